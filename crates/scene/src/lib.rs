@@ -1,0 +1,28 @@
+//! What a scene *is*: cameras, images, points, Gaussians and datasets as plain types.
+//!
+//! Nothing here reads a file or runs a kernel. Conventions, kept by every other crate:
+//!
+//! - World: right-handed, in the dataset's own units. Cameras: OpenCV axes, +X right, +Y down, +Z forward.
+//! - Transforms are named target-from-source: [`Pose::world_from_camera`].
+//! - The centre of pixel (0, 0) is at (0.5, 0.5). Colour is sRGB-encoded float in \[0, 1\]. Angles in radians.
+//! - Quaternions are `w, x, y, z`, normalised when used. Scales are stored as ln, opacities as logit.
+#![forbid(unsafe_code)]
+
+mod camera;
+mod cloud;
+mod dataset;
+mod image;
+mod lens;
+mod points;
+mod pose;
+pub mod rng;
+pub mod sh;
+
+pub use camera::{Camera, Intrinsics};
+pub use cloud::GaussianCloud;
+pub use dataset::{Dataset, LoadError, Photo, PhotoSource, View, every_eighth};
+pub use image::Image;
+pub use lens::Lens;
+pub use points::PointCloud;
+pub use pose::Pose;
+pub use rng::Rng;

@@ -1,0 +1,22 @@
+use glam::Vec3;
+
+/// Coloured points, as structure from motion leaves them.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct PointCloud {
+    /// `[N]` world.
+    pub positions: Vec<Vec3>,
+    /// `[N]` sRGB, 8 bits.
+    pub colors: Vec<[u8; 3]>,
+}
+
+impl PointCloud {
+    /// How many points.
+    pub fn len(&self) -> usize {
+        self.positions.len()
+    }
+
+    /// Whether there are none.
+    pub fn is_empty(&self) -> bool {
+        self.positions.is_empty()
+    }
+}

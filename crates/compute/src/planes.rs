@@ -1,0 +1,174 @@
+//! The device array: one contiguous run per component.
+
+/// Components ("planes") of `len` items each, planar: `[planes, stride]` with `stride >= len` a multiple of
+/// [`Planes::ALIGN`], so that every plane can be read in whole vectors. What lies past `len` is padding, initially zero.
+///
+/// Planar, because sixteen neighbours of one component are then one load; an interleaved `[N, 3]` takes a gather.
+#[derive(Clone, Debug, PartialEq, Default)]
+pub struct Planes {
+    data: Vec<f32>,
+    count: usize,
+    len: usize,
+    stride: usize,
+}
+
+impl Planes {
+    /// Every plane's length is a multiple of this: the widest vector.
+    pub const ALIGN: usize = 16;
+
+    /// `count` planes of `len` zeros.
+    pub fn zeros(count: usize, len: usize) -> Self {
+        let stride = len.next_multiple_of(Self::ALIGN);
+        Self {
+            data: vec![0.0; count * stride],
+            count,
+            len,
+            stride,
+        }
+    }
+
+    /// From interleaved `[N, count]` values.
+    ///
+    /// # Panics
+    /// When the length is no multiple of `count`.
+    pub fn from_interleaved(count: usize, values: &[f32]) -> Self {
+        assert_eq!(values.len() % count, 0, "whole items");
+        let mut planes = Self::zeros(count, values.len() / count);
+        for (i, item) in values.chunks_exact(count).enumerate() {
+            for (c, value) in item.iter().enumerate() {
+                planes.data[c * planes.stride + i] = *value;
+            }
+        }
+        planes
+    }
+
+    /// To interleaved `[N, count]` values.
+    pub fn to_interleaved(&self) -> Vec<f32> {
+        let mut values = Vec::with_capacity(self.len * self.count);
+        for i in 0..self.len {
+            values.extend((0..self.count).map(|c| self.data[c * self.stride + i]));
+        }
+        values
+    }
+
+    /// Items a plane.
+    pub fn len(&self) -> usize {
+        self.len
+    }
+
+    /// Whether there are no items.
+    pub fn is_empty(&self) -> bool {
+        self.len == 0
+    }
+
+    /// Planes.
+    pub fn count(&self) -> usize {
+        self.count
+    }
+
+    /// Items and padding a plane.
+    pub fn stride(&self) -> usize {
+        self.stride
+    }
+
+    /// Plane `c`, padding included.
+    pub fn plane(&self, c: usize) -> &[f32] {
+        &self.data[c * self.stride..(c + 1) * self.stride]
+    }
+
+    /// Plane `c`, to be written.
+    pub fn plane_mut(&mut self, c: usize) -> &mut [f32] {
+        &mut self.data[c * self.stride..(c + 1) * self.stride]
+    }
+
+    /// All planes one after the other, `[count, stride]`.
+    pub fn as_slice(&self) -> &[f32] {
+        &self.data
+    }
+
+    /// The same, to be written; `chunks_mut(stride)` are the planes.
+    pub fn as_mut_slice(&mut self) -> &mut [f32] {
+        &mut self.data
+    }
+
+    /// Component `c` of item `i`.
+    pub fn get(&self, c: usize, i: usize) -> f32 {
+        debug_assert!(i < self.len);
+        self.data[c * self.stride + i]
+    }
+
+    /// Sets component `c` of item `i`.
+    pub fn set(&mut self, c: usize, i: usize, value: f32) {
+        debug_assert!(i < self.len);
+        self.data[c * self.stride + i] = value;
+    }
+
+    /// The items `indices`, in that order: keeping, sorting and cloning are all this.
+    pub fn gather(&self, indices: &[u32]) -> Self {
+        let mut out = Self::zeros(self.count, indices.len());
+        for c in 0..self.count {
+            let from = self.plane(c);
+            for (to, i) in out.plane_mut(c).iter_mut().zip(indices) {
+                *to = from[*i as usize];
+            }
+        }
+        out
+    }
+
+    /// Adds the items of `other` behind these.
+    ///
+    /// # Panics
+    /// When the number of planes differs.
+    pub fn append(&mut self, other: &Self) {
+        assert_eq!(self.count, other.count, "same components");
+        let mut out = Self::zeros(self.count, self.len + other.len);
+        for c in 0..self.count {
+            let to = out.plane_mut(c);
+            to[..self.len].copy_from_slice(&self.plane(c)[..self.len]);
+            to[self.len..self.len + other.len].copy_from_slice(&other.plane(c)[..other.len]);
+        }
+        *self = out;
+    }
+
+    /// All values zero, padding too.
+    pub fn clear(&mut self) {
+        self.data.fill(0.0);
+    }
+
+    /// `len` items a plane, whose values are unspecified; reuses the memory where it suffices.
+    pub fn reshape(&mut self, count: usize, len: usize) {
+        let stride = len.next_multiple_of(Self::ALIGN);
+        if (self.count, self.len) != (count, len) {
+            self.data.resize(count * stride, 0.0);
+            (self.count, self.len, self.stride) = (count, len, stride);
+        }
+    }
+
+    /// Bytes held.
+    pub fn bytes(&self) -> usize {
+        self.data.capacity() * size_of::<f32>()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn gather_and_append_agree_with_interleaved_lists() {
+        let values: Vec<f32> = (0..51).map(|v| v as f32).collect();
+        let mut planes = Planes::from_interleaved(3, &values);
+        assert_eq!(
+            (planes.len(), planes.stride(), planes.to_interleaved()),
+            (17, 32, values)
+        );
+        let picked = planes.gather(&[16, 0, 3]);
+        assert_eq!(
+            picked.to_interleaved(),
+            [48.0, 49.0, 50.0, 0.0, 1.0, 2.0, 9.0, 10.0, 11.0]
+        );
+        planes.append(&picked);
+        assert_eq!((planes.len(), planes.get(1, 17), planes.get(2, 19)), (20, 49.0, 11.0));
+        assert!(planes.plane(0)[20..].iter().all(|v| *v == 0.0), "padding stays zero");
+    }
+}

@@ -1,0 +1,410 @@
+//! AVX2 and AVX-512 lanes. The only `unsafe` of the project's arithmetic: every block below calls an intrinsic whose
+//! instructions are there because the token that every value descends from is made by `detect` alone.
+
+use super::{EXP2, Kernel, Lanes, Mask, Simd};
+use std::arch::x86_64::*;
+use std::fmt::{Debug, Formatter, Result};
+use std::ops::{Add, AddAssign, Div, Mul, MulAssign, Neg, Sub, SubAssign};
+
+/// Proof of AVX-512 F, DQ, BW, VL and FMA.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Avx512(());
+
+/// Proof of AVX2 and FMA.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Avx2(());
+
+/// Sixteen `f32`.
+#[derive(Clone, Copy)]
+#[repr(transparent)]
+pub struct F32x16(__m512);
+
+/// Eight `f32`.
+#[derive(Clone, Copy)]
+#[repr(transparent)]
+pub struct F32x8(__m256);
+
+/// Sixteen truth values in a mask register.
+#[derive(Clone, Copy, Debug)]
+pub struct Mask16(__mmask16);
+
+/// Eight truth values, all bits of a lane set or clear.
+#[derive(Clone, Copy)]
+pub struct Mask8(__m256);
+
+impl Avx512 {
+    pub(super) fn detect() -> Option<Self> {
+        (is_x86_feature_detected!("avx512f")
+            && is_x86_feature_detected!("avx512dq")
+            && is_x86_feature_detected!("avx512bw")
+            && is_x86_feature_detected!("avx512vl")
+            && is_x86_feature_detected!("avx2")
+            && is_x86_feature_detected!("fma"))
+        .then_some(Self(()))
+    }
+
+    #[inline]
+    pub(super) fn run<K: Kernel>(self, kernel: K) -> K::Output {
+        #[target_feature(enable = "avx512f,avx512dq,avx512bw,avx512vl,avx2,fma")]
+        fn with_features<K: Kernel>(simd: Avx512, kernel: K) -> K::Output {
+            kernel.run(simd)
+        }
+        // SAFETY: `self` exists only where `detect` saw these features.
+        unsafe { with_features(self, kernel) }
+    }
+}
+
+impl Avx2 {
+    pub(super) fn detect() -> Option<Self> {
+        (is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma")).then_some(Self(()))
+    }
+
+    #[inline]
+    pub(super) fn run<K: Kernel>(self, kernel: K) -> K::Output {
+        #[target_feature(enable = "avx2,fma")]
+        fn with_features<K: Kernel>(simd: Avx2, kernel: K) -> K::Output {
+            kernel.run(simd)
+        }
+        // SAFETY: `self` exists only where `detect` saw these features.
+        unsafe { with_features(self, kernel) }
+    }
+}
+
+/// Implements what both widths have under the same names, given the intrinsics.
+macro_rules! float_lanes {
+    ($simd:ident, $vector:ident, $mask:ident, $lanes:literal,
+     $set1:ident, $loadu:ident, $storeu:ident, $add:ident, $sub:ident, $mul:ident, $div:ident,
+     $fmadd:ident, $sqrt:ident, $min:ident, $max:ident,
+     abs: |$abs_v:ident| $abs:expr, neg: |$neg_v:ident| $neg:expr, floor: |$floor_v:ident| $floor:expr,
+     lt: |$lt_a:ident, $lt_b:ident| $lt:expr, le: |$le_a:ident, $le_b:ident| $le:expr,
+     select: |$sel_m:ident, $sel_a:ident, $sel_b:ident| $select:expr,
+     exp2: |$exp_v:ident| $exp2:expr, recip: |$recip_v:ident| $recip:expr, sum: |$sum_v:ident| $sum:expr, sums: $sums:ident) => {
+        impl Simd for $simd {
+            type F = $vector;
+            const LANES: usize = $lanes;
+            #[inline(always)]
+            fn splat(self, value: f64) -> $vector {
+                self.set(value as f32)
+            }
+            #[inline(always)]
+            fn set(self, value: f32) -> $vector {
+                // SAFETY: the token proves the instruction set.
+                $vector(unsafe { $set1(value) })
+            }
+            #[inline(always)]
+            fn load(self, from: &[f32]) -> $vector {
+                let from: &[f32; $lanes] = from.first_chunk().expect("a whole vector");
+                // SAFETY: the token proves the instruction set; the array is as long as the unaligned load.
+                $vector(unsafe { $loadu(from.as_ptr()) })
+            }
+        }
+
+        impl Lanes for $vector {
+            type Scalar = f32;
+            type Mask = $mask;
+            type Simd = $simd;
+            #[inline(always)]
+            fn simd(self) -> $simd {
+                $simd(())
+            }
+            #[inline(always)]
+            fn store(self, to: &mut [f32]) {
+                let to: &mut [f32; $lanes] = to.first_chunk_mut().expect("room for a vector");
+                // SAFETY: the vector proves the instruction set; the array is as long as the unaligned store.
+                unsafe { $storeu(to.as_mut_ptr(), self.0) }
+            }
+            // SAFETY, for every block below: a vector exists only where its instruction set does.
+            #[inline(always)]
+            fn mul_add(self, b: Self, c: Self) -> Self {
+                $vector(unsafe { $fmadd(self.0, b.0, c.0) })
+            }
+            #[inline(always)]
+            fn sqrt(self) -> Self {
+                $vector(unsafe { $sqrt(self.0) })
+            }
+            #[inline(always)]
+            fn min(self, other: Self) -> Self {
+                $vector(unsafe { $min(self.0, other.0) })
+            }
+            #[inline(always)]
+            fn max(self, other: Self) -> Self {
+                $vector(unsafe { $max(self.0, other.0) })
+            }
+            #[inline(always)]
+            fn abs(self) -> Self {
+                let $abs_v = self.0;
+                $vector(unsafe { $abs })
+            }
+            #[inline(always)]
+            fn floor(self) -> Self {
+                let $floor_v = self.0;
+                $vector(unsafe { $floor })
+            }
+            #[inline(always)]
+            fn lt(self, other: Self) -> $mask {
+                let ($lt_a, $lt_b) = (self.0, other.0);
+                $mask(unsafe { $lt })
+            }
+            #[inline(always)]
+            fn le(self, other: Self) -> $mask {
+                let ($le_a, $le_b) = (self.0, other.0);
+                $mask(unsafe { $le })
+            }
+            #[inline(always)]
+            fn or_where_not(self, mask: $mask, other: Self) -> Self {
+                let ($sel_m, $sel_a, $sel_b) = (mask.0, self.0, other.0);
+                $vector(unsafe { $select })
+            }
+            #[inline(always)]
+            fn exp2(self) -> Self {
+                let $exp_v = self;
+                $exp2
+            }
+            #[inline(always)]
+            fn recip(self) -> Self {
+                // An estimate of 12 or 14 bits and one Newton step: 4 instructions where a division blocks the
+                // divider for 16 cycles (AVX-512).
+                let $recip_v = self.0;
+                let estimate = $vector(unsafe { $recip });
+                estimate * (-self).mul_add(estimate, self.splat(2.0))
+            }
+            #[inline(always)]
+            fn sum(self) -> f32 {
+                let $sum_v = self.0;
+                unsafe { $sum }
+            }
+            #[inline(always)]
+            fn sums<const N: usize>(vectors: [Self; N]) -> [f32; N] {
+                $sums(vectors)
+            }
+        }
+
+        impl Debug for $vector {
+            fn fmt(&self, f: &mut Formatter<'_>) -> Result {
+                let mut values = [0.0; $lanes];
+                self.store(&mut values);
+                values.fmt(f)
+            }
+        }
+        impl Neg for $vector {
+            type Output = Self;
+            #[inline(always)]
+            fn neg(self) -> Self {
+                let $neg_v = self.0;
+                // SAFETY: as above.
+                $vector(unsafe { $neg })
+            }
+        }
+        float_lanes!(@operator $vector Add add $add);
+        float_lanes!(@operator $vector Sub sub $sub);
+        float_lanes!(@operator $vector Mul mul $mul);
+        float_lanes!(@operator $vector Div div $div);
+        float_lanes!(@assign $vector AddAssign add_assign $add);
+        float_lanes!(@assign $vector SubAssign sub_assign $sub);
+        float_lanes!(@assign $vector MulAssign mul_assign $mul);
+    };
+    (@operator $vector:ident $trait:ident $method:ident $intrinsic:ident) => {
+        impl $trait for $vector {
+            type Output = Self;
+            #[inline(always)]
+            fn $method(self, other: Self) -> Self {
+                // SAFETY: a vector exists only where its instruction set does.
+                $vector(unsafe { $intrinsic(self.0, other.0) })
+            }
+        }
+    };
+    (@assign $vector:ident $trait:ident $method:ident $intrinsic:ident) => {
+        impl $trait for $vector {
+            #[inline(always)]
+            fn $method(&mut self, other: Self) {
+                // SAFETY: a vector exists only where its instruction set does.
+                self.0 = unsafe { $intrinsic(self.0, other.0) };
+            }
+        }
+    };
+}
+
+const NEAREST: i32 = _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC;
+const DOWN: i32 = _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC;
+
+float_lanes!(
+    Avx512, F32x16, Mask16, 16,
+    _mm512_set1_ps, _mm512_loadu_ps, _mm512_storeu_ps, _mm512_add_ps, _mm512_sub_ps, _mm512_mul_ps, _mm512_div_ps,
+    _mm512_fmadd_ps, _mm512_sqrt_ps, _mm512_min_ps, _mm512_max_ps,
+    abs: |v| _mm512_abs_ps(v),
+    neg: |v| _mm512_xor_ps(v, _mm512_set1_ps(-0.0)),
+    floor: |v| _mm512_roundscale_ps::<DOWN>(v),
+    lt: |a, b| _mm512_cmp_ps_mask::<_CMP_LT_OQ>(a, b),
+    le: |a, b| _mm512_cmp_ps_mask::<_CMP_LE_OQ>(a, b),
+    select: |mask, a, b| _mm512_mask_blend_ps(mask, b, a),
+    exp2: |v| exp2_16(v),
+    recip: |v| _mm512_rcp14_ps(v),
+    sum: |v| {
+        let half = _mm256_add_ps(_mm512_castps512_ps256(v), _mm512_extractf32x8_ps::<1>(v));
+        sum_of_8(half)
+    },
+    sums: sums_of_16
+);
+
+float_lanes!(
+    Avx2, F32x8, Mask8, 8,
+    _mm256_set1_ps, _mm256_loadu_ps, _mm256_storeu_ps, _mm256_add_ps, _mm256_sub_ps, _mm256_mul_ps, _mm256_div_ps,
+    _mm256_fmadd_ps, _mm256_sqrt_ps, _mm256_min_ps, _mm256_max_ps,
+    abs: |v| _mm256_andnot_ps(_mm256_set1_ps(-0.0), v),
+    neg: |v| _mm256_xor_ps(v, _mm256_set1_ps(-0.0)),
+    floor: |v| _mm256_round_ps::<DOWN>(v),
+    lt: |a, b| _mm256_cmp_ps::<_CMP_LT_OQ>(a, b),
+    le: |a, b| _mm256_cmp_ps::<_CMP_LE_OQ>(a, b),
+    select: |mask, a, b| _mm256_blendv_ps(b, a, mask),
+    exp2: |v| exp2_8(v),
+    recip: |v| _mm256_rcp_ps(v),
+    sum: |v| sum_of_8(v),
+    sums: sums_of_8
+);
+
+#[inline(always)]
+fn polynomial<V: Lanes>(f: V) -> V {
+    let mut p = f.splat(f64::from(EXP2[5]));
+    for k in (0..5).rev() {
+        p = p.mul_add(f, f.splat(f64::from(EXP2[k])));
+    }
+    p
+}
+
+#[inline(always)]
+fn exp2_16(v: F32x16) -> F32x16 {
+    let v = v.max(v.splat(-126.0));
+    // SAFETY: the vector proves the instruction set.
+    unsafe {
+        let n = _mm512_roundscale_ps::<NEAREST>(v.0);
+        F32x16(_mm512_scalef_ps(polynomial(v - F32x16(n)).0, n))
+    }
+}
+
+#[inline(always)]
+fn exp2_8(v: F32x8) -> F32x8 {
+    let v = v.max(v.splat(-126.0));
+    // SAFETY: the vector proves the instruction set.
+    unsafe {
+        let n = _mm256_round_ps::<NEAREST>(v.0);
+        let exponent = _mm256_slli_epi32::<23>(_mm256_add_epi32(_mm256_cvtps_epi32(n), _mm256_set1_epi32(127)));
+        polynomial(v - F32x8(n)) * F32x8(_mm256_castsi256_ps(exponent))
+    }
+}
+
+/// ((0+4)+(2+6)) + ((1+5)+(3+7)): the order in which [`sums_of_8`] adds, too.
+#[inline(always)]
+unsafe fn sum_of_8(v: __m256) -> f32 {
+    // SAFETY: called where AVX2 is proved.
+    unsafe {
+        let four = _mm_add_ps(_mm256_castps256_ps128(v), _mm256_extractf128_ps::<1>(v));
+        let two = _mm_add_ps(four, _mm_movehl_ps(four, four));
+        _mm_cvtss_f32(_mm_add_ss(two, _mm_shuffle_ps::<1>(two, two)))
+    }
+}
+
+/// Four vectors' sums by transposing within 128-bit lanes: 3 adds and 6 shuffles for four, where one at a time takes 12 and 12.
+#[inline(always)]
+unsafe fn sums_of_four_quads(a: __m128, b: __m128, c: __m128, d: __m128) -> __m128 {
+    // SAFETY: SSE is part of x86-64.
+    unsafe {
+        let ab = _mm_add_ps(_mm_movelh_ps(a, b), _mm_movehl_ps(b, a)); // a0+a2 a1+a3 b0+b2 b1+b3
+        let cd = _mm_add_ps(_mm_movelh_ps(c, d), _mm_movehl_ps(d, c));
+        _mm_add_ps(
+            _mm_shuffle_ps::<0b10_00_10_00>(ab, cd),
+            _mm_shuffle_ps::<0b11_01_11_01>(ab, cd),
+        )
+    }
+}
+
+#[inline(always)]
+fn sums_in_fours<const N: usize>(quad: impl Fn(usize) -> __m128) -> [f32; N] {
+    let mut out = [0.0; N];
+    let mut i = 0;
+    while i < N {
+        let last = N - 1;
+        let mut four = [0.0f32; 4];
+        // SAFETY: SSE is part of x86-64; `four` is as long as the store.
+        unsafe {
+            let s = sums_of_four_quads(
+                quad(i),
+                quad((i + 1).min(last)),
+                quad((i + 2).min(last)),
+                quad((i + 3).min(last)),
+            );
+            _mm_storeu_ps(four.as_mut_ptr(), s);
+        }
+        let count = (N - i).min(4);
+        out[i..i + count].copy_from_slice(&four[..count]);
+        i += 4;
+    }
+    out
+}
+
+#[inline(always)]
+fn sums_of_8<const N: usize>(vectors: [F32x8; N]) -> [f32; N] {
+    // SAFETY: a vector proves the instruction set.
+    sums_in_fours(|i| unsafe {
+        _mm_add_ps(
+            _mm256_castps256_ps128(vectors[i].0),
+            _mm256_extractf128_ps::<1>(vectors[i].0),
+        )
+    })
+}
+
+#[inline(always)]
+fn sums_of_16<const N: usize>(vectors: [F32x16; N]) -> [f32; N] {
+    // SAFETY: a vector proves the instruction set.
+    sums_in_fours(|i| unsafe {
+        let half = _mm256_add_ps(
+            _mm512_castps512_ps256(vectors[i].0),
+            _mm512_extractf32x8_ps::<1>(vectors[i].0),
+        );
+        _mm_add_ps(_mm256_castps256_ps128(half), _mm256_extractf128_ps::<1>(half))
+    })
+}
+
+impl Mask for Mask16 {
+    #[inline(always)]
+    fn and(self, other: Self) -> Self {
+        Mask16(self.0 & other.0)
+    }
+    #[inline(always)]
+    fn or(self, other: Self) -> Self {
+        Mask16(self.0 | other.0)
+    }
+    #[inline(always)]
+    fn and_not(self, other: Self) -> Self {
+        Mask16(self.0 & !other.0)
+    }
+    #[inline(always)]
+    fn bits(self) -> u32 {
+        u32::from(self.0)
+    }
+}
+
+impl Mask for Mask8 {
+    // SAFETY, for every block below: a mask exists only where AVX2 does.
+    #[inline(always)]
+    fn and(self, other: Self) -> Self {
+        Mask8(unsafe { _mm256_and_ps(self.0, other.0) })
+    }
+    #[inline(always)]
+    fn or(self, other: Self) -> Self {
+        Mask8(unsafe { _mm256_or_ps(self.0, other.0) })
+    }
+    #[inline(always)]
+    fn and_not(self, other: Self) -> Self {
+        Mask8(unsafe { _mm256_andnot_ps(other.0, self.0) })
+    }
+    #[inline(always)]
+    fn bits(self) -> u32 {
+        unsafe { _mm256_movemask_ps(self.0) as u32 }
+    }
+}
+
+impl Debug for Mask8 {
+    fn fmt(&self, f: &mut Formatter<'_>) -> Result {
+        write!(f, "{:08b}", self.bits())
+    }
+}

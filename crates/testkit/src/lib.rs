@@ -1,1 +1,10 @@
-//! See the crate's description in Cargo.toml.
+//! Development only: where the shared data lies, the golden files, and comparisons that say what differs.
+#![forbid(unsafe_code)]
+
+mod compare;
+mod golden;
+pub mod shared;
+
+pub use compare::{Difference, max_abs_difference, relative_difference};
+pub use golden::Golden;
+pub use shared::shared;

@@ -1,0 +1,344 @@
+//! Front-to-back alpha blending of one tile, and its vector-Jacobian product.
+//!
+//! Symbols: `p = a dx^2 + b dx dy + c dy^2 + l` is log2 of alpha before the cap (conic and opacity folded into it, so that
+//! a fragment costs two fused operations and one exponential), `T` transmittance, `w = alpha T` weight.
+//! A tile is 16 pixels wide and high: one row is one AVX-512 vector, two of AVX2.
+//! A pixel that has ended (a splat would have brought T to 1e-4 or below) is stored with the sign of T flipped: every
+//! later product then fails the same test, which saves a mask in the inner loop.
+
+use super::bin::{Entry, TILE};
+use irradia_compute::simd::{Kernel, Lanes, Mask, Simd};
+
+/// Alpha never exceeds this (Inria code).
+pub const ALPHA_MAX: f64 = 0.99;
+/// A splat that would leave this transmittance or less is not drawn and ends the pixel (Inria code).
+pub const TRANSMITTANCE_MIN: f64 = 1e-4;
+/// log2 of [`super::project::ALPHA_MIN`].
+pub const LOG2_ALPHA_MIN: f64 = -7.994_353_436_858_858;
+
+/// What blending needs of a splat; one cache line.
+#[derive(Clone, Copy, Debug, Default)]
+#[repr(C, align(64))]
+pub(super) struct Footprint2d {
+    /// Centre, pixels.
+    pub xy: [f32; 2],
+    /// `a, b, c` of `p`, negative definite.
+    pub quadratic: [f32; 3],
+    /// log2 of the opacity.
+    pub log2_opacity: f32,
+    pub color: [f32; 3],
+    pub depth: f32,
+    /// Half sizes of the box outside which alpha < 1/255, pixels.
+    pub extent: [f32; 2],
+}
+
+/// Pixels of a tile.
+pub(super) const TILE_PIXELS: usize = TILE * TILE;
+/// Channels a tile's forward state has: red, green, blue, depth, transmittance; `[channel, row, column]`.
+pub(super) const CHANNELS: usize = 5;
+/// Sums a splat collects in each tile, in this order: the moments 1, dx, dy, dx^2, dx dy, dy^2 of v_p, then the
+/// gradients of red, green, blue and depth.
+pub(super) const SUMS: usize = 10;
+
+/// What happens to one vector of pixels when a splat passes over it.
+pub(super) struct Fragment<F: Lanes> {
+    pub alpha: F,
+    pub weight: F,
+    /// Transmittance behind, if drawn.
+    pub behind: F,
+    /// Drawn here.
+    pub drawn: F::Mask,
+    /// Alpha reaches 1/255 but the pixel has ended or ends now.
+    pub ends: F::Mask,
+    /// The cap acts.
+    pub capped: F::Mask,
+}
+
+/// One splat over one vector of pixels: `p` as above, `transmittance` in front.
+#[inline(always)]
+pub(super) fn fragment<F: Lanes>(p: F, transmittance: F) -> Fragment<F> {
+    let raw = p.exp2();
+    let cap = p.splat(ALPHA_MAX);
+    let alpha = raw.min(cap);
+    let touched = p.splat(LOG2_ALPHA_MIN).le(p);
+    let weight = alpha * transmittance;
+    let behind = transmittance - weight;
+    let goes_on = p.splat(TRANSMITTANCE_MIN).lt(behind);
+    Fragment {
+        alpha,
+        weight,
+        behind,
+        drawn: touched.and(goes_on),
+        ends: touched.and_not(goes_on),
+        capped: cap.lt(raw),
+    }
+}
+
+/// The gradient of `p`, for a fragment that is drawn: `dL/dalpha = T g - rest / (1 - alpha)`, where `g` is the splat's
+/// colour (and depth) times the pixel's gradient and `rest` the same for all that lies behind, weighted, background too.
+#[inline(always)]
+pub(super) fn fragment_vjp<F: Lanes>(at: &Fragment<F>, transmittance: F, g: F, rest: F) -> F {
+    let one = g.splat(1.0);
+    let v_alpha = transmittance * g - rest * (one - at.alpha).recip();
+    let v_p = v_alpha * at.alpha * g.splat(std::f64::consts::LN_2);
+    v_p.zero_where_not(at.drawn.and_not(at.capped))
+}
+
+/// Blends one tile front to back into `out [CHANNELS, TILE, TILE]`.
+pub(super) struct BlendTile<'a> {
+    pub footprints: &'a [Footprint2d],
+    /// The tile's splats, front to back.
+    pub entries: &'a [Entry],
+    /// Pixel coordinates of the tile's corner.
+    pub corner: [f32; 2],
+    pub with_depth: bool,
+    pub out: &'a mut [f32; CHANNELS * TILE_PIXELS],
+}
+
+impl Kernel for BlendTile<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<S: Simd>(self, simd: S)
+    where
+        S::F: Lanes<Scalar = f32>,
+    {
+        if self.with_depth {
+            self.blend::<S, true>(simd);
+        } else {
+            self.blend::<S, false>(simd);
+        }
+    }
+}
+
+impl BlendTile<'_> {
+    #[inline(always)]
+    fn blend<S: Simd, const DEPTH: bool>(self, simd: S)
+    where
+        S::F: Lanes<Scalar = f32>,
+    {
+        let (colors, transmittances) = self.out.split_at_mut((CHANNELS - 1) * TILE_PIXELS);
+        colors.fill(0.0);
+        transmittances.fill(1.0);
+        let (red, colors) = colors.split_at_mut(TILE_PIXELS);
+        let (green, colors) = colors.split_at_mut(TILE_PIXELS);
+        let (blue, depths) = colors.split_at_mut(TILE_PIXELS);
+        // Bit r: some pixel of row r has not ended.
+        let mut live: u32 = (1 << TILE) - 1;
+        for entry in self.entries {
+            let mut rows = entry.row_mask() & live;
+            if rows == 0 {
+                if live == 0 {
+                    return;
+                }
+                continue;
+            }
+            let s = &self.footprints[entry.splat as usize];
+            let over = Parabola::<S>::new(simd, s, self.corner);
+            let color = s.color.map(|v| simd.set(v));
+            let depth = simd.set(s.depth);
+            while rows != 0 {
+                let row = rows.trailing_zeros() as usize;
+                rows &= rows - 1;
+                let dy = simd.set(over.dy(row));
+                let mut ended = false;
+                for part in 0..TILE / S::LANES {
+                    let at = row * TILE + part * S::LANES;
+                    let t = simd.load(&transmittances[at..]);
+                    let f = fragment(over.p(part, dy), t);
+                    let w = f.weight.zero_where_not(f.drawn);
+                    w.mul_add(color[0], simd.load(&red[at..])).store(&mut red[at..]);
+                    w.mul_add(color[1], simd.load(&green[at..])).store(&mut green[at..]);
+                    w.mul_add(color[2], simd.load(&blue[at..])).store(&mut blue[at..]);
+                    if DEPTH {
+                        w.mul_add(depth, simd.load(&depths[at..])).store(&mut depths[at..]);
+                    }
+                    f.behind.or_where_not(f.drawn, t).store(&mut transmittances[at..]);
+                    if !f.ends.none() {
+                        (-t.abs())
+                            .or_where_not(f.ends, f.behind.or_where_not(f.drawn, t))
+                            .store(&mut transmittances[at..]);
+                        ended = true;
+                    }
+                }
+                if ended && transmittances[row * TILE..][..TILE].iter().all(|t| *t < 0.0) {
+                    live &= !(1 << row);
+                }
+            }
+        }
+    }
+}
+
+/// `p` over a tile, with all that does not depend on the row worked out.
+struct Parabola<S: Simd> {
+    y: f32,
+    c: S::F,
+    /// For each part of a row: dx, b dx, and a dx^2 + l.
+    dx: [S::F; 4],
+    slope: [S::F; 4],
+    level: [S::F; 4],
+}
+
+impl<S: Simd> Parabola<S>
+where
+    S::F: Lanes<Scalar = f32>,
+{
+    #[inline(always)]
+    fn new(simd: S, s: &Footprint2d, corner: [f32; 2]) -> Self {
+        let zero = simd.splat(0.0);
+        let [a, b, c] = s.quadratic.map(|v| simd.set(v));
+        let l = simd.set(s.log2_opacity);
+        let mut over = Self {
+            y: s.xy[1] - corner[1],
+            c,
+            dx: [zero; 4],
+            slope: [zero; 4],
+            level: [zero; 4],
+        };
+        let x = simd.set(s.xy[0] - corner[0]);
+        for part in 0..TILE / S::LANES {
+            let dx = simd.load(&COLUMN_CENTRES[part * S::LANES..]) - x;
+            over.dx[part] = dx;
+            over.slope[part] = b * dx;
+            over.level[part] = (a * dx).mul_add(dx, l);
+        }
+        over
+    }
+
+    #[inline(always)]
+    fn dy(&self, row: usize) -> f32 {
+        COLUMN_CENTRES[row] - self.y
+    }
+
+    #[inline(always)]
+    fn p(&self, part: usize, dy: S::F) -> S::F {
+        self.c.mul_add(dy, self.slope[part]).mul_add(dy, self.level[part])
+    }
+}
+
+/// Pixel centres within a tile.
+const COLUMN_CENTRES: [f32; TILE] = {
+    let mut centres = [0.5; TILE];
+    let mut i = 0;
+    while i < TILE {
+        centres[i] += i as f32;
+        i += 1;
+    }
+    centres
+};
+
+/// Walks one tile front to back again and gives every entry's [`SUMS`] to `emit`.
+///
+/// Front to back, as forward: every test then has the very operands it had there. What lies behind is known because the
+/// whole pixel is: `rest` starts at the pixel's total and loses each splat's part.
+pub(super) struct BlendTileVjp<'a, E: Fn(&Entry, [f32; SUMS])> {
+    pub footprints: &'a [Footprint2d],
+    pub entries: &'a [Entry],
+    pub corner: [f32; 2],
+    /// Gradients of red, green, blue and depth over the tile, `[4, TILE, TILE]`; zero outside the image.
+    pub v_out: &'a [f32; (CHANNELS - 1) * TILE_PIXELS],
+    /// `color . v_color + depth v_depth - T v_alpha`, background included, `[TILE, TILE]`; overwritten.
+    pub rest: &'a mut [f32; TILE_PIXELS],
+    pub with_depth: bool,
+    pub emit: E,
+}
+
+impl<E: Fn(&Entry, [f32; SUMS])> Kernel for BlendTileVjp<'_, E> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<S: Simd>(self, simd: S)
+    where
+        S::F: Lanes<Scalar = f32>,
+    {
+        if self.with_depth {
+            self.backward::<S, true>(simd);
+        } else {
+            self.backward::<S, false>(simd);
+        }
+    }
+}
+
+impl<E: Fn(&Entry, [f32; SUMS])> BlendTileVjp<'_, E> {
+    #[inline(always)]
+    fn backward<S: Simd, const DEPTH: bool>(self, simd: S)
+    where
+        S::F: Lanes<Scalar = f32>,
+    {
+        let mut transmittances = [1.0f32; TILE_PIXELS];
+        let [v_red, v_green, v_blue, v_depth] = std::array::from_fn(|c| &self.v_out[c * TILE_PIXELS..][..TILE_PIXELS]);
+        let zero = simd.splat(0.0);
+        let mut live: u32 = (1 << TILE) - 1;
+        for entry in self.entries {
+            let mut rows = entry.row_mask() & live;
+            if rows == 0 {
+                (self.emit)(entry, [0.0; SUMS]);
+                continue;
+            }
+            let s = &self.footprints[entry.splat as usize];
+            let over = Parabola::<S>::new(simd, s, self.corner);
+            let color = s.color.map(|v| simd.set(v));
+            let depth = simd.set(s.depth);
+            // Moments over rows of v_p: 1, dy, dy^2 in each column; dx joins at the end, for it does not change with the row.
+            let mut moments = [[zero; 3]; 4];
+            let mut v_color = [zero; 4];
+            while rows != 0 {
+                let row = rows.trailing_zeros() as usize;
+                rows &= rows - 1;
+                let dy = simd.set(over.dy(row));
+                let mut ended = false;
+                for part in 0..TILE / S::LANES {
+                    let at = row * TILE + part * S::LANES;
+                    let t = simd.load(&transmittances[at..]);
+                    let f = fragment(over.p(part, dy), t);
+                    let w = f.weight.zero_where_not(f.drawn);
+                    let v = [
+                        simd.load(&v_red[at..]),
+                        simd.load(&v_green[at..]),
+                        simd.load(&v_blue[at..]),
+                    ];
+                    let mut g = color[0].mul_add(v[0], color[1].mul_add(v[1], color[2] * v[2]));
+                    if DEPTH {
+                        let v = simd.load(&v_depth[at..]);
+                        g = depth.mul_add(v, g);
+                        v_color[3] = w.mul_add(v, v_color[3]);
+                    }
+                    for c in 0..3 {
+                        v_color[c] = w.mul_add(v[c], v_color[c]);
+                    }
+                    let rest = simd.load(&self.rest[at..]) - w * g;
+                    rest.store(&mut self.rest[at..]);
+                    let v_p = fragment_vjp(&f, t, g, rest);
+                    let m = &mut moments[part];
+                    m[0] += v_p;
+                    let v_dy = v_p * dy;
+                    m[1] += v_dy;
+                    m[2] = v_dy.mul_add(dy, m[2]);
+                    let t_next = f.behind.or_where_not(f.drawn, t);
+                    t_next.store(&mut transmittances[at..]);
+                    if !f.ends.none() {
+                        (-t.abs()).or_where_not(f.ends, t_next).store(&mut transmittances[at..]);
+                        ended = true;
+                    }
+                }
+                if ended && transmittances[row * TILE..][..TILE].iter().all(|t| *t < 0.0) {
+                    live &= !(1 << row);
+                }
+            }
+            let mut sums = [zero; 6];
+            for part in 0..TILE / S::LANES {
+                let (dx, [m0, m1, m2]) = (over.dx[part], moments[part]);
+                let m0_dx = m0 * dx;
+                sums[0] += m0;
+                sums[1] += m0_dx;
+                sums[2] += m1;
+                sums[3] = m0_dx.mul_add(dx, sums[3]);
+                sums[4] = m1.mul_add(dx, sums[4]);
+                sums[5] += m2;
+            }
+            let [s0, s1, s2, s3, s4, s5] = sums;
+            let [c0, c1, c2, c3] = v_color;
+            (self.emit)(entry, S::F::sums([s0, s1, s2, s3, s4, s5, c0, c1, c2, c3]));
+        }
+    }
+}

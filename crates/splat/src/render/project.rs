@@ -1,0 +1,289 @@
+//! From a 3D Gaussian to its footprint on the image, and back: EWA splatting (Zwicker et al. 2001) as 3DGS uses it
+//! (Kerbl et al. 2023, section 4).
+//!
+//! Symbols: `m` mean in the world, `x = R m + t` in the camera, `q` unit quaternion, `s` standard deviations,
+//! `J` Jacobian of the projection, `U = J R Rot(q)` (2x3), `V = U diag(s)`, `cov = V V^T + dilation`,
+//! `conic = cov^-1 = [A B; B C]`. All functions are generic over lanes: `f32` vectors train, `f64` is tested.
+
+use super::view::ViewLanes;
+use irradia_compute::simd::{Lanes, Mask};
+
+/// Pixels squared added to the diagonal of the 2D covariance (Inria code, "low-pass filter").
+pub const DILATION: f64 = 0.3;
+/// A fragment counts from this alpha on (Inria code).
+pub const ALPHA_MIN: f64 = 1.0 / 255.0;
+/// Floor of the ratio under the root of the antialiasing compensation: 0.005 squared (gsplat).
+const COMPENSATION_FLOOR: f64 = 0.005 * 0.005;
+
+/// One splat's geometry, one a lane.
+#[derive(Clone, Copy)]
+pub(super) struct Geometry<F> {
+    pub mean: [F; 3],
+    pub quat: [F; 4],
+    pub log_scale: [F; 3],
+    pub opacity_logit: F,
+}
+
+/// The footprint.
+#[derive(Clone, Copy)]
+pub(super) struct Footprint<F> {
+    /// Pixel coordinates of the centre.
+    pub xy: [F; 2],
+    /// Along +Z.
+    pub depth: F,
+    /// `[A, B, C]` of `sigma = (A dx^2 + C dy^2) / 2 + B dx dy`.
+    pub conic: [F; 3],
+    /// After the antialiasing compensation, if any.
+    pub opacity: F,
+    /// Half the size of the box outside which alpha is below 1/255, pixels.
+    pub extent: [F; 2],
+}
+
+/// Gradients of a [`Footprint`]'s fields that the image depends on.
+#[derive(Clone, Copy)]
+pub(super) struct FootprintGradient<F> {
+    pub xy: [F; 2],
+    pub depth: F,
+    pub conic: [F; 3],
+    pub opacity: F,
+}
+
+/// What forward and backward both need.
+struct Intermediate<F> {
+    x: [F; 3],
+    inv_z: F,
+    /// Clamped tangents and whether the clamp acts.
+    tangent: [F; 2],
+    q: [F; 4],
+    inv_q_norm: F,
+    rot: [[F; 3]; 3],
+    scale: [F; 3],
+    /// Rows of J R.
+    jr: [[F; 3]; 2],
+    u: [[F; 3]; 2],
+    v: [[F; 3]; 2],
+    /// Before dilation: a, b, c and the determinant.
+    cov: [F; 3],
+    det: F,
+    /// After.
+    cov_dilated: [F; 3],
+    det_dilated: F,
+    sigmoid: F,
+}
+
+#[inline(always)]
+pub(super) fn dot<F: Lanes>(a: [F; 3], b: [F; 3]) -> F {
+    a[0].mul_add(b[0], a[1].mul_add(b[1], a[2] * b[2]))
+}
+
+/// e^x through 2^x; safe for any finite x.
+#[inline(always)]
+pub(super) fn exp<F: Lanes>(x: F) -> F {
+    (x * x.splat(std::f64::consts::LOG2_E)).min(x.splat(126.0)).exp2()
+}
+
+#[inline(always)]
+fn intermediate<F: Lanes>(view: &ViewLanes<F>, g: &Geometry<F>) -> Intermediate<F> {
+    let one = view.near.splat(1.0);
+    let two = view.near.splat(2.0);
+    let x: [F; 3] = std::array::from_fn(|i| dot(view.r[i], g.mean) + view.t[i]);
+    let inv_z = one / x[2];
+    let tangent = std::array::from_fn(|i| (x[i] * inv_z).min(view.limit[i]).max(-view.limit[i]));
+    let inv_q_norm =
+        one / (g.quat[0] * g.quat[0] + g.quat[1] * g.quat[1] + g.quat[2] * g.quat[2] + g.quat[3] * g.quat[3]).sqrt();
+    let q = g.quat.map(|v| v * inv_q_norm);
+    let [w, i, j, k] = q;
+    let rot = [
+        [
+            one - two * (j * j + k * k),
+            two * (i * j - w * k),
+            two * (i * k + w * j),
+        ],
+        [
+            two * (i * j + w * k),
+            one - two * (i * i + k * k),
+            two * (j * k - w * i),
+        ],
+        [
+            two * (i * k - w * j),
+            two * (j * k + w * i),
+            one - two * (i * i + j * j),
+        ],
+    ];
+    let scale = g.log_scale.map(exp);
+    // J = [[fx/z, 0, -fx tx/z], [0, fy/z, -fy ty/z]] with the clamped tangents tx, ty.
+    let jr: [[F; 3]; 2] = std::array::from_fn(|r| {
+        let j_scale = view.f[r] * inv_z;
+        std::array::from_fn(|c| j_scale * (view.r[r][c] - tangent[r] * view.r[2][c]))
+    });
+    let u: [[F; 3]; 2] =
+        std::array::from_fn(|r| std::array::from_fn(|c| dot(jr[r], [rot[0][c], rot[1][c], rot[2][c]])));
+    let v: [[F; 3]; 2] = std::array::from_fn(|r| std::array::from_fn(|c| u[r][c] * scale[c]));
+    let cov = [dot(v[0], v[0]), dot(v[0], v[1]), dot(v[1], v[1])];
+    // |V0 x V1|^2 (Lagrange) instead of a c - b^2: the difference of two large products loses needles to rounding.
+    let cross = [
+        v[0][1] * v[1][2] - v[0][2] * v[1][1],
+        v[0][2] * v[1][0] - v[0][0] * v[1][2],
+        v[0][0] * v[1][1] - v[0][1] * v[1][0],
+    ];
+    let det = dot(cross, cross);
+    let dilation = one.splat(DILATION);
+    let det_dilated = det + dilation * (cov[0] + cov[2]) + dilation * dilation;
+    let sigmoid = one / (one + exp(-g.opacity_logit));
+    Intermediate {
+        x,
+        inv_z,
+        tangent,
+        q,
+        inv_q_norm,
+        rot,
+        scale,
+        jr,
+        u,
+        v,
+        cov,
+        det,
+        cov_dilated: [cov[0] + dilation, cov[1], cov[2] + dilation],
+        det_dilated,
+        sigmoid,
+    }
+}
+
+/// Projects; the mask holds the lanes that can touch the image. Lanes outside it hold unspecified numbers.
+#[inline(always)]
+pub(super) fn project<F: Lanes>(view: &ViewLanes<F>, g: &Geometry<F>, antialias: bool) -> (Footprint<F>, F::Mask) {
+    let at = intermediate(view, g);
+    let inv_det = at.inv_z.splat(1.0) / at.det_dilated;
+    let [a, b, c] = at.cov_dilated;
+    let opacity = if antialias {
+        at.sigmoid * (at.det * inv_det).max(inv_det.splat(COMPENSATION_FLOOR)).sqrt()
+    } else {
+        at.sigmoid
+    };
+    let xy: [F; 2] = std::array::from_fn(|i| view.f[i] * at.x[i] * at.inv_z + view.c[i]);
+    // alpha >= 1/255 inside d^T conic d <= 2 ln(255 opacity), whose box has half sizes sqrt(2 ln(255 opacity) cov_ii).
+    let reach = (opacity * opacity.splat(1.0 / ALPHA_MIN)).map(|v| {
+        use irradia_compute::simd::Scalar;
+        Scalar::from_f64(2.0 * v.to_f64().max(1.0).ln())
+    });
+    let extent = [(reach * a).sqrt(), (reach * c).sqrt()];
+    let zero = reach.splat(0.0);
+    let half = reach.splat(0.5);
+    let mut visible = view.near.lt(at.x[2]).and(reach.splat(ALPHA_MIN).le(opacity));
+    for i in 0..2 {
+        // Some pixel centre (0.5 .. size - 0.5) must lie within the box; NaN fails both.
+        let low = (xy[i] - extent[i]).le(view.size[i] - half);
+        let high = half.le(xy[i] + extent[i]);
+        visible = visible.and(low).and(high);
+    }
+    visible = visible
+        .and(zero.lt(at.det_dilated))
+        .and(at.det_dilated.lt(zero.splat(1e30)));
+    (
+        Footprint {
+            xy,
+            depth: at.x[2],
+            conic: [c * inv_det, -b * inv_det, a * inv_det],
+            opacity,
+            extent,
+        },
+        visible,
+    )
+}
+
+/// The vector-Jacobian product of [`project`].
+#[inline(always)]
+pub(super) fn project_vjp<F: Lanes>(
+    view: &ViewLanes<F>,
+    g: &Geometry<F>,
+    antialias: bool,
+    v_out: &FootprintGradient<F>,
+) -> Geometry<F> {
+    let at = intermediate(view, g);
+    let one = at.inv_z.splat(1.0);
+    let two = one.splat(2.0);
+    let zero = one.splat(0.0);
+    let inv_det = one / at.det_dilated;
+    let [a, b, c] = at.cov_dilated;
+
+    // conic = cov^-1: v_cov = -conic v_conic conic, with b counted twice.
+    let [qa, qb, qc] = [c * inv_det, -b * inv_det, a * inv_det];
+    let [ga, gb, gc] = [v_out.conic[0], v_out.conic[1] * one.splat(0.5), v_out.conic[2]];
+    let left = [
+        qa * ga + qb * gb,
+        qa * gb + qb * gc,
+        qb * ga + qc * gb,
+        qb * gb + qc * gc,
+    ];
+    let mut v_cov = [
+        -(left[0] * qa + left[1] * qb),
+        -two * (left[0] * qb + left[1] * qc),
+        -(left[2] * qb + left[3] * qc),
+    ];
+
+    // Opacity, with its compensation sqrt(det / det_dilated).
+    let v_sigmoid = if antialias {
+        let ratio = at.det * inv_det;
+        let floor = one.splat(COMPENSATION_FLOOR);
+        let compensation = ratio.max(floor).sqrt();
+        let v_ratio = (v_out.opacity * at.sigmoid * one.splat(0.5) / compensation).zero_where_not(floor.lt(ratio));
+        let v_det = v_ratio * inv_det;
+        let v_det_dilated = -v_det * ratio;
+        v_cov[0] += v_det * at.cov[2] + v_det_dilated * c;
+        v_cov[2] += v_det * at.cov[0] + v_det_dilated * a;
+        v_cov[1] -= two * b * (v_det + v_det_dilated);
+        v_out.opacity * compensation
+    } else {
+        v_out.opacity
+    };
+
+    // cov = V V^T, V = U diag(s), U = (J R) Rot.
+    let v_v: [[F; 3]; 2] = [
+        std::array::from_fn(|k| two * v_cov[0] * at.v[0][k] + v_cov[1] * at.v[1][k]),
+        std::array::from_fn(|k| two * v_cov[2] * at.v[1][k] + v_cov[1] * at.v[0][k]),
+    ];
+    let v_log_scale = std::array::from_fn(|k| v_v[0][k] * at.v[0][k] + v_v[1][k] * at.v[1][k]);
+    let v_u: [[F; 3]; 2] = std::array::from_fn(|r| std::array::from_fn(|k| v_v[r][k] * at.scale[k]));
+    let v_rot: [[F; 3]; 3] =
+        std::array::from_fn(|j| std::array::from_fn(|k| at.jr[0][j] * v_u[0][k] + at.jr[1][j] * v_u[1][k]));
+    let v_jr: [[F; 3]; 2] = std::array::from_fn(|r| std::array::from_fn(|j| dot(v_u[r], at.rot[j])));
+
+    // J R: row r is f_r / z (R_r - tangent_r R_2).
+    let mut v_x = [zero; 3];
+    for r in 0..2 {
+        let j_scale = view.f[r] * at.inv_z;
+        let v_j_scale = dot(v_jr[r], view.r[r]) - at.tangent[r] * dot(v_jr[r], view.r[2]);
+        v_x[2] -= v_j_scale * j_scale * at.inv_z;
+        let v_tangent = -j_scale * dot(v_jr[r], view.r[2]);
+        let tangent = at.x[r] * at.inv_z;
+        let v_tangent = v_tangent.zero_where_not(tangent.abs().lt(view.limit[r]));
+        // The pixel position moves with the tangent too, unclamped.
+        let v_free = v_tangent + v_out.xy[r] * view.f[r];
+        v_x[r] += v_free * at.inv_z;
+        v_x[2] -= v_free * tangent * at.inv_z;
+    }
+    v_x[2] += v_out.depth;
+    let v_mean = std::array::from_fn(|j| dot(v_x, [view.r[0][j], view.r[1][j], view.r[2][j]]));
+
+    // Rot(q), then the normalisation of q.
+    let [w, i, j, k] = at.q;
+    let m = v_rot;
+    let v_q = [
+        two * (k * (m[1][0] - m[0][1]) + j * (m[0][2] - m[2][0]) + i * (m[2][1] - m[1][2])),
+        two * (j * (m[0][1] + m[1][0]) + k * (m[0][2] + m[2][0]) + w * (m[2][1] - m[1][2])
+            - two * i * (m[1][1] + m[2][2])),
+        two * (i * (m[0][1] + m[1][0]) + k * (m[1][2] + m[2][1]) + w * (m[0][2] - m[2][0])
+            - two * j * (m[0][0] + m[2][2])),
+        two * (i * (m[0][2] + m[2][0]) + j * (m[1][2] + m[2][1]) + w * (m[1][0] - m[0][1])
+            - two * k * (m[0][0] + m[1][1])),
+    ];
+    let along = v_q[0] * w + v_q[1] * i + v_q[2] * j + v_q[3] * k;
+    let v_quat = std::array::from_fn(|n| (v_q[n] - at.q[n] * along) * at.inv_q_norm);
+
+    Geometry {
+        mean: v_mean,
+        quat: v_quat,
+        log_scale: v_log_scale,
+        opacity_logit: v_sigmoid * at.sigmoid * (one - at.sigmoid),
+    }
+}

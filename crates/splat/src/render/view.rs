@@ -1,0 +1,76 @@
+use irradia_compute::simd::Simd;
+use irradia_scene::Camera;
+
+/// A pinhole camera as the renderer uses it, in double precision so that tests lose nothing.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ViewParams {
+    /// Rotation of `x_cam = R x + t`, row-major.
+    pub rotation: [[f64; 3]; 3],
+    /// Translation of `x_cam = R x + t`.
+    pub translation: [f64; 3],
+    /// Focal lengths, pixels.
+    pub focal: [f64; 2],
+    /// Principal point, pixels.
+    pub principal: [f64; 2],
+    /// Image width, pixels.
+    pub width: u32,
+    /// Image height, pixels.
+    pub height: u32,
+    /// Near plane, world units.
+    pub near: f64,
+}
+
+impl ViewParams {
+    /// From a scene camera; its lens is not looked at (readers undistort).
+    pub fn new(camera: &Camera) -> Self {
+        let (r, t) = camera.pose.camera_from_world_parts();
+        let r = r.to_cols_array_2d();
+        let k = &camera.intrinsics;
+        Self {
+            rotation: std::array::from_fn(|i| std::array::from_fn(|j| f64::from(r[j][i]))),
+            translation: t.to_array().map(f64::from),
+            focal: [k.fx, k.fy].map(f64::from),
+            principal: [k.cx, k.cy].map(f64::from),
+            width: k.width,
+            height: k.height,
+            near: f64::from(camera.near),
+        }
+    }
+
+    /// The camera's centre in the world: `-R^T t`.
+    pub fn center(&self) -> [f64; 3] {
+        std::array::from_fn(|j| -(0..3).map(|i| self.rotation[i][j] * self.translation[i]).sum::<f64>())
+    }
+
+    /// `|X / Z|` beyond which J is evaluated at the limit: Inria's 1.3 tan(fov / 2), about the axis.
+    pub fn tangent_limit(&self) -> [f64; 2] {
+        let size = [self.width, self.height];
+        std::array::from_fn(|i| 1.3 * 0.5 * f64::from(size[i]) / self.focal[i])
+    }
+
+    #[inline(always)]
+    pub(super) fn lanes<S: Simd>(&self, simd: S) -> ViewLanes<S::F> {
+        ViewLanes {
+            r: self.rotation.map(|row| row.map(|v| simd.splat(v))),
+            t: self.translation.map(|v| simd.splat(v)),
+            f: self.focal.map(|v| simd.splat(v)),
+            c: self.principal.map(|v| simd.splat(v)),
+            limit: self.tangent_limit().map(|v| simd.splat(v)),
+            size: [self.width, self.height].map(|v| simd.splat(f64::from(v))),
+            center: self.center().map(|v| simd.splat(v)),
+            near: simd.splat(self.near),
+        }
+    }
+}
+
+/// [`ViewParams`] in every lane.
+pub(super) struct ViewLanes<F> {
+    pub r: [[F; 3]; 3],
+    pub t: [F; 3],
+    pub f: [F; 2],
+    pub c: [F; 2],
+    pub limit: [F; 2],
+    pub size: [F; 2],
+    pub center: [F; 3],
+    pub near: F,
+}

@@ -1,0 +1,141 @@
+//! Forward and backward against an independent double-precision implementation (`../shared/golden`).
+
+use irradia_compute::simd::Level;
+use irradia_scene::GaussianCloud;
+use irradia_splat::{OutputGradient, RenderOptions, Renderer, SplatGradients, Splats, ViewParams};
+use irradia_testkit::{Golden, max_abs_difference, relative_difference, shared};
+
+/// The cases in this project's conventions; `symclamp` files hold Inria's clamp, which is ours where cx is off-centre.
+const CASES: [&str; 5] = [
+    "c0_n50_64x64_sh0",
+    "c1_n500_128x96_sh1_symclamp",
+    "c2_n500_128x96_sh2_aa",
+    "c3_n3000_200x120_sh3",
+    "c4_n60_edge_77x53_sh3_symclamp",
+];
+
+fn splats(golden: &Golden) -> Splats {
+    let columns = |name: &str| golden.get_f32(name);
+    Splats::from_cloud(&GaussianCloud {
+        means: columns("means").as_chunks().0.to_vec(),
+        quats: columns("quats").as_chunks().0.to_vec(),
+        log_scales: columns("log_scales").as_chunks().0.to_vec(),
+        opacity_logits: columns("logit_opac"),
+        sh: columns("sh"),
+        sh_degree: golden.scalar("sh_degree") as u32,
+        antialiased: false,
+    })
+}
+
+fn view(golden: &Golden) -> ViewParams {
+    let (v, k) = (golden.get("viewmat"), golden.get("K"));
+    ViewParams {
+        rotation: std::array::from_fn(|i| std::array::from_fn(|j| v[4 * i + j])),
+        translation: std::array::from_fn(|i| v[4 * i + 3]),
+        focal: [k[0], k[4]],
+        principal: [k[2], k[5]],
+        width: golden.scalar("width") as u32,
+        height: golden.scalar("height") as u32,
+        near: 0.01,
+    }
+}
+
+fn options(golden: &Golden) -> RenderOptions {
+    RenderOptions {
+        background: golden.get_f32("background").try_into().expect("three channels"),
+        sh_degree: golden.scalar("sh_degree") as u32,
+        antialias: golden.scalar("antialias") != 0.0,
+        depth: true,
+    }
+}
+
+/// `[3, H, W]` from `[H, W, 3]`.
+fn planar(interleaved: &[f64]) -> Vec<f32> {
+    (0..3)
+        .flat_map(|c| interleaved.iter().skip(c).step_by(3).map(|v| *v as f32))
+        .collect()
+}
+
+fn interleaved(planar: &[f32]) -> Vec<f64> {
+    let pixels = planar.len() / 3;
+    (0..planar.len())
+        .map(|i| f64::from(planar[(i % 3) * pixels + i / 3]))
+        .collect()
+}
+
+fn wide(values: &[f32]) -> Vec<f64> {
+    values.iter().map(|v| f64::from(*v)).collect()
+}
+
+#[test]
+fn images_agree() {
+    for case in CASES {
+        let Some(path) = shared(&format!("golden/{case}.safetensors")) else {
+            return;
+        };
+        let golden = Golden::read(&path);
+        let robust = golden.get("fragile");
+        for level in Level::all() {
+            let mut renderer = Renderer::with_level(level);
+            renderer.render(&splats(&golden), &view(&golden), &options(&golden));
+            // The issue asks for 1e-4; 2e-5 is what single precision can hold (golden/README.md).
+            for (name, got, channels, scale) in [
+                ("out_rgb", interleaved(renderer.color()), 3, 1.0),
+                ("out_alpha", wide(renderer.alpha()), 1, 1.0),
+                ("out_depth_acc", wide(renderer.depth()), 1, 10.0),
+            ] {
+                let d = max_abs_difference(&got, golden.get(name), |i| robust[i / channels] == 0.0);
+                println!("{case} {} {name}: {:.2e}", level.name(), d.worst);
+                assert!(d.worst < 2e-5 * scale, "{case} {} {name}: {d:?}", level.name());
+            }
+        }
+    }
+}
+
+#[test]
+fn gradients_agree() {
+    for case in CASES {
+        let Some(path) = shared(&format!("golden/{case}.safetensors")) else {
+            return;
+        };
+        let golden = Golden::read(&path);
+        let splats = splats(&golden);
+        for level in Level::all() {
+            let mut renderer = Renderer::with_level(level);
+            renderer.render(&splats, &view(&golden), &options(&golden));
+            let color = planar(golden.get("W1"));
+            let (alpha, depth) = (golden.get_f32("W2"), golden.get_f32("W3"));
+            for (set, depth) in [("gradA", None), ("gradB", Some(&depth[..]))] {
+                let v_out = OutputGradient {
+                    color: &color,
+                    alpha: Some(&alpha),
+                    depth,
+                };
+                let mut gradients = SplatGradients::default();
+                renderer.backward(&splats, &v_out, &mut gradients);
+                assert_eq!(gradients.non_finite, 0);
+                let names = ["means", "quats", "log_scales", "logit_opac", "sh"];
+                for (name, column) in names.iter().zip(gradients.splats.columns()) {
+                    let mut got = column.to_interleaved();
+                    for (i, item) in got.chunks_mut(column.count()).enumerate() {
+                        if gradients.active[i] == 0.0 {
+                            item.fill(0.0);
+                        }
+                    }
+                    let d = relative_difference(&wide(&got), golden.get(&format!("{set}_{name}")));
+                    println!("{case} {} {set}_{name}: {:.2e}", level.name(), d.worst);
+                    // As the issue asks: single precision against double, relative to the largest of the array.
+                    assert!(d.worst < 1e-3, "{case} {} {set}_{name}: {d:?}", level.name());
+                }
+                let mut screen = gradients.screen.to_interleaved();
+                for (i, item) in screen.chunks_mut(2).enumerate() {
+                    if gradients.active[i] == 0.0 {
+                        item.fill(0.0);
+                    }
+                }
+                let d = relative_difference(&wide(&screen), golden.get(&format!("{set}_means2d")));
+                assert!(d.worst < 1e-3, "{case} {} {set}_means2d: {d:?}", level.name());
+            }
+        }
+    }
+}

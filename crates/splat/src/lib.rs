@@ -1,8 +1,12 @@
 //! 3D Gaussian splatting (Kerbl et al. 2023): rendering, its gradients, initialisation and density control.
 #![forbid(unsafe_code)]
 
+pub mod densify;
+pub mod init;
 pub mod render;
 mod splats;
+mod state;
 
 pub use render::{OutputGradient, RenderOptions, Renderer, SplatGradients, ViewParams};
 pub use splats::{COLUMN_NAMES, Splats, logit, sigmoid};
+pub use state::{Rates, SplatState};

@@ -60,7 +60,6 @@ struct Intermediate<F> {
     scale: [F; 3],
     /// Rows of J R.
     jr: [[F; 3]; 2],
-    u: [[F; 3]; 2],
     v: [[F; 3]; 2],
     /// Before dilation: a, b, c and the determinant.
     cov: [F; 3],
@@ -139,7 +138,6 @@ fn intermediate<F: Lanes>(view: &ViewLanes<F>, g: &Geometry<F>) -> Intermediate<
         rot,
         scale,
         jr,
-        u,
         v,
         cov,
         det,

@@ -1,0 +1,14 @@
+//! Density control: where splats are added and removed. One file a strategy.
+
+pub mod classic;
+
+/// What one round of density control did.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct DensityChange {
+    /// Splats copied where they stand.
+    pub cloned: usize,
+    /// Splats replaced by two smaller ones.
+    pub split: usize,
+    /// Splats removed.
+    pub pruned: usize,
+}

@@ -1,0 +1,211 @@
+//! Where the first splats stand: on points that structure from motion found, or at random in what the cameras see.
+
+use crate::{Splats, logit};
+use glam::{Vec2, Vec3};
+use irradia_scene::{Camera, GaussianCloud, PointCloud, Rng, sh};
+use kiddo::SquaredEuclidean;
+use kiddo::immutable::float::kdtree::ImmutableKdTree;
+use rayon::prelude::*;
+use std::num::NonZero;
+
+/// Knobs of the first cloud.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct InitOptions {
+    /// Opacity of every splat; 0.1 in 3DGS.
+    pub opacity: f32,
+    /// Factor on the neighbour distance; 1 in 3DGS.
+    pub scale: f32,
+    /// Room for SH of this degree.
+    pub sh_degree: u32,
+}
+
+/// One round splat on each point, as large as the root mean square distance to its three nearest neighbours (Inria code).
+pub fn from_points(points: &PointCloud, options: &InitOptions) -> Splats {
+    let kept: Vec<usize> = (0..points.len()).filter(|i| points.positions[*i].is_finite()).collect();
+    let positions: Vec<[f32; 3]> = kept.iter().map(|i| points.positions[*i].to_array()).collect();
+    let n = positions.len();
+    let distances = neighbour_distances(&positions);
+    let coefficients = sh::coefficients(options.sh_degree);
+    let mut harmonics = vec![0.0; n * coefficients * 3];
+    for (to, i) in harmonics.chunks_mut(coefficients * 3).zip(&kept) {
+        for (to, color) in to.iter_mut().zip(points.colors[*i]) {
+            *to = sh::dc_from_color(f32::from(color) / 255.0);
+        }
+    }
+    Splats::from_cloud(&GaussianCloud {
+        means: positions,
+        quats: vec![[1.0, 0.0, 0.0, 0.0]; n],
+        log_scales: distances.iter().map(|d| [(d * options.scale).ln(); 3]).collect(),
+        opacity_logits: vec![logit(options.opacity); n],
+        sh: harmonics,
+        sh_degree: options.sh_degree,
+        antialiased: false,
+    })
+}
+
+/// Root mean square distance to the three nearest neighbours, at least 1e-7 of the cloud's size, for it is put into a logarithm.
+fn neighbour_distances(positions: &[[f32; 3]]) -> Vec<f32> {
+    let size = (0..3)
+        .map(|c| {
+            let (low, high) = positions
+                .iter()
+                .fold((f32::MAX, f32::MIN), |(l, h), p| (l.min(p[c]), h.max(p[c])));
+            (high - low).max(0.0)
+        })
+        .fold(0.0f32, f32::max);
+    if positions.len() < 2 || size == 0.0 {
+        return vec![if size > 0.0 { 0.01 * size } else { 0.01 }; positions.len()];
+    }
+    let tree: ImmutableKdTree<f32, u32, 3, 32> = ImmutableKdTree::new_from_slice(positions);
+    let wanted = NonZero::new(4).expect("not zero"); // The first is the point itself.
+    positions
+        .par_iter()
+        .map(|p| {
+            let near = tree.nearest_n::<SquaredEuclidean>(p, wanted);
+            let others = &near[1..];
+            let mean = others.iter().map(|n| n.distance).sum::<f32>() / others.len() as f32;
+            mean.sqrt().max(1e-7 * size)
+        })
+        .collect()
+}
+
+/// `count` points in the space that the cameras see, for scenes that come without any. `depth_bounds[i]` says how near
+/// and far view i's scene lies, where that is known; otherwise it is taken around the point that the cameras look at.
+///
+/// Points are drawn along random pixels' rays, uniformly in inverse depth, and kept with a probability that grows with
+/// the share of cameras that see them, so that they gather where views overlap. `color(view, pixel)` gives the colour.
+pub fn random_points(
+    cameras: &[Camera],
+    depth_bounds: &[Option<[f32; 2]>],
+    count: usize,
+    rng: &mut Rng,
+    color: impl Fn(usize, Vec2) -> [u8; 3],
+) -> PointCloud {
+    let mut cloud = PointCloud::default();
+    let focus = focus_point(cameras);
+    for attempt in 0..count * 20 {
+        if cloud.len() == count || cameras.is_empty() {
+            break;
+        }
+        let view = rng.below(cameras.len() as u32) as usize;
+        let camera = &cameras[view];
+        let k = &camera.intrinsics;
+        let pixel = Vec2::new(rng.uniform() * k.width as f32, rng.uniform() * k.height as f32);
+        let [near, far] = depth_bounds.get(view).copied().flatten().unwrap_or_else(|| {
+            let distance = focus.distance(camera.pose.position).max(4.0 * camera.near);
+            [0.5 * distance, 1.6 * distance]
+        });
+        let inverse = rng.range(1.0 / far, 1.0 / near);
+        let ray = camera.pose.rotation * Vec3::new((pixel.x - k.cx) / k.fx, (pixel.y - k.cy) / k.fy, 1.0);
+        let point = camera.pose.position + ray / inverse;
+        let seen = cameras.iter().filter(|c| sees(c, point)).count() as f32 / cameras.len() as f32;
+        // Late attempts take what comes: a scene whose cameras share little must still get its points.
+        if rng.uniform() < seen || attempt > count * 15 {
+            cloud.positions.push(point);
+            cloud.colors.push(color(view, pixel));
+        }
+    }
+    cloud
+}
+
+fn sees(camera: &Camera, point: Vec3) -> bool {
+    let k = &camera.intrinsics;
+    camera
+        .project(point)
+        .is_some_and(|(p, _)| p.x >= 0.0 && p.y >= 0.0 && p.x < k.width as f32 && p.y < k.height as f32)
+}
+
+/// The point nearest to all optical axes, in the least-squares sense, pulled in front of the cameras when they look in
+/// parallel (forward-facing captures), where it would lie at infinity.
+pub fn focus_point(cameras: &[Camera]) -> Vec3 {
+    let n = cameras.len().max(1) as f32;
+    let center = cameras.iter().map(|c| c.pose.position).sum::<Vec3>() / n;
+    let spread = camera_extent(cameras);
+    let mut normal = glam::Mat3::from_diagonal(Vec3::splat(1e-3));
+    let mut right =
+        1e-3 * (center + cameras.iter().map(|c| c.pose.rotation * Vec3::Z).sum::<Vec3>() / n * 4.0 * spread);
+    for camera in cameras {
+        let axis = camera.pose.rotation * Vec3::Z;
+        let across = glam::Mat3::IDENTITY - glam::Mat3::from_cols(axis * axis.x, axis * axis.y, axis * axis.z);
+        let across = across * (1.0 / n);
+        normal += across;
+        right += across * camera.pose.position;
+    }
+    normal.inverse() * right
+}
+
+/// The scene's size as 3DGS measures it: 1.1 times the largest distance of a camera from the cameras' mean.
+pub fn camera_extent(cameras: &[Camera]) -> f32 {
+    let center = cameras.iter().map(|c| c.pose.position).sum::<Vec3>() / cameras.len().max(1) as f32;
+    let radius = cameras
+        .iter()
+        .map(|c| c.pose.position.distance(center))
+        .fold(0.0, f32::max);
+    if radius > 0.0 { 1.1 * radius } else { 1.0 }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use irradia_scene::{Intrinsics, Pose};
+
+    const OPTIONS: InitOptions = InitOptions {
+        opacity: 0.1,
+        scale: 1.0,
+        sh_degree: 1,
+    };
+
+    #[test]
+    fn a_grid_gives_its_spacing_as_scale_and_its_colour_as_dc() {
+        let mut points = PointCloud::default();
+        for i in 0..4 {
+            for j in 0..4 {
+                for k in 0..4 {
+                    points.positions.push(Vec3::new(i as f32, j as f32, k as f32) * 0.5);
+                    points.colors.push([255, 0, 51]);
+                }
+            }
+        }
+        let splats = from_points(&points, &OPTIONS);
+        assert_eq!(splats.len(), 64);
+        for i in 0..64 {
+            assert!((splats.log_scales.get(1, i) - 0.5f32.ln()).abs() < 1e-5);
+            assert!((splats.opacity(i) - 0.1).abs() < 1e-6);
+            assert!((sh::color_from_dc(splats.sh.get(2, i)) - 0.2).abs() < 1e-5);
+        }
+    }
+
+    #[test]
+    fn equal_points_one_point_and_poison_give_finite_scales() {
+        let same = |n: usize| PointCloud {
+            positions: vec![Vec3::ONE; n],
+            colors: vec![[9; 3]; n],
+        };
+        for mut points in [same(0), same(1), same(100)] {
+            points.positions.push(Vec3::NAN);
+            points.colors.push([0; 3]);
+            let n = points.len() - 1;
+            let splats = from_points(&points, &OPTIONS);
+            assert_eq!(splats.len(), n);
+            assert!(splats.log_scales.as_slice().iter().all(|s| s.is_finite()));
+        }
+    }
+
+    #[test]
+    fn a_ring_of_cameras_focuses_on_its_middle_and_points_fall_where_they_look() {
+        let target = Vec3::new(1.0, 2.0, 0.5);
+        let cameras: Vec<Camera> = (0..12)
+            .map(|i| {
+                let angle = i as f32 * 0.5236;
+                let eye = target + Vec3::new(4.0 * angle.cos(), 4.0 * angle.sin(), 2.0);
+                Camera::new(Pose::look_at(eye, target, Vec3::Z), Intrinsics::from_fov_x(64, 64, 0.7))
+            })
+            .collect();
+        assert!(focus_point(&cameras).distance(target) < 0.02);
+        let cloud = random_points(&cameras, &[], 500, &mut Rng::new(1, 0), |view, _| [view as u8; 3]);
+        assert_eq!(cloud.len(), 500);
+        let mean = cloud.positions.iter().sum::<Vec3>() / 500.0;
+        assert!(mean.distance(target) < 0.5, "{mean}");
+        assert!(random_points(&[], &[], 10, &mut Rng::new(1, 0), |_, _| [0; 3]).is_empty());
+    }
+}

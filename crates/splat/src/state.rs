@@ -1,0 +1,236 @@
+use crate::{SplatGradients, Splats};
+use irradia_compute::Planes;
+use irradia_compute::adam::{AdamStep, adam};
+use irradia_compute::simd::Level;
+use rayon::prelude::*;
+
+/// Splats being trained, with everything that must stay in step with them.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct SplatState {
+    /// The parameters.
+    pub splats: Splats,
+    /// Adam's first and second moments.
+    pub moments: [Splats; 2],
+    /// What density control has gathered since it last acted: planes [`SplatState::GRADIENT`], [`SplatState::SEEN`],
+    /// [`SplatState::EXTENT`].
+    pub statistics: Planes,
+}
+
+/// Learning rates of one step.
+#[derive(Clone, Copy, Debug, PartialEq, Default)]
+pub struct Rates {
+    /// Of the means, world units a step.
+    pub means: f32,
+    /// Of the raw quaternions.
+    pub quats: f32,
+    /// Of the ln scales.
+    pub log_scales: f32,
+    /// Of the opacity logits.
+    pub opacities: f32,
+    /// Of the SH's DC coefficients.
+    pub sh_dc: f32,
+    /// Of the other SH coefficients.
+    pub sh_rest: f32,
+}
+
+impl SplatState {
+    /// Statistics plane: sum of the screen-space gradient's norm, in normalised device coordinates as in 3DGS.
+    pub const GRADIENT: usize = 0;
+    /// Statistics plane: frames in which the splat was visible.
+    pub const SEEN: usize = 1;
+    /// Statistics plane: largest half size on screen, pixels.
+    pub const EXTENT: usize = 2;
+
+    /// Fresh moments and statistics for `splats`, which are put into Morton order.
+    pub fn new(splats: Splats) -> Self {
+        let (n, degree) = (splats.len(), splats.sh_degree());
+        let mut state = Self {
+            splats,
+            moments: std::array::from_fn(|_| Splats::zeros(n, degree)),
+            statistics: Planes::zeros(3, n),
+        };
+        state.sort_by_place();
+        state
+    }
+
+    /// How many splats.
+    pub fn len(&self) -> usize {
+        self.splats.len()
+    }
+
+    /// Whether there are none.
+    pub fn is_empty(&self) -> bool {
+        self.splats.is_empty()
+    }
+
+    /// Keeps the splats `indices`, in that order, with their moments and statistics.
+    pub fn gather(&mut self, indices: &[u32]) {
+        self.splats = self.splats.gather(indices);
+        self.moments = [self.moments[0].gather(indices), self.moments[1].gather(indices)];
+        self.statistics = self.statistics.gather(indices);
+    }
+
+    /// Adds `splats` with moments and statistics of zero.
+    pub fn append(&mut self, splats: &Splats) {
+        let zeros = Splats::zeros(splats.len(), splats.sh_degree());
+        self.splats.append(splats);
+        for moment in &mut self.moments {
+            moment.append(&zeros);
+        }
+        self.statistics.append(&Planes::zeros(3, splats.len()));
+    }
+
+    /// Puts neighbours in space beside each other in memory (Morton order of the means), so that a vector of splats is
+    /// visible, or not, together, and tiles read few cache lines.
+    pub fn sort_by_place(&mut self) {
+        let order = morton_order(&self.splats.means);
+        self.gather(&order);
+    }
+
+    /// One Adam step with `gradients`, on the splats that were active. SH bands above `sh_degree` rest.
+    pub fn step(&mut self, level: Level, gradients: &SplatGradients, rates: &Rates, sh_degree: u32, step: AdamStep) {
+        let mut sh = vec![0.0; self.splats.sh.count()];
+        for (plane, rate) in sh
+            .iter_mut()
+            .enumerate()
+            .take(3 * irradia_scene::sh::coefficients(sh_degree))
+        {
+            *rate = if plane < 3 { rates.sh_dc } else { rates.sh_rest };
+        }
+        let rates = [
+            vec![rates.means; 3],
+            vec![rates.quats; 4],
+            vec![rates.log_scales; 3],
+            vec![rates.opacities],
+            sh,
+        ];
+        let [first, second] = &mut self.moments;
+        let columns = self
+            .splats
+            .columns_mut()
+            .into_iter()
+            .zip(first.columns_mut())
+            .zip(second.columns_mut());
+        for (((parameters, first), second), (g, rates)) in
+            columns.zip(gradients.splats.columns().into_iter().zip(rates))
+        {
+            adam(level, parameters, g, [first, second], &rates, &gradients.active, step);
+        }
+    }
+
+    /// Adds one frame's gradients to the statistics. `width` and `height` are the frame's, pixels; `extent(i)` is splat
+    /// i's half size on screen.
+    pub fn gather_statistics(
+        &mut self,
+        gradients: &SplatGradients,
+        width: u32,
+        height: u32,
+        extent: impl Fn(usize) -> f32 + Sync,
+    ) {
+        let n = self.len();
+        let stride = self.statistics.stride();
+        let (x, y) = (gradients.screen.plane(0), gradients.screen.plane(1));
+        // Pixels to normalised device coordinates, whose range is 2.
+        let scale = [0.5 * width as f32, 0.5 * height as f32];
+        let [gradient, seen, extents] = {
+            let (a, rest) = self.statistics.as_mut_slice().split_at_mut(stride);
+            let (b, c) = rest.split_at_mut(stride);
+            [a, b, c]
+        };
+        gradient[..n]
+            .par_iter_mut()
+            .zip(&mut seen[..n])
+            .zip(&mut extents[..n])
+            .with_min_len(4096)
+            .enumerate()
+            .filter(|(i, _)| gradients.active[*i] != 0.0)
+            .for_each(|(i, ((gradient, seen), largest))| {
+                let (gx, gy) = (x[i] * scale[0], y[i] * scale[1]);
+                *gradient += (gx * gx + gy * gy).sqrt();
+                *seen += 1.0;
+                *largest = largest.max(extent(i));
+            });
+    }
+}
+
+/// Indices in Morton (Z-curve) order of the positions, 10 bits an axis, over the box that holds the middle 98 % of each
+/// axis (a few points far out would otherwise share the whole scene's cell).
+fn morton_order(means: &Planes) -> Vec<u32> {
+    let n = means.len();
+    let mut codes = vec![0u32; n];
+    for axis in 0..3 {
+        let values = &means.plane(axis)[..n];
+        let mut sample: Vec<f32> = values
+            .iter()
+            .copied()
+            .step_by((n / 4096).max(1))
+            .filter(|v| v.is_finite())
+            .collect();
+        sample.sort_unstable_by(f32::total_cmp);
+        let Some(last) = sample.len().checked_sub(1) else {
+            continue;
+        };
+        let (low, high) = (sample[last / 100], sample[last - last / 100]);
+        let scale = 1023.0 / (high - low).max(1e-20);
+        for (code, value) in codes.iter_mut().zip(values) {
+            *code |= spread(((value - low) * scale).clamp(0.0, 1023.0) as u32) << axis;
+        }
+    }
+    let mut order: Vec<u32> = (0..n as u32).collect();
+    order.par_sort_by_key(|i| codes[*i as usize]);
+    order
+}
+
+/// Ten bits to every third bit of thirty.
+fn spread(v: u32) -> u32 {
+    let v = (v | v << 16) & 0x0300_00ff;
+    let v = (v | v << 8) & 0x0300_f00f;
+    let v = (v | v << 4) & 0x030c_30c3;
+    (v | v << 2) & 0x0924_9249
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn gather_and_append_keep_moments_with_their_splats() {
+        let mut state = SplatState::new(Splats::zeros(0, 1));
+        let mut three = Splats::zeros(3, 1);
+        for i in 0..3 {
+            three.means.set(0, i, i as f32);
+        }
+        state.append(&three);
+        for i in 0..3 {
+            state.moments[1].means.set(0, i, 10.0 * i as f32);
+            state.statistics.set(SplatState::SEEN, i, 100.0 * i as f32);
+        }
+        state.gather(&[2, 0]);
+        state.append(&three);
+        assert_eq!(state.len(), 5);
+        let column = |p: &Planes, c: usize| p.plane(c)[..5].to_vec();
+        assert_eq!(column(&state.splats.means, 0), [2.0, 0.0, 0.0, 1.0, 2.0]);
+        assert_eq!(column(&state.moments[1].means, 0), [20.0, 0.0, 0.0, 0.0, 0.0]);
+        assert_eq!(column(&state.statistics, SplatState::SEEN), [200.0, 0.0, 0.0, 0.0, 0.0]);
+    }
+
+    #[test]
+    fn morton_order_groups_octants() {
+        let corners: Vec<f32> = (0..64)
+            .flat_map(|i| {
+                [
+                    (i * 37 % 64 & 1) as f32,
+                    (i * 37 % 64 >> 1 & 1) as f32,
+                    (i * 37 % 64 >> 2 & 1) as f32,
+                ]
+            })
+            .collect();
+        let means = Planes::from_interleaved(3, &corners);
+        let order = morton_order(&means);
+        let runs = order
+            .windows(2)
+            .filter(|w| (0..3).any(|c| means.get(c, w[0] as usize) != means.get(c, w[1] as usize)))
+            .count();
+        assert_eq!(runs, 7, "eight corners, seven changes");
+    }
+}

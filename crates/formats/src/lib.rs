@@ -1,1 +1,28 @@
-//! See the crate's description in Cargo.toml.
+//! Files in, files out: datasets of posed photographs, splat scenes, point clouds and pictures.
+//!
+//! Foreign conventions stop in this crate: whatever a file means by a pose, a pixel or a colour, what comes out follows
+//! the conventions of [`irradia_scene`]. The parsers in [`parse`] take bytes and are fuzzed; no input makes them panic,
+//! and no size that a file declares is allocated before it was held against the size the file really has.
+#![forbid(unsafe_code)]
+
+mod atomic;
+mod bytes;
+mod complete;
+mod dataset;
+mod describe;
+mod error;
+mod image_file;
+pub mod parse;
+mod photo;
+mod ply;
+mod points_ply;
+mod splats;
+mod undistort;
+
+pub use atomic::write_atomic;
+pub use dataset::{DatasetFormat, DatasetOptions, read_dataset};
+pub use describe::{Description, Kind, describe, detect};
+pub use error::{FormatError, Malformed};
+pub use image_file::{Pixels, read_image, write_png};
+pub use points_ply::read_points_ply;
+pub use splats::{SplatFormat, read_splats, write_splats};

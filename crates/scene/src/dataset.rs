@@ -1,4 +1,4 @@
-use crate::{Camera, PointCloud};
+use crate::{Camera, PointCloud, resize_area};
 use std::sync::Arc;
 
 /// Why a photograph could not be loaded: one line that says what, where and what to do.
@@ -26,6 +26,41 @@ impl Photo {
     pub fn bytes(&self) -> usize {
         self.data.len() + self.mask.as_ref().map_or(0, Vec::len)
     }
+
+    /// The same photograph at `width` x `height`, averaged over area; a mask counts a pixel that is kept by half or more.
+    pub fn resized(&self, width: u32, height: u32) -> Self {
+        if (width, height) == (self.width, self.height) {
+            return self.clone();
+        }
+        let (from, to) = ([self.width, self.height], [width, height]);
+        Self {
+            width,
+            height,
+            channels: self.channels,
+            data: resize_area(&self.data, self.channels, from, to),
+            mask: self.mask.as_ref().map(|mask| {
+                let mean = resize_area(mask, 1, from, to);
+                mean.into_iter().map(|v| if v >= 128 { 255 } else { 0 }).collect()
+            }),
+        }
+    }
+
+    /// `[H, W, 3]` laid over `background` (sRGB in \[0, 1\]), as 8 bits.
+    pub fn over(&self, background: [f32; 3]) -> Vec<u8> {
+        if self.channels == 3 {
+            return self.data.clone();
+        }
+        let pixel = |p: &[u8]| -> [u8; 3] {
+            let alpha = f32::from(p[3]) / 255.0;
+            std::array::from_fn(|c| (f32::from(p[c]) * alpha + 255.0 * background[c] * (1.0 - alpha)).round() as u8)
+        };
+        self.data.chunks_exact(4).flat_map(pixel).collect()
+    }
+
+    /// `[H, W]`, where there is an alpha channel.
+    pub fn alpha(&self) -> Option<Vec<u8>> {
+        (self.channels == 4).then(|| self.data.iter().skip(3).step_by(4).copied().collect())
+    }
 }
 
 /// Something that can produce a view's photograph again and again: a file, or pixels in memory.
@@ -52,6 +87,8 @@ pub struct View {
     pub camera: Camera,
     /// The pixels, loaded when needed.
     pub photo: Arc<dyn PhotoSource>,
+    /// How near and how far this view's scene lies along +Z, world units, where the source says so.
+    pub depth_bounds: Option<[f32; 2]>,
     /// Indices into [`Dataset::points`] of the points this view is known to see; empty where the source does not say.
     pub points_seen: Vec<u32>,
 }

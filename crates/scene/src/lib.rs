@@ -15,6 +15,7 @@ mod image;
 mod lens;
 mod points;
 mod pose;
+mod resize;
 pub mod rng;
 pub mod sh;
 
@@ -25,4 +26,5 @@ pub use image::Image;
 pub use lens::Lens;
 pub use points::PointCloud;
 pub use pose::Pose;
+pub use resize::resize_area;
 pub use rng::Rng;

@@ -1,1 +1,15 @@
-//! See the crate's description in Cargo.toml.
+//! Training: recipes, the schedule, the loop, checkpoints and reports. Read [`Trainer::step`] first.
+#![forbid(unsafe_code)]
+
+pub mod checkpoint;
+pub mod eval;
+pub mod event;
+mod photos;
+pub mod recipe;
+mod run;
+pub mod schedule;
+mod trainer;
+
+pub use recipe::{Recipe, RecipeError};
+pub use run::{RunLimits, run};
+pub use trainer::{TrainError, TrainOptions, Trainer};

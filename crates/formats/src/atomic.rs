@@ -1,0 +1,92 @@
+use crate::FormatError;
+use std::fs::{self, File, OpenOptions};
+use std::io::{self, BufWriter, Write};
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicU64, Ordering};
+
+/// Writes a file so that nobody ever sees half of it: under a temporary name in the same folder, synced to the disk,
+/// then renamed over `path`. When anything fails, or the process is killed, what was under `path` stays as it was.
+///
+/// # Errors
+/// [`FormatError::Write`] with the system's reason, such as a full disk; the temporary file is removed.
+pub fn write_atomic(path: &Path, write: impl FnOnce(&mut dyn Write) -> io::Result<()>) -> Result<(), FormatError> {
+    write_beside(path, write).map_err(|source| FormatError::Write {
+        path: path.to_owned(),
+        source,
+    })
+}
+
+fn write_beside(path: &Path, write: impl FnOnce(&mut dyn Write) -> io::Result<()>) -> io::Result<()> {
+    let (temporary, file) = Temporary::beside(path)?;
+    let mut writer = BufWriter::with_capacity(1 << 18, file);
+    write(&mut writer)?;
+    let file = writer.into_inner().map_err(|error| error.into_error())?;
+    file.sync_all()?;
+    drop(file);
+    temporary.become_file(path)
+}
+
+/// A file that is removed unless it gets its final name; also when the writing code panics.
+struct Temporary {
+    path: Option<PathBuf>,
+}
+
+impl Temporary {
+    fn beside(target: &Path) -> io::Result<(Self, File)> {
+        // Two threads, or a process that was killed earlier under the same id, must not meet in one name.
+        static COUNTER: AtomicU64 = AtomicU64::new(0);
+        let name = target
+            .file_name()
+            .ok_or_else(|| io::Error::new(io::ErrorKind::InvalidInput, "the path names no file"))?
+            .to_string_lossy()
+            .into_owned();
+        loop {
+            let number = COUNTER.fetch_add(1, Ordering::Relaxed);
+            let path = target.with_file_name(format!(".{name}.{}-{number}.tmp", std::process::id()));
+            match OpenOptions::new().write(true).create_new(true).open(&path) {
+                Ok(file) => return Ok((Self { path: Some(path) }, file)),
+                Err(error) if error.kind() == io::ErrorKind::AlreadyExists => {}
+                Err(error) => return Err(error),
+            }
+        }
+    }
+
+    fn become_file(mut self, target: &Path) -> io::Result<()> {
+        let path = self.path.as_ref().expect("set until it is renamed");
+        fs::rename(path, target)?;
+        self.path = None;
+        Ok(())
+    }
+}
+
+impl Drop for Temporary {
+    fn drop(&mut self) {
+        if let Some(path) = &self.path {
+            // The first error is the one worth telling; this one would hide it.
+            let _ = fs::remove_file(path);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_failed_write_leaves_the_old_file_and_no_temporary() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.bin");
+        write_atomic(&path, |w| w.write_all(b"first")).unwrap();
+        let error = write_atomic(&path, |w| {
+            w.write_all(b"sec")?;
+            Err(io::Error::other("no space left"))
+        })
+        .unwrap_err();
+        assert!(error.to_string().contains("a.bin") && error.to_string().contains("no space left"));
+        assert_eq!(fs::read(&path).unwrap(), b"first");
+        assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 1);
+        write_atomic(&path, |w| w.write_all(b"second")).unwrap();
+        assert_eq!(fs::read(&path).unwrap(), b"second");
+        assert!(write_atomic(&folder.path().join("none/a.bin"), |_| Ok(())).is_err());
+    }
+}

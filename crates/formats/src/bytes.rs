@@ -1,0 +1,77 @@
+use crate::Malformed;
+
+/// Little-endian values from a byte slice; running out is an error that says where.
+pub(crate) struct Bytes<'a> {
+    rest: &'a [u8],
+    total: usize,
+}
+
+impl<'a> Bytes<'a> {
+    pub fn new(bytes: &'a [u8]) -> Self {
+        Self {
+            rest: bytes,
+            total: bytes.len(),
+        }
+    }
+
+    pub fn take(&mut self, count: usize) -> Result<&'a [u8], Malformed> {
+        let Some((taken, rest)) = self.rest.split_at_checked(count) else {
+            return Err(Malformed(format!(
+                "ends too early: {count} bytes are needed at byte {} and {} are left; the file is truncated, copy it again",
+                self.total - self.rest.len(),
+                self.rest.len()
+            )));
+        };
+        self.rest = rest;
+        Ok(taken)
+    }
+
+    fn array<const N: usize>(&mut self) -> Result<[u8; N], Malformed> {
+        Ok(self.take(N)?.try_into().expect("took N"))
+    }
+
+    pub fn u8(&mut self) -> Result<u8, Malformed> {
+        Ok(self.array::<1>()?[0])
+    }
+
+    pub fn u32(&mut self) -> Result<u32, Malformed> {
+        Ok(u32::from_le_bytes(self.array()?))
+    }
+
+    pub fn u64(&mut self) -> Result<u64, Malformed> {
+        Ok(u64::from_le_bytes(self.array()?))
+    }
+
+    pub fn f64(&mut self) -> Result<f64, Malformed> {
+        Ok(f64::from_le_bytes(self.array()?))
+    }
+
+    pub fn f64s<const N: usize>(&mut self) -> Result<[f64; N], Malformed> {
+        let mut values = [0.0; N];
+        for value in &mut values {
+            *value = self.f64()?;
+        }
+        Ok(values)
+    }
+
+    /// Bytes up to a zero, which is taken too; invalid UTF-8 is replaced.
+    pub fn text(&mut self) -> Result<String, Malformed> {
+        let length = self.rest.iter().position(|byte| *byte == 0).unwrap_or(self.rest.len());
+        let text = String::from_utf8_lossy(self.take(length)?).into_owned();
+        self.u8()?;
+        Ok(text)
+    }
+
+    /// A u64 count of records that take at least `least` bytes each, held against what is left before anyone allocates.
+    pub fn count(&mut self, least: usize, what: &str) -> Result<usize, Malformed> {
+        let declared = self.u64()?;
+        let possible = self.rest.len() / least;
+        match usize::try_from(declared) {
+            Ok(count) if count <= possible => Ok(count),
+            _ => Err(Malformed(format!(
+                "promises {declared} {what}, but the {} bytes that follow hold at most {possible}; the file is damaged",
+                self.rest.len()
+            ))),
+        }
+    }
+}

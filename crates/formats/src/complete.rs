@@ -1,0 +1,39 @@
+//! Whether an image file goes on to its end. The JPEG decoder paints what is missing grey without a word, and a PNG that
+//! lacks its tail would fail only when it is decoded, in the midst of training.
+
+use std::io::{self, BufRead, Seek};
+
+/// Whether a JPEG in memory has its end-of-image marker behind the start of its scan.
+///
+/// The search begins behind the headers, as these may hold a thumbnail, which is a JPEG of its own with both markers.
+pub(crate) fn jpeg_is_complete(bytes: &[u8]) -> bool {
+    let mut rest = bytes.get(2..).unwrap_or_default();
+    loop {
+        match rest {
+            // Any number of fill bytes may stand before a marker.
+            [0xFF, 0xFF, ..] => rest = &rest[1..],
+            [0xFF, 0xDA, scan @ ..] => return scan.windows(2).rev().any(|pair| pair == [0xFF, 0xD9]),
+            [0xFF, _, high, low, ..] => {
+                let length = usize::from(u16::from_be_bytes([*high, *low]));
+                rest = rest.get(2 + length..).unwrap_or_default();
+            }
+            _ => return false,
+        }
+    }
+}
+
+/// Whether a PNG's chunks lead to its `IEND`; the reader stands at the start of the file and is left anywhere.
+pub(crate) fn png_is_complete(reader: &mut (impl BufRead + Seek)) -> io::Result<bool> {
+    let length = reader.seek(io::SeekFrom::End(0))?;
+    let mut at = 8;
+    while at + 12 <= length {
+        reader.seek(io::SeekFrom::Start(at))?;
+        let mut head = [0u8; 8];
+        reader.read_exact(&mut head)?;
+        if head[4..] == *b"IEND" {
+            return Ok(true);
+        }
+        at += 12 + u64::from(u32::from_be_bytes([head[0], head[1], head[2], head[3]]));
+    }
+    Ok(false)
+}

@@ -1,0 +1,330 @@
+//! COLMAP's sparse models: <https://colmap.github.io/format.html>. Its pixel convention is ours: the centre of the first
+//! pixel is at (0.5, 0.5). Its poses are camera-from-world.
+
+pub mod binary;
+pub mod text;
+
+use super::declared::{Declared, DeclaredCamera, DeclaredView, Focal, lens_or_pinhole};
+use super::files::{ImageFolder, choose_image_folder, find_image};
+use super::masks::Masks;
+use crate::error::read_and_parse;
+use crate::{FormatError, Malformed};
+use glam::{DQuat, DVec3};
+use irradia_scene::{Lens, PointCloud, Pose};
+use std::collections::HashMap;
+use std::path::{Path, PathBuf};
+
+/// A row of `cameras`.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ColmapCamera {
+    /// Its number.
+    pub id: u32,
+    /// COLMAP's name of the model: `PINHOLE`, `OPENCV`, ..
+    pub model: String,
+    /// Width in pixels.
+    pub width: u64,
+    /// Height in pixels.
+    pub height: u64,
+    /// As many as the model has, in COLMAP's order.
+    pub params: Vec<f64>,
+}
+
+/// A row of `images`.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ColmapImage {
+    /// Rotation camera-from-world, `w, x, y, z`.
+    pub rotation: [f64; 4],
+    /// Translation camera-from-world.
+    pub translation: [f64; 3],
+    /// [`ColmapCamera::id`].
+    pub camera_id: u32,
+    /// Path below the folder of images.
+    pub name: String,
+    /// [`ColmapPoint::id`] of the points seen.
+    pub points: Vec<u64>,
+}
+
+/// A row of `points3D`.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ColmapPoint {
+    /// Its number.
+    pub id: u64,
+    /// World.
+    pub position: [f64; 3],
+    /// sRGB.
+    pub color: [u8; 3],
+}
+
+/// The models by COLMAP's number, with their names and how many parameters they have (`models.h` of COLMAP).
+const MODELS: [(&str, usize); 11] = [
+    ("SIMPLE_PINHOLE", 3),
+    ("PINHOLE", 4),
+    ("SIMPLE_RADIAL", 4),
+    ("RADIAL", 5),
+    ("OPENCV", 8),
+    ("OPENCV_FISHEYE", 8),
+    ("FULL_OPENCV", 12),
+    ("FOV", 5),
+    ("SIMPLE_RADIAL_FISHEYE", 4),
+    ("RADIAL_FISHEYE", 5),
+    ("THIN_PRISM_FISHEYE", 12),
+];
+
+/// Where a model lies and in which of its two forms.
+pub(super) struct ModelFiles {
+    folder: PathBuf,
+    binary: bool,
+}
+
+/// The first complete model of `sparse/0`, `sparse` and the folder itself; binary before text.
+pub(super) fn find_model(root: &Path) -> Option<ModelFiles> {
+    ["sparse/0", "sparse", ""].into_iter().find_map(|below| {
+        let folder = root.join(below);
+        [true, false].into_iter().find_map(|binary| {
+            let files = ModelFiles {
+                folder: folder.clone(),
+                binary,
+            };
+            (files.path("cameras").is_file() && files.path("images").is_file()).then_some(files)
+        })
+    })
+}
+
+impl ModelFiles {
+    fn path(&self, table: &str) -> PathBuf {
+        self.folder
+            .join(format!("{table}.{}", if self.binary { "bin" } else { "txt" }))
+    }
+
+    fn read<T>(
+        &self,
+        table: &str,
+        binary: fn(&[u8]) -> Result<T, Malformed>,
+        text: fn(&[u8]) -> Result<T, Malformed>,
+    ) -> Result<T, FormatError> {
+        read_and_parse(&self.path(table), if self.binary { binary } else { text })
+    }
+}
+
+pub(super) fn read(root: &Path, downscale: f32) -> Result<Declared, FormatError> {
+    let Some(files) = find_model(root) else {
+        return Err(FormatError::malformed(root, "holds no COLMAP model"));
+    };
+    let mut cameras = HashMap::new();
+    for camera in files.read("cameras", binary::parse_cameras, text::parse_cameras)? {
+        let declared = declared_camera(&camera).map_err(|source| FormatError::Malformed {
+            path: files.path("cameras"),
+            source,
+        })?;
+        cameras.insert(camera.id, declared);
+    }
+    let images = files.read("images", binary::parse_images, text::parse_images)?;
+    let (points, index_of) = match files.path("points3D").is_file() {
+        true => gather(files.read("points3D", binary::parse_points, text::parse_points)?),
+        false => Default::default(),
+    };
+
+    let folder = choose_image_folder(root, downscale).unwrap_or(ImageFolder {
+        name: String::new(),
+        downscale,
+        warning: None,
+    });
+    let masks = Masks::beside(root, &folder.name);
+    let mut views = Vec::with_capacity(images.len());
+    for image in images {
+        let camera = *cameras.get(&image.camera_id).ok_or_else(|| {
+            let message = format!(
+                "{} is by camera {}, which cameras does not list",
+                image.name, image.camera_id
+            );
+            FormatError::malformed(&files.path("images"), message)
+        })?;
+        let name = image.name.replace('\\', "/");
+        let mut points_seen: Vec<u32> = image.points.iter().filter_map(|id| index_of.get(id)).copied().collect();
+        points_seen.sort_unstable();
+        points_seen.dedup();
+        views.push(DeclaredView {
+            image: find_image(&root.join(&folder.name).join(&name)),
+            mask: masks.as_ref().and_then(|masks| masks.of(&name)),
+            name: if folder.name.is_empty() {
+                name
+            } else {
+                format!("{}/{name}", folder.name)
+            },
+            pose: pose(&image),
+            camera,
+            depth_bounds: None,
+            points_seen,
+            split: None,
+        });
+    }
+    let mut warnings: Vec<String> = folder.warning.into_iter().collect();
+    let masked = views.iter().filter(|view| view.mask.is_some()).count();
+    warnings.extend(masks.and_then(|masks| masks.warning(views.len(), masked)));
+    Ok(Declared {
+        kind: if files.binary {
+            "COLMAP (binary)"
+        } else {
+            "COLMAP (text)"
+        },
+        root: root.to_owned(),
+        views,
+        points: Some(points),
+        ignores_exif: true,
+        downscale: folder.downscale,
+        warnings,
+    })
+}
+
+fn pose(image: &ColmapImage) -> Option<Pose> {
+    let [w, x, y, z] = image.rotation;
+    let camera_from_world = DQuat::from_xyzw(x, y, z, w);
+    let length = camera_from_world.length();
+    if !(length.is_finite() && length > 1e-6) {
+        return None;
+    }
+    let world_from_camera = (camera_from_world / length).inverse();
+    let pose = Pose {
+        rotation: world_from_camera.as_quat(),
+        position: -(world_from_camera * DVec3::from(image.translation)).as_vec3(),
+    };
+    pose.is_valid().then_some(pose)
+}
+
+fn gather(points: Vec<ColmapPoint>) -> (PointCloud, HashMap<u64, u32>) {
+    let mut cloud = PointCloud::default();
+    let mut index_of = HashMap::with_capacity(points.len());
+    for point in points {
+        let position = DVec3::from(point.position).as_vec3();
+        if position.is_finite() {
+            index_of.insert(point.id, cloud.len() as u32);
+            cloud.positions.push(position);
+            cloud.colors.push(point.color);
+        }
+    }
+    (cloud, index_of)
+}
+
+fn declared_camera(camera: &ColmapCamera) -> Result<DeclaredCamera, Malformed> {
+    let opencv = |k: [f64; 6], p: [f64; 2]| Lens::Opencv { k, p };
+    let (focal, center, lens) = match (camera.model.as_str(), &camera.params[..]) {
+        ("SIMPLE_PINHOLE", &[f, cx, cy]) => ([f, f], [cx, cy], Lens::Pinhole),
+        ("PINHOLE", &[fx, fy, cx, cy]) => ([fx, fy], [cx, cy], Lens::Pinhole),
+        ("SIMPLE_RADIAL", &[f, cx, cy, k1]) => ([f, f], [cx, cy], opencv([k1, 0.0, 0.0, 0.0, 0.0, 0.0], [0.0; 2])),
+        ("RADIAL", &[f, cx, cy, k1, k2]) => ([f, f], [cx, cy], opencv([k1, k2, 0.0, 0.0, 0.0, 0.0], [0.0; 2])),
+        ("OPENCV", &[fx, fy, cx, cy, k1, k2, p1, p2]) => {
+            ([fx, fy], [cx, cy], opencv([k1, k2, 0.0, 0.0, 0.0, 0.0], [p1, p2]))
+        }
+        ("FULL_OPENCV", &[fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6]) => {
+            ([fx, fy], [cx, cy], opencv([k1, k2, k3, k4, k5, k6], [p1, p2]))
+        }
+        ("OPENCV_FISHEYE", &[fx, fy, cx, cy, k1, k2, k3, k4]) => {
+            ([fx, fy], [cx, cy], Lens::Fisheye { k: [k1, k2, k3, k4] })
+        }
+        ("SIMPLE_RADIAL_FISHEYE", &[f, cx, cy, k1]) => ([f, f], [cx, cy], Lens::Fisheye { k: [k1, 0.0, 0.0, 0.0] }),
+        ("RADIAL_FISHEYE", &[f, cx, cy, k1, k2]) => ([f, f], [cx, cy], Lens::Fisheye { k: [k1, k2, 0.0, 0.0] }),
+        (model, params) => {
+            let count = MODELS.iter().find(|(name, _)| *name == model).map(|(_, count)| *count);
+            return Err(Malformed(match count {
+                Some(count) if count != params.len() => {
+                    format!(
+                        "camera {} of model {model} has {} parameters, not {count}",
+                        camera.id,
+                        params.len()
+                    )
+                }
+                _ => format!(
+                    "camera {} has the model {model}, which is not supported; run COLMAP's image_undistorter, or calibrate \
+                     with OPENCV, FULL_OPENCV or OPENCV_FISHEYE",
+                    camera.id
+                ),
+            }));
+        }
+    };
+    if camera.width == 0 || camera.height == 0 {
+        return Err(Malformed(format!(
+            "camera {} has a size of {}x{} pixels",
+            camera.id, camera.width, camera.height
+        )));
+    }
+    Ok(DeclaredCamera {
+        size: Some([camera.width as f64, camera.height as f64]),
+        focal: Focal::Pixels(focal),
+        center: Some(center),
+        lens: lens_or_pinhole(lens),
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn camera(model: &str, params: &[f64]) -> Result<DeclaredCamera, Malformed> {
+        declared_camera(&ColmapCamera {
+            id: 7,
+            model: model.into(),
+            width: 100,
+            height: 80,
+            params: params.to_vec(),
+        })
+    }
+
+    #[test]
+    fn each_model_puts_its_parameters_where_they_belong() {
+        let numbers: Vec<f64> = (1..=12).map(f64::from).collect();
+        let full = camera("FULL_OPENCV", &numbers).unwrap();
+        assert_eq!(
+            full.lens,
+            Lens::Opencv {
+                k: [5.0, 6.0, 9.0, 10.0, 11.0, 12.0],
+                p: [7.0, 8.0]
+            }
+        );
+        assert_eq!((full.focal, full.center), (Focal::Pixels([1.0, 2.0]), Some([3.0, 4.0])));
+        let opencv = camera("OPENCV", &numbers[..8]).unwrap();
+        assert_eq!(
+            opencv.lens,
+            Lens::Opencv {
+                k: [5.0, 6.0, 0.0, 0.0, 0.0, 0.0],
+                p: [7.0, 8.0]
+            }
+        );
+        let fisheye = camera("OPENCV_FISHEYE", &numbers[..8]).unwrap();
+        assert_eq!(
+            fisheye.lens,
+            Lens::Fisheye {
+                k: [5.0, 6.0, 7.0, 8.0]
+            }
+        );
+        let radial = camera("RADIAL", &numbers[..5]).unwrap();
+        assert_eq!(
+            (radial.focal, radial.center),
+            (Focal::Pixels([1.0, 1.0]), Some([2.0, 3.0]))
+        );
+        assert_eq!(
+            radial.lens,
+            Lens::Opencv {
+                k: [4.0, 5.0, 0.0, 0.0, 0.0, 0.0],
+                p: [0.0; 2]
+            }
+        );
+        assert_eq!(
+            camera("SIMPLE_RADIAL", &[9.0, 50.0, 40.0, 0.0]).unwrap().lens,
+            Lens::Pinhole
+        );
+        assert_eq!(
+            camera("RADIAL_FISHEYE", &numbers[..5]).unwrap().lens,
+            Lens::Fisheye {
+                k: [4.0, 5.0, 0.0, 0.0]
+            }
+        );
+    }
+
+    #[test]
+    fn unknown_models_and_wrong_counts_are_named() {
+        let error = camera("FOV", &[1.0; 5]).unwrap_err().to_string();
+        assert!(error.contains("FOV") && error.contains("image_undistorter"), "{error}");
+        let error = camera("PINHOLE", &[1.0; 3]).unwrap_err().to_string();
+        assert!(error.contains("has 3 parameters, not 4"), "{error}");
+    }
+}

@@ -1,0 +1,121 @@
+//! What a dataset's files declare, before any image was looked at: the one form that all layouts are read into.
+
+use glam::{DMat3, DQuat, DVec3};
+use irradia_scene::{Intrinsics, Lens, PointCloud, Pose};
+use std::path::PathBuf;
+
+pub(super) struct Declared {
+    /// For people: `COLMAP (binary)`.
+    pub kind: &'static str,
+    /// The dataset's folder.
+    pub root: PathBuf,
+    pub views: Vec<DeclaredView>,
+    pub points: Option<PointCloud>,
+    /// Made by a tool that sees images as they are stored.
+    pub ignores_exif: bool,
+    /// How many times the images must still be made smaller.
+    pub downscale: f32,
+    pub warnings: Vec<String>,
+}
+
+pub(super) struct DeclaredView {
+    /// Relative to the root, with forward slashes.
+    pub name: String,
+    /// `None` when no such file exists.
+    pub image: Option<PathBuf>,
+    pub mask: Option<PathBuf>,
+    /// `None` when the numbers are no pose.
+    pub pose: Option<Pose>,
+    pub camera: DeclaredCamera,
+    /// Nearest and farthest depth along +Z, world units, as the file has them.
+    pub depth_bounds: Option<[f64; 2]>,
+    pub points_seen: Vec<u32>,
+    /// `None` when the dataset does not say.
+    pub split: Option<Split>,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Split {
+    Train,
+    Test,
+    /// In neither list.
+    Left,
+}
+
+/// Intrinsics as declared: sizes and the principal point may be left to the image file.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct DeclaredCamera {
+    /// The size, in pixels, that the other numbers refer to; the image file's where `None`.
+    pub size: Option<[f64; 2]>,
+    pub focal: Focal,
+    /// The middle where `None`.
+    pub center: Option<[f64; 2]>,
+    pub lens: Lens,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) enum Focal {
+    /// `fx, fy`.
+    Pixels([f64; 2]),
+    /// Field of view across and down, radians; square pixels where one is `None`.
+    Angles([Option<f64>; 2]),
+}
+
+impl DeclaredCamera {
+    /// The camera of an image file of `width` x `height` pixels.
+    pub fn at_size(&self, width: u32, height: u32) -> Intrinsics {
+        let real = [f64::from(width), f64::from(height)];
+        let declared = self.size.unwrap_or(real);
+        let from_angle = |side: usize, angle: f64| 0.5 * declared[side] / (0.5 * angle).tan();
+        let focal = match self.focal {
+            Focal::Pixels(focal) => focal,
+            Focal::Angles([Some(x), Some(y)]) => [from_angle(0, x), from_angle(1, y)],
+            Focal::Angles([Some(x), None]) => [from_angle(0, x); 2],
+            Focal::Angles([None, y]) => [from_angle(1, y.unwrap_or(f64::NAN)); 2],
+        };
+        let center = self.center.unwrap_or([0.5 * declared[0], 0.5 * declared[1]]);
+        let scale = [real[0] / declared[0], real[1] / declared[1]];
+        Intrinsics {
+            width,
+            height,
+            fx: (focal[0] * scale[0]) as f32,
+            fy: (focal[1] * scale[1]) as f32,
+            cx: (center[0] * scale[0]) as f32,
+            cy: (center[1] * scale[1]) as f32,
+            lens: self.lens,
+        }
+    }
+}
+
+/// A distortion model whose coefficients are all zero is a pinhole.
+pub(super) fn lens_or_pinhole(lens: Lens) -> Lens {
+    let bends = match lens {
+        Lens::Pinhole => false,
+        Lens::Opencv { k, p } => k.iter().chain(&p).any(|v| *v != 0.0),
+        // The fisheye model bends straight lines also with zeros.
+        Lens::Fisheye { .. } => true,
+    };
+    if bends { lens } else { Lens::Pinhole }
+}
+
+/// A pose from the camera's axes (right, down, forward; any length) and centre in the world; `None` when they are not
+/// finite, not roughly perpendicular, or left-handed.
+pub(super) fn pose_from_axes(right: DVec3, down: DVec3, forward: DVec3, position: DVec3) -> Option<Pose> {
+    let axes = [right, down, forward].map(DVec3::try_normalize);
+    let [Some(x), Some(y), Some(z)] = axes else {
+        return None;
+    };
+    // Files keep few digits; more than this (3 degrees) is not rounding.
+    let skew = x.dot(y).abs().max(y.dot(z).abs()).max(z.dot(x).abs());
+    if !(skew < 0.05 && x.cross(y).dot(z) > 0.0) {
+        return None;
+    }
+    let z = z.normalize();
+    let x = (x - z * x.dot(z)).normalize();
+    let rotation = DQuat::from_mat3(&DMat3::from_cols(x, z.cross(x), z));
+    let pose = Pose {
+        rotation: rotation.normalize().as_quat(),
+        position: position.as_vec3(),
+    };
+    pose.is_valid().then_some(pose)
+}

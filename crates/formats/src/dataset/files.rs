@@ -1,0 +1,103 @@
+//! Finding image files: by the names datasets use, in the folders they keep smaller copies in.
+
+use crate::FormatError;
+use std::path::{Component, Path, PathBuf};
+
+const EXTENSIONS: [&str; 6] = ["png", "jpg", "jpeg", "PNG", "JPG", "JPEG"];
+
+/// The image that a dataset calls `path`: that file, or that name with an extension added or exchanged.
+pub(super) fn find_image(path: &Path) -> Option<PathBuf> {
+    if path.is_file() {
+        return Some(path.to_owned());
+    }
+    let name = path.file_name()?;
+    let added = EXTENSIONS.iter().map(|extension| {
+        let mut name = name.to_owned();
+        name.push(".");
+        name.push(extension);
+        path.with_file_name(name)
+    });
+    let exchanged = EXTENSIONS.iter().map(|extension| path.with_extension(extension));
+    added.chain(exchanged).find(|candidate| candidate.is_file())
+}
+
+/// `path` below `root`, with forward slashes and without `./`.
+pub(super) fn relative_name(root: &Path, path: &Path) -> String {
+    let below = path.strip_prefix(root).unwrap_or(path);
+    let parts = below
+        .components()
+        .filter(|part| !matches!(part, Component::CurDir | Component::RootDir));
+    let parts: Vec<_> = parts.map(|part| part.as_os_str().to_string_lossy()).collect();
+    parts.join("/")
+}
+
+/// Whether a file's name says that it is an image.
+pub(super) fn is_image_name(path: &Path) -> bool {
+    let extension = path.extension().map(|e| e.to_string_lossy().to_lowercase());
+    extension.is_some_and(|e| EXTENSIONS.contains(&e.as_str()))
+}
+
+/// The images in a folder itself, sorted by name.
+pub(super) fn list_images(folder: &Path) -> Result<Vec<PathBuf>, FormatError> {
+    let read_error = |source| FormatError::Read {
+        path: folder.to_owned(),
+        source,
+    };
+    let mut images = Vec::new();
+    for entry in std::fs::read_dir(folder).map_err(read_error)? {
+        let path = entry.map_err(read_error)?.path();
+        let hidden = path
+            .file_name()
+            .is_some_and(|name| name.to_string_lossy().starts_with('.'));
+        if is_image_name(&path) && !hidden && path.is_file() {
+            images.push(path);
+        }
+    }
+    images.sort();
+    Ok(images)
+}
+
+/// The folder that the photographs are taken from.
+pub(super) struct ImageFolder {
+    /// `images`, `images_4`, ..
+    pub name: String,
+    /// How many times its images must still be made smaller.
+    pub downscale: f32,
+    /// What the user should know about the choice.
+    pub warning: Option<String>,
+}
+
+/// `images_N` when the downscale is N and it exists; else the largest there is: `images`, then `images_2`, ..
+pub(super) fn choose_image_folder(root: &Path, downscale: f32) -> Option<ImageFolder> {
+    if downscale > 1.0 && downscale.fract() == 0.0 {
+        let name = format!("images_{downscale}");
+        if root.join(&name).is_dir() {
+            return Some(ImageFolder {
+                name,
+                downscale: 1.0,
+                warning: None,
+            });
+        }
+    }
+    if root.join("images").is_dir() {
+        return Some(ImageFolder {
+            name: "images".into(),
+            downscale,
+            warning: None,
+        });
+    }
+    let entries = std::fs::read_dir(root).ok()?.flatten();
+    let factors = entries.filter(|entry| entry.path().is_dir()).filter_map(|entry| {
+        let name = entry.file_name().into_string().ok()?;
+        name.strip_prefix("images_")?.parse::<u32>().ok()
+    });
+    let name = format!("images_{}", factors.min()?);
+    let warning = format!(
+        "there is no folder `images`; the photographs are taken from `{name}`, and any downscale counts from it"
+    );
+    Some(ImageFolder {
+        name,
+        downscale,
+        warning: Some(warning),
+    })
+}

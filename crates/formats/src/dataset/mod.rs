@@ -1,0 +1,175 @@
+//! Datasets of posed photographs. A new layout is one file here and one arm in each `match` below.
+//!
+//! A layout's reader says what the files declare ([`declared::Declared`]); [`assemble`] then looks at the image files,
+//! drops what cannot be used, and makes the [`Dataset`] with undistorted cameras at the size that was asked for.
+
+mod assemble;
+mod blender;
+pub(crate) mod colmap;
+mod declared;
+mod files;
+pub(crate) mod llff;
+mod masks;
+mod nerfstudio;
+mod npy;
+mod split;
+pub(crate) mod transforms;
+
+use crate::FormatError;
+use declared::Declared;
+use irradia_scene::Dataset;
+use std::fmt;
+use std::path::Path;
+use std::str::FromStr;
+
+/// The layouts of datasets.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum DatasetFormat {
+    /// `cameras`, `images` and `points3D` as `.bin` or `.txt` in `sparse/0`, `sparse` or the folder itself.
+    Colmap,
+    /// nerfstudio's and instant-ngp's `transforms.json`.
+    Nerfstudio,
+    /// `transforms_train.json` and `transforms_test.json`, as NeRF's synthetic scenes have them.
+    Blender,
+    /// `poses_bounds.npy`.
+    Llff,
+}
+
+impl DatasetFormat {
+    /// All of them, in the order in which a folder is asked.
+    ///
+    /// Who prepared a folder last knows best: `transforms.json` is made from a COLMAP model that may lie beside it, and
+    /// `poses_bounds.npy` keeps less than the COLMAP model it is made from.
+    pub const ALL: [Self; 4] = [Self::Blender, Self::Nerfstudio, Self::Colmap, Self::Llff];
+
+    /// The name used on the command line.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Colmap => "colmap",
+            Self::Nerfstudio => "nerfstudio",
+            Self::Blender => "blender",
+            Self::Llff => "llff",
+        }
+    }
+
+    fn looked_for(self) -> &'static str {
+        match self {
+            Self::Colmap => "{cameras,images}.{bin,txt} in sparse/0, sparse or the folder (COLMAP)",
+            Self::Nerfstudio => "transforms.json (nerfstudio, instant-ngp)",
+            Self::Blender => "transforms_train.json (Blender)",
+            Self::Llff => "poses_bounds.npy (LLFF)",
+        }
+    }
+
+    fn is_in(self, path: &Path) -> bool {
+        match self {
+            Self::Colmap => colmap::find_model(path).is_some(),
+            Self::Nerfstudio => nerfstudio::find(path).is_some(),
+            Self::Blender => path.join("transforms_train.json").is_file(),
+            Self::Llff => path.join("poses_bounds.npy").is_file(),
+        }
+    }
+
+    /// The layout that `path` has, if any. `path` is a folder, or a nerfstudio JSON file.
+    pub fn recognise(path: &Path) -> Option<Self> {
+        Self::ALL.into_iter().find(|format| format.is_in(path))
+    }
+}
+
+impl fmt::Display for DatasetFormat {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        f.write_str(self.name())
+    }
+}
+
+impl FromStr for DatasetFormat {
+    type Err = FormatError;
+
+    fn from_str(text: &str) -> Result<Self, FormatError> {
+        let found = Self::ALL
+            .into_iter()
+            .find(|format| format.name().eq_ignore_ascii_case(text));
+        found.ok_or_else(|| {
+            let known = Self::ALL.map(Self::name).join(", ");
+            FormatError::Option(format!("`{text}` is no dataset format; known are {known}"))
+        })
+    }
+}
+
+/// How a dataset is to be read.
+#[derive(Clone, Debug, PartialEq)]
+pub struct DatasetOptions {
+    /// The layout; recognised from the files when `None`.
+    pub format: Option<DatasetFormat>,
+    /// Photographs are made this many times smaller, at least 1. A folder of smaller images that matches (`images_4` for
+    /// 4) is used as it is; where only such folders exist, other factors count from the largest of them.
+    pub downscale: f32,
+    /// Photographs are made smaller until the longer side has at most this many pixels.
+    pub max_side: Option<u32>,
+}
+
+impl Default for DatasetOptions {
+    fn default() -> Self {
+        Self {
+            format: None,
+            downscale: 1.0,
+            max_side: None,
+        }
+    }
+}
+
+/// Reads a dataset: poses, cameras, points and the headers of the images. Pixels are loaded later, view by view.
+///
+/// Views are sorted by name. Held out are the views that the dataset itself holds out, else every 8th. What had to be
+/// left out (missing images, poses that are none) is told in [`Dataset::warnings`].
+///
+/// EXIF orientation: poses belong to the pixels as the tool that made them saw them. Where the declared size has the
+/// shape of the stored image alone, nothing is turned; where it has the shape of the upright image, it is turned; where
+/// both fit (half turns, square images) it is turned, except for COLMAP, which ignores EXIF orientation.
+///
+/// # Errors
+/// When the folder is no dataset (the error says what was looked for), a file is unreadable or malformed, cameras have no
+/// intrinsics or an unknown model, or fewer than 3 views are usable.
+pub fn read_dataset(path: &Path, options: &DatasetOptions) -> Result<Dataset, FormatError> {
+    if !(options.downscale >= 1.0 && options.downscale.is_finite()) {
+        return Err(FormatError::Option(format!(
+            "downscale is {}; give 1 or more",
+            options.downscale
+        )));
+    }
+    if options.max_side == Some(0) {
+        return Err(FormatError::Option(
+            "the longest side is 0 pixels; give 1 or more".into(),
+        ));
+    }
+    let format = match options.format {
+        Some(format) if format.is_in(path) => Some(format),
+        Some(_) => None,
+        None => DatasetFormat::recognise(path),
+    };
+    let Some(format) = format else {
+        // A folder that is not there at all gets the system's word for it.
+        std::fs::metadata(path).map_err(|source| FormatError::Read {
+            path: path.to_owned(),
+            source,
+        })?;
+        let asked = options
+            .format
+            .map_or(DatasetFormat::ALL.to_vec(), |format| vec![format]);
+        return Err(FormatError::NotADataset {
+            path: path.to_owned(),
+            looked_for: asked
+                .into_iter()
+                .map(DatasetFormat::looked_for)
+                .collect::<Vec<_>>()
+                .join("; "),
+        });
+    };
+    let declared: Declared = match format {
+        DatasetFormat::Colmap => colmap::read(path, options.downscale)?,
+        DatasetFormat::Nerfstudio => nerfstudio::read(path, options.downscale)?,
+        DatasetFormat::Blender => blender::read(path, options.downscale)?,
+        DatasetFormat::Llff => llff::read(path, options.downscale)?,
+    };
+    assemble::assemble(declared, options.max_side)
+}

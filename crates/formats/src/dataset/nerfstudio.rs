@@ -1,0 +1,121 @@
+//! A folder with one `transforms.json`, as nerfstudio and instant-ngp make them.
+
+use super::declared::{Declared, DeclaredView, Split};
+use super::files::{find_image, relative_name};
+use super::masks::Masks;
+use super::transforms::{Transforms, parse_transforms};
+use crate::error::read_and_parse;
+use crate::{FormatError, read_points_ply};
+use std::collections::HashSet;
+use std::path::{Path, PathBuf};
+
+/// The JSON file: `path` itself, or `transforms.json` in it.
+pub(super) fn find(path: &Path) -> Option<PathBuf> {
+    let is_json = path
+        .extension()
+        .is_some_and(|extension| extension.eq_ignore_ascii_case("json"));
+    let file = if is_json {
+        path.to_owned()
+    } else {
+        path.join("transforms.json")
+    };
+    file.is_file().then_some(file)
+}
+
+pub(super) fn read(path: &Path, downscale: f32) -> Result<Declared, FormatError> {
+    let Some(file) = find(path) else {
+        return Err(FormatError::malformed(path, "holds no transforms.json"));
+    };
+    let transforms = read_and_parse(&file, parse_transforms)?;
+    let root = match file.parent() {
+        Some(parent) if parent != Path::new("") => parent.to_owned(),
+        _ => PathBuf::from("."),
+    };
+    let mut views = declared_views(&file, &root, &transforms)?;
+    let mut warnings = Vec::new();
+
+    let masks = Masks::beside(&root, "images");
+    if let Some(masks) = &masks {
+        for view in views.iter_mut().filter(|view| view.mask.is_none()) {
+            let below = view.name.split_once('/').map_or(view.name.as_str(), |(_, below)| below);
+            view.mask = masks.of(below);
+        }
+        let masked = views.iter().filter(|view| view.mask.is_some()).count();
+        warnings.extend(masks.warning(views.len(), masked));
+    }
+    let points = transforms.ply_file_path.as_ref().and_then(|ply| {
+        let read = read_points_ply(&root.join(ply));
+        read.map_err(|error| warnings.push(format!("the initial points are ignored: {error}")))
+            .ok()
+    });
+    Ok(Declared {
+        kind: "nerfstudio",
+        root,
+        views,
+        points,
+        ignores_exif: false,
+        downscale,
+        warnings,
+    })
+}
+
+/// The frames of a transforms file.
+pub(super) fn declared_views(
+    file: &Path,
+    root: &Path,
+    transforms: &Transforms,
+) -> Result<Vec<DeclaredView>, FormatError> {
+    let set =
+        |names: &Option<Vec<String>>| -> HashSet<String> { names.iter().flatten().map(|n| n.to_owned()).collect() };
+    let train = set(&transforms.train_filenames);
+    // A dataset that keeps validation frames alone holds those out.
+    let (test, validation) = (set(&transforms.test_filenames), set(&transforms.val_filenames));
+    let (test, left) = if test.is_empty() {
+        (validation, HashSet::new())
+    } else {
+        (test, validation)
+    };
+    let split_of = |name: &String| {
+        if train.is_empty() && test.is_empty() {
+            None
+        } else if test.contains(name) {
+            Some(Split::Test)
+        } else if train.contains(name) || (train.is_empty() && !left.contains(name)) {
+            Some(Split::Train)
+        } else if test.is_empty() {
+            Some(Split::Test)
+        } else {
+            Some(Split::Left)
+        }
+    };
+    transforms
+        .frames
+        .iter()
+        .map(|frame| {
+            let camera = frame
+                .camera
+                .or(&transforms.camera)
+                .camera()
+                .map_err(|source| FormatError::Malformed {
+                    path: file.to_owned(),
+                    source,
+                })?;
+            let path = root.join(frame.file_path.replace('\\', "/"));
+            let image = find_image(&path);
+            Ok(DeclaredView {
+                name: relative_name(root, image.as_deref().unwrap_or(&path)),
+                image,
+                mask: frame
+                    .mask_path
+                    .as_ref()
+                    .map(|mask| root.join(mask))
+                    .filter(|mask| mask.is_file()),
+                pose: frame.pose(),
+                camera,
+                depth_bounds: None,
+                points_seen: Vec::new(),
+                split: split_of(&frame.file_path),
+            })
+        })
+        .collect()
+}

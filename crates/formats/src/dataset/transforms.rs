@@ -1,0 +1,293 @@
+//! `transforms*.json`: cameras and frames as NeRF's Blender scenes, instant-ngp and nerfstudio write them.
+
+use super::declared::{DeclaredCamera, Focal, lens_or_pinhole, pose_from_axes};
+use crate::Malformed;
+use glam::DVec3;
+use irradia_scene::{Lens, Pose};
+use serde::Deserialize;
+
+/// A `transforms.json`.
+#[derive(Clone, Debug, Deserialize)]
+pub struct Transforms {
+    /// Intrinsics for all frames that have none of their own.
+    #[serde(flatten)]
+    pub camera: CameraKeys,
+    /// The photographs.
+    pub frames: Vec<Frame>,
+    /// A point cloud in the same world, relative to the file.
+    pub ply_file_path: Option<String>,
+    /// `file_path` of the frames to train on.
+    pub train_filenames: Option<Vec<String>>,
+    /// `file_path` of the frames for validation.
+    pub val_filenames: Option<Vec<String>>,
+    /// `file_path` of the frames that are held out.
+    pub test_filenames: Option<Vec<String>>,
+}
+
+/// One photograph.
+#[derive(Clone, Debug, Deserialize)]
+pub struct Frame {
+    /// The image, relative to the file, with or without extension.
+    pub file_path: String,
+    /// Camera-to-world with OpenGL axes, 3x4 or 4x4, row by row; numbers that are not finite are `None`.
+    pub transform_matrix: Vec<Vec<Option<f64>>>,
+    /// The mask, relative to the file; white is kept.
+    pub mask_path: Option<String>,
+    /// Intrinsics of this frame alone.
+    #[serde(flatten)]
+    pub camera: CameraKeys,
+}
+
+/// The keys that say what a camera projects with; global or in a frame.
+#[derive(Clone, Debug, Default, PartialEq, Deserialize)]
+#[allow(missing_docs)] // The format's own names.
+pub struct CameraKeys {
+    pub camera_model: Option<String>,
+    pub is_fisheye: Option<bool>,
+    pub w: Option<f64>,
+    pub h: Option<f64>,
+    pub fl_x: Option<f64>,
+    pub fl_y: Option<f64>,
+    pub camera_angle_x: Option<f64>,
+    pub camera_angle_y: Option<f64>,
+    pub cx: Option<f64>,
+    pub cy: Option<f64>,
+    pub k1: Option<f64>,
+    pub k2: Option<f64>,
+    pub k3: Option<f64>,
+    pub k4: Option<f64>,
+    pub p1: Option<f64>,
+    pub p2: Option<f64>,
+}
+
+/// Parses a `transforms.json`. `NaN` and `Infinity`, which are no JSON but which Python writes, are read as `None`.
+///
+/// # Errors
+/// When it is no JSON, or lacks `frames`, a `file_path` or a `transform_matrix`; with line and column.
+pub fn parse_transforms(bytes: &[u8]) -> Result<Transforms, Malformed> {
+    let bytes = bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes);
+    serde_json::from_slice(bytes).or_else(|error| {
+        let replaced = nulls_for_python_numbers(bytes);
+        serde_json::from_slice(&replaced).map_err(|_| Malformed(format!("not a usable transforms file: {error}")))
+    })
+}
+
+/// `null` for each `NaN`, `Infinity` and `-Infinity` outside strings.
+fn nulls_for_python_numbers(bytes: &[u8]) -> Vec<u8> {
+    let mut out = Vec::with_capacity(bytes.len());
+    let mut in_string = false;
+    let mut rest = bytes;
+    while let Some((first, after)) = rest.split_first() {
+        if !in_string
+            && let Some(after) = [&b"NaN"[..], b"-NaN", b"Infinity", b"-Infinity"]
+                .iter()
+                .find_map(|word| rest.strip_prefix(*word))
+        {
+            out.extend(b"null");
+            rest = after;
+            continue;
+        }
+        out.push(*first);
+        rest = after;
+        match first {
+            b'"' => in_string = !in_string,
+            b'\\' if in_string => {
+                if let Some((escaped, after)) = rest.split_first() {
+                    out.push(*escaped);
+                    rest = after;
+                }
+            }
+            _ => {}
+        }
+    }
+    out
+}
+
+impl CameraKeys {
+    /// These keys, and `others` where these say nothing.
+    ///
+    /// A frame's focal length given in one way is not mixed with a global one given in another.
+    pub(super) fn or(&self, others: &Self) -> Self {
+        let own_focal = self
+            .fl_x
+            .or(self.fl_y)
+            .or(self.camera_angle_x)
+            .or(self.camera_angle_y)
+            .is_some();
+        let focal = if own_focal { self } else { others };
+        Self {
+            camera_model: self.camera_model.clone().or_else(|| others.camera_model.clone()),
+            is_fisheye: self.is_fisheye.or(others.is_fisheye),
+            w: self.w.or(others.w),
+            h: self.h.or(others.h),
+            fl_x: focal.fl_x,
+            fl_y: focal.fl_y,
+            camera_angle_x: focal.camera_angle_x,
+            camera_angle_y: focal.camera_angle_y,
+            cx: self.cx.or(others.cx),
+            cy: self.cy.or(others.cy),
+            k1: self.k1.or(others.k1),
+            k2: self.k2.or(others.k2),
+            k3: self.k3.or(others.k3),
+            k4: self.k4.or(others.k4),
+            p1: self.p1.or(others.p1),
+            p2: self.p2.or(others.p2),
+        }
+    }
+
+    /// The camera. Focal lengths in pixels count before angles; a principal point that is not given is in the middle.
+    ///
+    /// Coefficients: `k1 k2 p1 p2` are OpenCV's, `k3` is its third radial one. A `k4` belongs to the fisheye model; with
+    /// others nerfstudio's files carry it as a fourth radial coefficient that its own undistortion refuses unless it is
+    /// zero, and so does this.
+    pub(super) fn camera(&self) -> Result<DeclaredCamera, Malformed> {
+        let focal = match (self.fl_x, self.fl_y) {
+            (Some(x), y) => Focal::Pixels([x, y.unwrap_or(x)]),
+            (None, Some(y)) => Focal::Pixels([y, y]),
+            (None, None) if self.camera_angle_x.or(self.camera_angle_y).is_some() => {
+                Focal::Angles([self.camera_angle_x, self.camera_angle_y])
+            }
+            (None, None) => {
+                return Err(Malformed(
+                    "names no intrinsics; give fl_x (and fl_y, cx, cy, w, h) in pixels or camera_angle_x in radians, for \
+                     all frames or in each"
+                        .into(),
+                ));
+            }
+        };
+        let k = [self.k1, self.k2, self.k3, self.k4].map(|k| k.unwrap_or(0.0));
+        let p = [self.p1, self.p2].map(|p| p.unwrap_or(0.0));
+        let model = match (self.is_fisheye, self.camera_model.as_deref()) {
+            (Some(true), _) => "OPENCV_FISHEYE",
+            (_, model) => model.unwrap_or("OPENCV"),
+        };
+        let lens = match model {
+            "OPENCV_FISHEYE" => Lens::Fisheye { k },
+            "OPENCV" | "PINHOLE" | "SIMPLE_PINHOLE" | "SIMPLE_RADIAL" | "RADIAL" | "PERSPECTIVE" => {
+                if k[3] != 0.0 {
+                    return Err(Malformed(format!(
+                        "k4 is {} and the camera model {model} has no fourth radial coefficient; set k4 to 0, or camera_model \
+                         to OPENCV_FISHEYE if it is one",
+                        k[3]
+                    )));
+                }
+                Lens::Opencv {
+                    k: [k[0], k[1], k[2], 0.0, 0.0, 0.0],
+                    p,
+                }
+            }
+            other => {
+                return Err(Malformed(format!(
+                    "the camera model {other} is not supported; PINHOLE, OPENCV and OPENCV_FISHEYE are"
+                )));
+            }
+        };
+        let size = match (self.w, self.h) {
+            (Some(w), Some(h)) if w >= 1.0 && h >= 1.0 => Some([w, h]),
+            _ => None,
+        };
+        // Half a principal point is as good as none.
+        let center = self.cx.zip(self.cy).map(|(x, y)| [x, y]);
+        Ok(DeclaredCamera {
+            size,
+            focal,
+            center,
+            lens: lens_or_pinhole(lens),
+        })
+    }
+}
+
+impl Frame {
+    /// The pose in OpenCV axes: the file's cameras look along -Z with Y up.
+    pub(super) fn pose(&self) -> Option<Pose> {
+        let number = |row: usize, column: usize| *self.transform_matrix.get(row)?.get(column)?;
+        let column = |c: usize| Some(DVec3::new(number(0, c)?, number(1, c)?, number(2, c)?));
+        pose_from_axes(column(0)?, -column(1)?, -column(2)?, column(3)?)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use glam::Vec3;
+
+    #[test]
+    fn a_frame_overrides_globals_and_axes_are_flipped() {
+        let text = r#"{"w": 100.0, "h": 50, "fl_x": 80, "k1": 0.1, "frames": [
+            {"file_path": "a NaN.png", "transform_matrix": [[1,0,0,1],[0,1,0,2],[0,0,1,3]]},
+            {"file_path": "b.png", "camera_angle_x": 1.5707963267948966, "k1": 0,
+             "transform_matrix": [[1,0,0,NaN],[0,1,0,2],[0,0,1,3],[0,0,0,1]]}]}"#;
+        let transforms = parse_transforms(text.as_bytes()).unwrap();
+        let [a, b] = &transforms.frames[..] else {
+            panic!("two frames")
+        };
+        let pose = a.pose().unwrap();
+        assert_eq!(pose.position, Vec3::new(1.0, 2.0, 3.0));
+        assert!(
+            (pose.rotation * Vec3::Z - Vec3::NEG_Z).length() < 1e-6,
+            "looks along -Z"
+        );
+        assert!((pose.rotation * Vec3::Y - Vec3::NEG_Y).length() < 1e-6, "down is -Y");
+        assert_eq!((a.file_path.as_str(), b.pose()), ("a NaN.png", None));
+        let camera = a.camera.or(&transforms.camera).camera().unwrap();
+        assert_eq!(camera.at_size(50, 25).fx, 40.0);
+        assert_eq!(camera.at_size(50, 25).cy, 12.5);
+        let camera = b.camera.or(&transforms.camera).camera().unwrap();
+        assert_eq!(camera.lens, Lens::Pinhole);
+        assert!((camera.at_size(100, 50).fx - 50.0).abs() < 1e-4);
+    }
+
+    #[test]
+    fn what_a_camera_lacks_or_cannot_be_is_named() {
+        let error = CameraKeys::default().camera().unwrap_err().to_string();
+        assert!(error.contains("fl_x") && error.contains("camera_angle_x"), "{error}");
+        let keys = CameraKeys {
+            fl_x: Some(1.0),
+            camera_model: Some("EQUIRECTANGULAR".into()),
+            ..Default::default()
+        };
+        assert!(keys.camera().unwrap_err().to_string().contains("EQUIRECTANGULAR"));
+        let keys = CameraKeys {
+            fl_x: Some(1.0),
+            k4: Some(0.1),
+            ..Default::default()
+        };
+        assert!(keys.camera().unwrap_err().to_string().contains("k4"));
+        let fisheye = CameraKeys {
+            is_fisheye: Some(true),
+            ..keys
+        };
+        assert_eq!(
+            fisheye.camera().unwrap().lens,
+            Lens::Fisheye {
+                k: [0.0, 0.0, 0.0, 0.1]
+            }
+        );
+        let error = parse_transforms(br#"{"frames": [{"transform_matrix": []}]}"#)
+            .unwrap_err()
+            .to_string();
+        assert!(error.contains("file_path"), "{error}");
+    }
+
+    #[test]
+    fn sheared_mirrored_and_flat_matrices_are_no_poses() {
+        let frame = |rows: [[f64; 4]; 3]| Frame {
+            file_path: String::new(),
+            transform_matrix: rows.map(|row| row.map(Some).to_vec()).to_vec(),
+            mask_path: None,
+            camera: CameraKeys::default(),
+        };
+        let good = [[2.0, 0.0, 0.0, 0.0], [0.0, 2.0, 0.0, 0.0], [0.0, 0.0, 2.0, 0.0]];
+        assert!(frame(good).pose().is_some(), "a scale is taken off");
+        let mut bad = good;
+        bad[0][0] = -2.0;
+        assert_eq!(frame(bad).pose(), None);
+        bad[0][0] = 0.0;
+        assert_eq!(frame(bad).pose(), None);
+        bad = good;
+        bad[0][1] = 1.0;
+        assert_eq!(frame(bad).pose(), None);
+        bad[0][1] = f64::NAN;
+        assert_eq!(frame(bad).pose(), None);
+    }
+}

@@ -1,0 +1,141 @@
+//! What a file or folder is, for people.
+
+use crate::error::read_and_parse;
+use crate::splats::ply::looks_like_splats;
+use crate::{DatasetFormat, DatasetOptions, FormatError, SplatFormat, read_dataset, read_points_ply, read_splats};
+use irradia_scene::{Dataset, GaussianCloud, PointCloud};
+use std::fmt;
+use std::path::Path;
+
+/// What a path leads to.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Kind {
+    /// A splat scene.
+    Splats(SplatFormat),
+    /// A PLY with points that are no splats.
+    Points,
+    /// Posed photographs.
+    Dataset(DatasetFormat),
+}
+
+/// Tells what `path` is: a folder or JSON file by what it holds, another file by extension and header.
+///
+/// # Errors
+/// When it does not exist, or is none of what is known; the error says what was looked for.
+pub fn detect(path: &Path) -> Result<Kind, FormatError> {
+    if let Some(format) = DatasetFormat::recognise(path) {
+        return Ok(Kind::Dataset(format));
+    }
+    if path.is_dir() {
+        // Says what was looked for.
+        read_dataset(path, &DatasetOptions::default())?;
+    }
+    match SplatFormat::of(path)? {
+        SplatFormat::Ply if !read_and_parse(path, looks_like_splats)? => Ok(Kind::Points),
+        format => Ok(Kind::Splats(format)),
+    }
+}
+
+/// A summary of a file or dataset: a title and facts, printed one a line.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Description {
+    /// What it is.
+    pub title: String,
+    /// Name and value of each fact.
+    pub facts: Vec<(&'static str, String)>,
+    /// What was left out or assumed when reading.
+    pub warnings: Vec<String>,
+}
+
+impl fmt::Display for Description {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        write!(f, "{}", self.title)?;
+        for (name, value) in &self.facts {
+            write!(f, "\n  {name:<14} {value}")?;
+        }
+        for warning in &self.warnings {
+            write!(f, "\n  warning: {warning}")?;
+        }
+        Ok(())
+    }
+}
+
+/// Reads what `path` leads to and sums it up.
+///
+/// # Errors
+/// Those of [`detect`] and of reading it.
+pub fn describe(path: &Path) -> Result<Description, FormatError> {
+    Ok(match detect(path)? {
+        Kind::Splats(format) => describe_splats(format, &read_splats(path)?),
+        Kind::Points => describe_points(&read_points_ply(path)?),
+        Kind::Dataset(_) => describe_dataset(&read_dataset(path, &DatasetOptions::default())?),
+    })
+}
+
+fn describe_splats(format: SplatFormat, cloud: &GaussianCloud) -> Description {
+    Description {
+        title: format!("{format} with {} Gaussians", cloud.len()),
+        facts: vec![
+            ("SH degree", cloud.sh_degree.to_string()),
+            ("antialiased", if cloud.antialiased { "yes" } else { "no" }.into()),
+            ("centres within", extent(cloud.means.iter().copied())),
+        ],
+        warnings: Vec::new(),
+    }
+}
+
+fn describe_points(points: &PointCloud) -> Description {
+    Description {
+        title: format!("point cloud with {} points", points.len()),
+        facts: vec![("within", extent(points.positions.iter().map(|p| p.to_array())))],
+        warnings: Vec::new(),
+    }
+}
+
+fn describe_dataset(dataset: &Dataset) -> Description {
+    let sizes = dataset
+        .views
+        .iter()
+        .map(|v| (v.camera.intrinsics.width, v.camera.intrinsics.height));
+    let area = |(width, height): &(u32, u32)| u64::from(*width) * u64::from(*height);
+    let small = sizes.clone().min_by_key(area).unwrap_or_default();
+    let large = sizes.max_by_key(area).unwrap_or_default();
+    let size = match small == large {
+        true => format!("{}x{}", small.0, small.1),
+        false => format!("{}x{} to {}x{}", small.0, small.1, large.0, large.1),
+    };
+    let points = dataset
+        .points
+        .as_ref()
+        .map_or("none".to_owned(), |points| points.len().to_string());
+    let centres = dataset.views.iter().map(|view| view.camera.pose.position.to_array());
+    Description {
+        title: format!("{} dataset with {} views", dataset.kind, dataset.views.len()),
+        facts: vec![
+            (
+                "train, test",
+                format!("{}, {}", dataset.train.len(), dataset.test.len()),
+            ),
+            ("image size", format!("{size} (undistorted)")),
+            ("points", points),
+            ("cameras within", extent(centres)),
+        ],
+        warnings: dataset.warnings.clone(),
+    }
+}
+
+/// The box around all finite points.
+fn extent(points: impl Iterator<Item = [f32; 3]>) -> String {
+    let finite = points.filter(|p| p.iter().all(|v| v.is_finite()));
+    let (low, high) = finite.fold(([f32::INFINITY; 3], [f32::NEG_INFINITY; 3]), |(low, high), p| {
+        (
+            std::array::from_fn(|i| low[i].min(p[i])),
+            std::array::from_fn(|i| high[i].max(p[i])),
+        )
+    });
+    if low[0] > high[0] {
+        return "nothing".into();
+    }
+    let corner = |p: [f32; 3]| format!("({:.3}, {:.3}, {:.3})", p[0], p[1], p[2]);
+    format!("{} .. {}", corner(low), corner(high))
+}

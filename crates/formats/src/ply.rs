@@ -1,0 +1,426 @@
+//! The PLY container: the header, and the rows of one element as fixed-size scalars in whatever encoding.
+
+use crate::Malformed;
+use std::borrow::Cow;
+
+/// A header is a few kilobytes; a file that goes on without `end_header` is not searched to its end.
+const LONGEST_HEADER: usize = 1 << 20;
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Scalar {
+    I8,
+    U8,
+    I16,
+    U16,
+    I32,
+    U32,
+    F32,
+    F64,
+}
+
+impl Scalar {
+    fn from_name(name: &str) -> Option<Self> {
+        Some(match name {
+            "char" | "int8" => Self::I8,
+            "uchar" | "uint8" => Self::U8,
+            "short" | "int16" => Self::I16,
+            "ushort" | "uint16" => Self::U16,
+            "int" | "int32" => Self::I32,
+            "uint" | "uint32" => Self::U32,
+            "float" | "float32" => Self::F32,
+            "double" | "float64" => Self::F64,
+            _ => return None,
+        })
+    }
+
+    pub fn size(self) -> usize {
+        match self {
+            Self::I8 | Self::U8 => 1,
+            Self::I16 | Self::U16 => 2,
+            Self::I32 | Self::U32 | Self::F32 => 4,
+            Self::F64 => 8,
+        }
+    }
+
+    pub fn is_float(self) -> bool {
+        matches!(self, Self::F32 | Self::F64)
+    }
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Encoding {
+    Ascii,
+    LittleEndian,
+    BigEndian,
+}
+
+#[derive(Clone, Copy, Debug)]
+enum PropertyKind {
+    One(Scalar),
+    List { count: Scalar, item: Scalar },
+}
+
+#[derive(Clone, Debug)]
+struct Property {
+    name: String,
+    kind: PropertyKind,
+}
+
+#[derive(Clone, Debug)]
+struct Element {
+    name: String,
+    count: u64,
+    properties: Vec<Property>,
+}
+
+impl Element {
+    /// Bytes a binary row takes when no property is a list.
+    fn fixed_stride(&self) -> Option<usize> {
+        self.properties.iter().try_fold(0, |sum, property| match property.kind {
+            PropertyKind::One(scalar) => Some(sum + scalar.size()),
+            PropertyKind::List { .. } => None,
+        })
+    }
+
+    /// Bytes (binary) or characters (ASCII, a digit and a separator) a row takes at least.
+    fn least_row(&self, encoding: Encoding) -> u64 {
+        let least = |property: &Property| match (encoding, property.kind) {
+            (Encoding::Ascii, _) => 2,
+            (_, PropertyKind::One(scalar)) => scalar.size(),
+            (_, PropertyKind::List { count, .. }) => count.size(),
+        };
+        self.properties.iter().map(least).sum::<usize>() as u64
+    }
+}
+
+/// A parsed header with the bytes behind it.
+pub(crate) struct Ply<'a> {
+    encoding: Encoding,
+    pub comments: Vec<String>,
+    elements: Vec<Element>,
+    body: &'a [u8],
+}
+
+/// The scalar properties of one element, each row `stride` bytes.
+pub(crate) struct Rows<'a> {
+    bytes: Cow<'a, [u8]>,
+    stride: usize,
+    columns: Vec<(String, Column)>,
+}
+
+/// Where in a row a property lies and how it is to be read.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Column {
+    offset: usize,
+    pub scalar: Scalar,
+    big_endian: bool,
+}
+
+impl<'a> Ply<'a> {
+    pub fn parse(bytes: &'a [u8]) -> Result<Self, Malformed> {
+        let mut rest = bytes;
+        if next_line(&mut rest) != Some("ply") {
+            return Err(Malformed("not a PLY file: its first line is not `ply`".into()));
+        }
+        let mut encoding = None;
+        let mut comments = Vec::new();
+        let mut elements: Vec<Element> = Vec::new();
+        loop {
+            let Some(line) = next_line(&mut rest).filter(|_| bytes.len() - rest.len() <= LONGEST_HEADER) else {
+                return Err(Malformed(
+                    "the PLY header has no `end_header`; the file is damaged".into(),
+                ));
+            };
+            let refuse = || Malformed(format!("the PLY header line `{}` is not understood", shown(line)));
+            let words: Vec<&str> = line.split_ascii_whitespace().collect();
+            match words[..] {
+                ["end_header"] => break,
+                ["comment" | "obj_info", ..] => comments.push(line.split_once(' ').map_or("", |(_, c)| c).to_owned()),
+                ["format", name, _] => {
+                    encoding = Some(match name {
+                        "ascii" => Encoding::Ascii,
+                        "binary_little_endian" => Encoding::LittleEndian,
+                        "binary_big_endian" => Encoding::BigEndian,
+                        _ => return Err(refuse()),
+                    });
+                }
+                ["element", name, count] => elements.push(Element {
+                    name: name.to_owned(),
+                    count: count.parse().map_err(|_| refuse())?,
+                    properties: Vec::new(),
+                }),
+                ["property", "list", count, item, name] => {
+                    let count = Scalar::from_name(count).filter(|c| !c.is_float()).ok_or_else(refuse)?;
+                    let item = Scalar::from_name(item).ok_or_else(refuse)?;
+                    elements.last_mut().ok_or_else(refuse)?.properties.push(Property {
+                        name: name.to_owned(),
+                        kind: PropertyKind::List { count, item },
+                    });
+                }
+                ["property", scalar, name] => {
+                    let scalar = Scalar::from_name(scalar).ok_or_else(refuse)?;
+                    elements.last_mut().ok_or_else(refuse)?.properties.push(Property {
+                        name: name.to_owned(),
+                        kind: PropertyKind::One(scalar),
+                    });
+                }
+                [] => {}
+                _ => return Err(refuse()),
+            }
+        }
+        Ok(Self {
+            encoding: encoding.ok_or_else(|| Malformed("the PLY header has no `format` line".into()))?,
+            comments,
+            elements,
+            body: rest,
+        })
+    }
+
+    fn find(&self, element: &str) -> Result<&Element, Malformed> {
+        let found = self.elements.iter().find(|e| e.name == element);
+        found.ok_or_else(|| Malformed(format!("the PLY header declares no element `{element}`")))
+    }
+
+    /// Names of an element's properties, in order.
+    pub fn property_names(&self, element: &str) -> Result<impl Iterator<Item = &str>, Malformed> {
+        Ok(self.find(element)?.properties.iter().map(|p| p.name.as_str()))
+    }
+
+    /// The scalar properties of `element`; lists in it and all elements before it are skipped.
+    pub fn rows(&self, element: &str) -> Result<Rows<'a>, Malformed> {
+        let wanted = self.find(element)?;
+        let mut rest = self.body;
+        let before = self.elements.iter().take_while(|e| e.name != wanted.name);
+        // Rows without properties take no room, however many are declared.
+        for before in before.filter(|e| !e.properties.is_empty()) {
+            self.check_size(before, rest)?;
+            match (self.encoding, before.fixed_stride()) {
+                (Encoding::Ascii, _) => walk_ascii(before, &mut rest, None)?,
+                (_, Some(stride)) => rest = &rest[before.count as usize * stride..],
+                (_, None) => self.walk_binary(before, &mut rest, None)?,
+            }
+        }
+        if wanted.properties.is_empty() {
+            return Err(Malformed(format!("the element `{element}` has no properties")));
+        }
+        self.check_size(wanted, rest)?;
+        let count = wanted.count as usize;
+        let mut columns = Vec::new();
+        let mut stride = 0;
+        let big_endian = self.encoding == Encoding::BigEndian;
+        for property in &wanted.properties {
+            if let PropertyKind::One(scalar) = property.kind {
+                let column = Column {
+                    offset: stride,
+                    scalar,
+                    big_endian,
+                };
+                columns.push((property.name.clone(), column));
+                stride += scalar.size();
+            }
+        }
+        let bytes = match (self.encoding, wanted.fixed_stride()) {
+            (Encoding::Ascii, _) => {
+                let mut packed = Vec::new();
+                walk_ascii(wanted, &mut rest, Some(&mut packed))?;
+                Cow::Owned(packed)
+            }
+            (_, Some(stride)) => Cow::Borrowed(&rest[..count * stride]),
+            (_, None) => {
+                let mut packed = Vec::new();
+                self.walk_binary(wanted, &mut rest, Some(&mut packed))?;
+                Cow::Owned(packed)
+            }
+        };
+        Ok(Rows { bytes, stride, columns })
+    }
+
+    fn check_size(&self, element: &Element, rest: &[u8]) -> Result<(), Malformed> {
+        // The last number of an ASCII file needs no separator.
+        let there = rest.len() as u64 + u64::from(self.encoding == Encoding::Ascii);
+        let needed = u128::from(element.count) * u128::from(element.least_row(self.encoding));
+        if needed > u128::from(there) {
+            return Err(Malformed(format!(
+                "the PLY header promises {} rows of `{}`, which take at least {needed} bytes, and the file has {} left; \
+                 it is truncated, copy it again",
+                element.count,
+                element.name,
+                rest.len()
+            )));
+        }
+        Ok(())
+    }
+
+    fn walk_binary(
+        &self,
+        element: &Element,
+        rest: &mut &[u8],
+        mut packed: Option<&mut Vec<u8>>,
+    ) -> Result<(), Malformed> {
+        let mut take = |count: usize| -> Result<&[u8], Malformed> {
+            let (taken, left) = rest.split_at_checked(count).ok_or_else(|| ends_within(element))?;
+            *rest = left;
+            Ok(taken)
+        };
+        for _ in 0..element.count {
+            for property in &element.properties {
+                match property.kind {
+                    PropertyKind::One(scalar) => {
+                        let taken = take(scalar.size())?;
+                        if let Some(packed) = packed.as_deref_mut() {
+                            packed.extend_from_slice(taken);
+                        }
+                    }
+                    PropertyKind::List { count, item } => {
+                        let column = Column {
+                            offset: 0,
+                            scalar: count,
+                            big_endian: self.encoding == Encoding::BigEndian,
+                        };
+                        let length = column.f64(take(count.size())?);
+                        // A negative length saturates to 0, one beyond the file is refused by `take`.
+                        take((length as usize).saturating_mul(item.size()))?;
+                    }
+                }
+            }
+        }
+        Ok(())
+    }
+}
+
+impl Rows<'_> {
+    pub fn len(&self) -> usize {
+        self.bytes.len().checked_div(self.stride).unwrap_or(0)
+    }
+
+    pub fn row(&self, index: usize) -> &[u8] {
+        &self.bytes[index * self.stride..(index + 1) * self.stride]
+    }
+
+    pub fn column(&self, name: &str) -> Option<Column> {
+        self.columns.iter().find(|(n, _)| n == name).map(|(_, c)| *c)
+    }
+
+    /// The columns of `names`, or an error that lists those that are missing.
+    pub fn columns<const N: usize>(&self, names: [&str; N]) -> Result<[Column; N], Malformed> {
+        let missing: Vec<&str> = names.into_iter().filter(|name| self.column(name).is_none()).collect();
+        if !missing.is_empty() {
+            return Err(Malformed(format!(
+                "the vertices lack the properties {}",
+                missing.join(", ")
+            )));
+        }
+        Ok(names.map(|name| self.column(name).expect("checked above")))
+    }
+}
+
+impl Column {
+    /// The value in `row`. Floats keep their bits, also those of a NaN; integers are converted, doubles rounded.
+    pub fn f32(self, row: &[u8]) -> f32 {
+        match self.scalar {
+            Scalar::F32 => f32::from_bits(u32::from_ne_bytes(self.native(row))),
+            _ => self.f64(row) as f32,
+        }
+    }
+
+    pub fn f64(self, row: &[u8]) -> f64 {
+        match self.scalar {
+            Scalar::I8 => f64::from(i8::from_ne_bytes(self.native(row))),
+            Scalar::U8 => f64::from(u8::from_ne_bytes(self.native(row))),
+            Scalar::I16 => f64::from(i16::from_ne_bytes(self.native(row))),
+            Scalar::U16 => f64::from(u16::from_ne_bytes(self.native(row))),
+            Scalar::I32 => f64::from(i32::from_ne_bytes(self.native(row))),
+            Scalar::U32 => f64::from(u32::from_ne_bytes(self.native(row))),
+            Scalar::F32 => f64::from(f32::from_ne_bytes(self.native(row))),
+            Scalar::F64 => f64::from_ne_bytes(self.native(row)),
+        }
+    }
+
+    fn native<const N: usize>(self, row: &[u8]) -> [u8; N] {
+        let mut bytes: [u8; N] = row[self.offset..self.offset + N].try_into().expect("N bytes");
+        if self.big_endian != cfg!(target_endian = "big") {
+            bytes.reverse();
+        }
+        bytes
+    }
+}
+
+fn walk_ascii(element: &Element, rest: &mut &[u8], mut packed: Option<&mut Vec<u8>>) -> Result<(), Malformed> {
+    let mut next = || -> Result<&str, Malformed> {
+        let text = rest.trim_ascii_start();
+        let length = text.iter().position(u8::is_ascii_whitespace).unwrap_or(text.len());
+        let (word, left) = text.split_at(length);
+        *rest = left;
+        match std::str::from_utf8(word) {
+            Ok("") => Err(ends_within(element)),
+            Ok(word) => Ok(word),
+            Err(_) => Err(Malformed(format!(
+                "the ASCII rows of `{}` hold something that is no number",
+                element.name
+            ))),
+        }
+    };
+    for _ in 0..element.count {
+        for property in &element.properties {
+            match property.kind {
+                PropertyKind::One(scalar) => {
+                    let word = next()?;
+                    if let Some(packed) = packed.as_deref_mut() {
+                        push_number(packed, scalar, word)?;
+                    }
+                }
+                PropertyKind::List { .. } => {
+                    let word = next()?;
+                    let length: u64 = word.parse().map_err(|_| no_number(word))?;
+                    for _ in 0..length {
+                        next()?;
+                    }
+                }
+            }
+        }
+    }
+    Ok(())
+}
+
+/// Appends the little-endian bytes of a number written out.
+fn push_number(packed: &mut Vec<u8>, scalar: Scalar, word: &str) -> Result<(), Malformed> {
+    if scalar == Scalar::F32 {
+        // Not by way of f64: rounding twice may miss the nearest float.
+        let value: f32 = word.parse().map_err(|_| no_number(word))?;
+        packed.extend_from_slice(&value.to_le_bytes());
+        return Ok(());
+    }
+    let value: f64 = word.parse().map_err(|_| no_number(word))?;
+    match scalar {
+        Scalar::I8 => packed.extend_from_slice(&(value as i8).to_le_bytes()),
+        Scalar::U8 => packed.extend_from_slice(&(value as u8).to_le_bytes()),
+        Scalar::I16 => packed.extend_from_slice(&(value as i16).to_le_bytes()),
+        Scalar::U16 => packed.extend_from_slice(&(value as u16).to_le_bytes()),
+        Scalar::I32 => packed.extend_from_slice(&(value as i32).to_le_bytes()),
+        Scalar::U32 => packed.extend_from_slice(&(value as u32).to_le_bytes()),
+        Scalar::F32 | Scalar::F64 => packed.extend_from_slice(&value.to_le_bytes()),
+    }
+    Ok(())
+}
+
+fn next_line<'a>(rest: &mut &'a [u8]) -> Option<&'a str> {
+    let end = rest.iter().take(LONGEST_HEADER).position(|byte| *byte == b'\n')?;
+    let line = std::str::from_utf8(&rest[..end]).ok()?;
+    *rest = &rest[end + 1..];
+    Some(line.trim_end())
+}
+
+fn shown(text: &str) -> String {
+    text.chars().take(60).filter(|c| !c.is_control()).collect()
+}
+
+fn no_number(word: &str) -> Malformed {
+    Malformed(format!("`{}` is no number", shown(word)))
+}
+
+fn ends_within(element: &Element) -> Malformed {
+    Malformed(format!(
+        "ends within the {} rows of `{}` that the header promises; the file is truncated, copy it again",
+        element.count, element.name
+    ))
+}

@@ -1,0 +1,148 @@
+use crate::error::read_and_parse;
+use crate::ply::{Column, Ply, Rows};
+use crate::{FormatError, Malformed};
+use glam::Vec3;
+use irradia_scene::PointCloud;
+use std::path::Path;
+
+/// Reads a point cloud from a PLY file: ASCII or binary of either byte order; `x y z` of any type; `red green blue`
+/// (or `r g b`, `diffuse_red ..`) as bytes, or as floats in \[0, 1\] or in 0..255; white where there is no colour.
+///
+/// Other properties and elements are skipped, points that are not finite are left out.
+///
+/// # Errors
+/// When the file cannot be read, is no PLY, lacks a coordinate, or is shorter than its header promises.
+pub fn read_points_ply(path: &Path) -> Result<PointCloud, FormatError> {
+    read_and_parse(path, parse_points_ply)
+}
+
+/// The bytes-level twin of [`read_points_ply`].
+///
+/// # Errors
+/// The same, without the file's name.
+///
+/// [`read_points_ply`]: crate::read_points_ply
+pub fn parse_points_ply(bytes: &[u8]) -> Result<PointCloud, Malformed> {
+    let ply = Ply::parse(bytes)?;
+    let rows = ply.rows("vertex")?;
+    let [x, y, z] = rows.columns(["x", "y", "z"])?;
+    let color = [
+        ["red", "green", "blue"],
+        ["r", "g", "b"],
+        ["diffuse_red", "diffuse_green", "diffuse_blue"],
+    ]
+    .into_iter()
+    .find_map(|names| rows.columns(names).ok());
+    let color_scale = color.map_or(1.0, |columns| color_scale(&rows, columns));
+
+    let mut points = PointCloud::default();
+    for index in 0..rows.len() {
+        let row = rows.row(index);
+        let position = Vec3::new(x.f32(row), y.f32(row), z.f32(row));
+        if position.is_finite() {
+            points.positions.push(position);
+            // `as u8` saturates, and takes NaN to 0.
+            points.colors.push(color.map_or([255; 3], |columns| {
+                columns.map(|c| (c.f64(row) * color_scale).round() as u8)
+            }));
+        }
+    }
+    Ok(points)
+}
+
+/// What takes the file's colours to 0..=255. Float colours are in \[0, 1\] by custom, yet some writers keep 0..255:
+/// nothing but the values themselves tells.
+fn color_scale(rows: &Rows, columns: [Column; 3]) -> f64 {
+    match columns[0].scalar {
+        scalar if scalar.is_float() => {
+            let over_one = (0..rows.len()).any(|index| columns.iter().any(|c| c.f64(rows.row(index)) > 1.0));
+            if over_one { 1.0 } else { 255.0 }
+        }
+        scalar if scalar.size() == 2 => 255.0 / 65535.0,
+        _ => 1.0,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn ascii_with_lists_other_elements_and_float_colours() {
+        let text = "ply\nformat ascii 1.0\ncomment made by hand\nelement camera 1\nproperty list uchar int ids\n\
+            element vertex 3\nproperty double x\nproperty list uchar float extra\nproperty float y\nproperty float z\n\
+            property float red\nproperty float green\nproperty float blue\nelement face 1\n\
+            property list uchar int vertex_indices\nend_header\n2 7 8\n\
+            1 0 2 3 1 0.5 0\n-1e2 2 9 9 5 6 0 0 0.2\nnan 0 0 0 0 0 0\n3 0 1 2\n";
+        let points = parse_points_ply(text.as_bytes()).unwrap();
+        assert_eq!(
+            points.positions,
+            [Vec3::new(1.0, 2.0, 3.0), Vec3::new(-100.0, 5.0, 6.0)]
+        );
+        assert_eq!(points.colors, [[255, 128, 0], [0, 0, 51]]);
+    }
+
+    #[test]
+    fn binary_in_both_byte_orders_with_a_list_before_the_vertices() {
+        for big in [false, true] {
+            let f = |v: f32| if big { v.to_be_bytes() } else { v.to_le_bytes() };
+            let d = |v: f64| if big { v.to_be_bytes() } else { v.to_le_bytes() };
+            let u = |v: u32| if big { v.to_be_bytes() } else { v.to_le_bytes() };
+            let mut bytes = format!(
+                "ply\r\nformat binary_{}_endian 1.0\r\nelement face 1\r\nproperty list uint float weights\r\n\
+                 element vertex 2\r\nproperty uchar red\r\nproperty uchar green\r\nproperty uchar blue\r\n\
+                 property double x\r\nproperty float y\r\nproperty float z\r\nend_header\r\n",
+                if big { "big" } else { "little" }
+            )
+            .into_bytes();
+            bytes.extend(u(2));
+            bytes.extend(f(0.5));
+            bytes.extend(f(0.25));
+            for (color, x) in [([1u8, 2, 3], 0.125), ([4, 5, 6], -8.0)] {
+                bytes.extend(color);
+                bytes.extend(d(x));
+                bytes.extend(f(2.0));
+                bytes.extend(f(3.0));
+            }
+            let points = parse_points_ply(&bytes).unwrap();
+            assert_eq!(
+                points.positions,
+                [Vec3::new(0.125, 2.0, 3.0), Vec3::new(-8.0, 2.0, 3.0)]
+            );
+            assert_eq!(points.colors, [[1, 2, 3], [4, 5, 6]]);
+            let error = parse_points_ply(&bytes[..bytes.len() - 1]).unwrap_err().to_string();
+            assert!(
+                error.contains("promises 2 rows") && error.contains("37 left"),
+                "{error}"
+            );
+        }
+    }
+
+    #[test]
+    fn headers_that_promise_the_moon_are_refused_before_anything_is_allocated() {
+        for (body, expected) in [
+            (
+                "element vertex 18446744073709551615\nproperty float x\nproperty float y\nproperty float z\n",
+                "promises",
+            ),
+            (
+                "element vertex 99999999999999999999\nproperty float x\n",
+                "not understood",
+            ),
+            ("element vertex 3\n", "no properties"),
+            (
+                "element edge 18446744073709551615\nelement vertex 0\nproperty float x\nproperty float y\n",
+                "lack the properties z",
+            ),
+            ("property float x\n", "not understood"),
+        ] {
+            for format in ["ascii", "binary_little_endian"] {
+                let text = format!("ply\nformat {format} 1.0\n{body}end_header\n");
+                let error = parse_points_ply(text.as_bytes()).unwrap_err().to_string();
+                assert!(error.contains(expected), "{error}");
+            }
+        }
+        assert!(parse_points_ply(b"ply\nformat ascii 1.0\nelement vertex 0\n").is_err());
+        assert!(parse_points_ply(b"PNG").is_err());
+    }
+}

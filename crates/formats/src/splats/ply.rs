@@ -1,0 +1,326 @@
+//! Splats as PLY, in the layout of the Inria 3DGS code (Kerbl et al. 2023, `save_ply` of its `gaussian_model.py`):
+//! `x y z nx ny nz f_dc_0..2 f_rest_0.. opacity scale_0..2 rot_0..3`, little-endian floats. `f_rest` is channel-major:
+//! all of red's coefficients, then green's, then blue's. `rot` is `w x y z`; scales are ln, opacity is a logit.
+
+use crate::Malformed;
+use crate::ply::{Column, Ply, Rows};
+use irradia_scene::{GaussianCloud, sh};
+use rayon::prelude::*;
+use std::io::{self, Write};
+
+/// Rows that one task converts.
+const CHUNK: usize = 16_384;
+/// The comment that carries [`GaussianCloud::antialiased`], which the layout has no place for.
+const ANTIALIASED: &str = "antialiased 1";
+/// Highest degree that is read.
+const MAX_DEGREE: u32 = 4;
+
+/// The properties of a splat file that every splat needs.
+const POSITION: [&str; 3] = ["x", "y", "z"];
+const DC: [&str; 3] = ["f_dc_0", "f_dc_1", "f_dc_2"];
+const SCALE: [&str; 3] = ["scale_0", "scale_1", "scale_2"];
+const ROTATION: [&str; 4] = ["rot_0", "rot_1", "rot_2", "rot_3"];
+
+/// Parses a splat PLY: any encoding, any order of properties, SH degree 0 to 4 by the number of `f_rest`; what else
+/// the file holds is skipped. Floats keep their bits.
+///
+/// # Errors
+/// One line when the header is not understood, properties are missing (all are named), or the file is shorter than
+/// the header promises.
+pub fn parse_splat_ply(bytes: &[u8]) -> Result<GaussianCloud, Malformed> {
+    let ply = Ply::parse(bytes)?;
+    let sh_degree = check_properties(&ply)?;
+    let rows = ply.rows("vertex")?;
+    let columns = Columns::find(&rows, sh_degree)?;
+
+    let count = rows.len();
+    let sh_values = 3 * sh::coefficients(sh_degree);
+    let mut cloud = GaussianCloud {
+        means: vec![[0.0; 3]; count],
+        quats: vec![[0.0; 4]; count],
+        log_scales: vec![[0.0; 3]; count],
+        opacity_logits: vec![0.0; count],
+        sh: vec![0.0; count * sh_values],
+        sh_degree,
+        antialiased: ply.comments.iter().any(|comment| comment.trim() == ANTIALIASED),
+    };
+    let geometry = cloud.means.par_chunks_mut(CHUNK).zip(cloud.quats.par_chunks_mut(CHUNK));
+    let shape = cloud
+        .log_scales
+        .par_chunks_mut(CHUNK)
+        .zip(cloud.opacity_logits.par_chunks_mut(CHUNK));
+    let colour = cloud.sh.par_chunks_mut(CHUNK * sh_values);
+    geometry
+        .zip(shape)
+        .zip(colour)
+        .enumerate()
+        .for_each(|(chunk, (((means, quats), (scales, opacities)), sh))| {
+            for (i, sh) in sh.chunks_exact_mut(sh_values).enumerate() {
+                let row = rows.row(chunk * CHUNK + i);
+                means[i] = columns.position.map(|c| c.f32(row));
+                quats[i] = columns.rotation.map(|c| c.f32(row));
+                scales[i] = columns.scale.map(|c| c.f32(row));
+                opacities[i] = columns.opacity.f32(row);
+                for (value, column) in sh.iter_mut().zip(&columns.sh) {
+                    *value = column.f32(row);
+                }
+            }
+        });
+    Ok(cloud)
+}
+
+/// Whether a PLY holds splats rather than a point cloud, by the names of its properties.
+pub(crate) fn looks_like_splats(bytes: &[u8]) -> Result<bool, Malformed> {
+    let ply = Ply::parse(bytes)?;
+    Ok(ply
+        .property_names("vertex")?
+        .any(|name| name.starts_with("f_dc_") || name.starts_with("packed_")))
+}
+
+struct Columns {
+    position: [Column; 3],
+    rotation: [Column; 4],
+    scale: [Column; 3],
+    opacity: Column,
+    /// In the order of [`GaussianCloud::sh`].
+    sh: Vec<Column>,
+}
+
+impl Columns {
+    fn find(rows: &Rows, sh_degree: u32) -> Result<Self, Malformed> {
+        let mut sh = rows.columns(DC)?.to_vec();
+        let rest = sh::coefficients(sh_degree) - 1;
+        for coefficient in 0..rest {
+            for channel in 0..3 {
+                let name = format!("f_rest_{}", channel * rest + coefficient);
+                sh.extend(rows.columns([name.as_str()])?);
+            }
+        }
+        Ok(Self {
+            position: rows.columns(POSITION)?,
+            rotation: rows.columns(ROTATION)?,
+            scale: rows.columns(SCALE)?,
+            opacity: rows.columns(["opacity"])?[0],
+            sh,
+        })
+    }
+}
+
+/// Names everything that is missing at once, before a byte of the body is looked at; returns the SH degree.
+fn check_properties(ply: &Ply) -> Result<u32, Malformed> {
+    let names: Vec<&str> = ply.property_names("vertex")?.collect();
+    if names.iter().any(|name| name.starts_with("packed_")) {
+        return Err(Malformed(
+            "compressed PLY (packed_position, packed_rotation, ..) is not supported yet; convert it to a plain PLY"
+                .into(),
+        ));
+    }
+    let needed = POSITION
+        .iter()
+        .chain(&DC)
+        .chain(&["opacity"])
+        .chain(&SCALE)
+        .chain(&ROTATION);
+    let missing: Vec<&str> = needed.copied().filter(|name| !names.contains(name)).collect();
+    if !missing.is_empty() {
+        let hint = if DC.iter().all(|name| missing.contains(name)) {
+            "; it is a point cloud or a mesh, not a splat scene"
+        } else {
+            ""
+        };
+        return Err(Malformed(format!(
+            "the splats lack the properties {}{hint}",
+            missing.join(", ")
+        )));
+    }
+    let rest = names.iter().filter(|name| name.starts_with("f_rest_")).count();
+    (0..=MAX_DEGREE)
+        .find(|degree| 3 * (sh::coefficients(*degree) - 1) == rest)
+        .ok_or_else(|| {
+            Malformed(format!(
+                "{rest} f_rest properties belong to no spherical-harmonics degree; 0, 9, 24, 45 and 72 do"
+            ))
+        })
+}
+
+/// Writes `cloud` in the Inria layout with zero normals; `3 ((degree + 1)^2 - 1)` values of `f_rest`.
+pub(crate) fn write_splat_ply(out: &mut dyn Write, cloud: &GaussianCloud) -> io::Result<()> {
+    let rest = cloud.sh_coefficients() - 1;
+    let mut names: Vec<String> = POSITION
+        .iter()
+        .chain(&["nx", "ny", "nz"])
+        .chain(&DC)
+        .map(|n| n.to_string())
+        .collect();
+    names.extend((0..3 * rest).map(|i| format!("f_rest_{i}")));
+    names.extend(["opacity"].iter().chain(&SCALE).chain(&ROTATION).map(|n| n.to_string()));
+
+    writeln!(out, "ply\nformat binary_little_endian 1.0\ncomment written by Irradia")?;
+    if cloud.antialiased {
+        writeln!(out, "comment {ANTIALIASED}")?;
+    }
+    writeln!(out, "element vertex {}", cloud.len())?;
+    for name in &names {
+        writeln!(out, "property float {name}")?;
+    }
+    writeln!(out, "end_header")?;
+
+    let sh_values = 3 * (rest + 1);
+    let chunk_bytes = |chunk: usize| {
+        let first = chunk * CHUNK;
+        let last = (first + CHUNK).min(cloud.len());
+        let mut bytes = Vec::with_capacity((last - first) * names.len() * 4);
+        for i in first..last {
+            let sh = &cloud.sh[i * sh_values..(i + 1) * sh_values];
+            let mut put = |value: f32| bytes.extend_from_slice(&value.to_le_bytes());
+            cloud.means[i].into_iter().for_each(&mut put);
+            [0.0; 3].into_iter().for_each(&mut put);
+            sh[..3].iter().copied().for_each(&mut put);
+            for channel in 0..3 {
+                (1..=rest).for_each(|coefficient| put(sh[3 * coefficient + channel]));
+            }
+            put(cloud.opacity_logits[i]);
+            cloud.log_scales[i].into_iter().for_each(&mut put);
+            cloud.quats[i].into_iter().for_each(&mut put);
+        }
+        bytes
+    };
+    // A few chunks a thread at a time: parallel, without the whole file in memory.
+    let chunks = cloud.len().div_ceil(CHUNK);
+    let batch = 2 * rayon::current_num_threads();
+    for first in (0..chunks).step_by(batch) {
+        let parts: Vec<Vec<u8>> = (first..(first + batch).min(chunks))
+            .into_par_iter()
+            .map(chunk_bytes)
+            .collect();
+        parts.iter().try_for_each(|part| out.write_all(part))?;
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use irradia_scene::Rng;
+
+    fn random_cloud(count: usize, sh_degree: u32, antialiased: bool) -> GaussianCloud {
+        let mut rng = Rng::new(3, u64::from(sh_degree));
+        let mut f = || f32::from_bits(rng.next_u32());
+        GaussianCloud {
+            means: (0..count).map(|_| [f(), f(), f()]).collect(),
+            quats: (0..count).map(|_| [f(), f(), f(), f()]).collect(),
+            log_scales: (0..count).map(|_| [f(), f(), f()]).collect(),
+            opacity_logits: (0..count).map(|_| f()).collect(),
+            sh: (0..count * 3 * sh::coefficients(sh_degree)).map(|_| f()).collect(),
+            sh_degree,
+            antialiased,
+        }
+    }
+
+    fn bits(cloud: &GaussianCloud) -> Vec<u32> {
+        let columns = [
+            cloud.means.as_flattened(),
+            cloud.quats.as_flattened(),
+            cloud.log_scales.as_flattened(),
+            &cloud.opacity_logits,
+            &cloud.sh,
+        ];
+        columns.concat().iter().map(|v| v.to_bits()).collect()
+    }
+
+    #[test]
+    fn every_bit_comes_back_also_of_nans_for_every_degree() {
+        for degree in 0..=4 {
+            for count in [0, 1, 3, CHUNK + 7] {
+                let cloud = random_cloud(count, degree, degree % 2 == 0);
+                let mut bytes = Vec::new();
+                write_splat_ply(&mut bytes, &cloud).unwrap();
+                let back = parse_splat_ply(&bytes).unwrap();
+                assert_eq!((back.sh_degree, back.antialiased), (degree, degree % 2 == 0));
+                assert_eq!(bits(&back), bits(&cloud));
+            }
+        }
+    }
+
+    #[test]
+    fn the_layout_is_inrias() {
+        let mut cloud = random_cloud(1, 3, false);
+        cloud.sh = (0..48).map(|i| i as f32).collect();
+        let mut bytes = Vec::new();
+        write_splat_ply(&mut bytes, &cloud).unwrap();
+        let end = bytes.windows(11).position(|w| w == b"end_header\n").unwrap() + 11;
+        let header = String::from_utf8(bytes[..end].to_vec()).unwrap();
+        let names: Vec<&str> = header
+            .lines()
+            .filter_map(|l| l.strip_prefix("property float "))
+            .collect();
+        assert_eq!(names.len(), 62);
+        assert_eq!(
+            names[..10],
+            [
+                "x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "f_rest_0"
+            ]
+        );
+        assert_eq!(
+            names[53..],
+            [
+                "f_rest_44",
+                "opacity",
+                "scale_0",
+                "scale_1",
+                "scale_2",
+                "rot_0",
+                "rot_1",
+                "rot_2",
+                "rot_3"
+            ]
+        );
+        let value = |i: usize| f32::from_le_bytes(bytes[end + 4 * i..end + 4 * i + 4].try_into().unwrap());
+        // Channel-major: f_rest_0 and f_rest_1 are red's first two, f_rest_15 is green's first.
+        assert_eq!([value(6), value(7), value(8)], [0.0, 1.0, 2.0]);
+        assert_eq!([value(9), value(10), value(24), value(39)], [3.0, 6.0, 4.0, 5.0]);
+        assert_eq!(bytes.len(), end + 62 * 4);
+    }
+
+    #[test]
+    fn big_endian_shuffled_and_with_extras() {
+        let order = [
+            "rot_3", "rot_0", "opacity", "extra", "x", "z", "y", "f_dc_2", "f_dc_1", "f_dc_0", "rot_1", "rot_2",
+            "scale_2", "scale_0", "scale_1",
+        ];
+        let mut bytes = b"ply\nformat binary_big_endian 1.0\nelement vertex 1\n".to_vec();
+        for name in order {
+            bytes.extend(format!("property {} {name}\n", if name == "extra" { "uchar" } else { "float" }).bytes());
+        }
+        bytes.extend(b"end_header\n");
+        for (i, name) in order.into_iter().enumerate() {
+            match name {
+                "extra" => bytes.push(9),
+                _ => bytes.extend((i as f32).to_be_bytes()),
+            }
+        }
+        let cloud = parse_splat_ply(&bytes).unwrap();
+        assert_eq!(cloud.means, [[4.0, 6.0, 5.0]]);
+        assert_eq!(cloud.quats, [[1.0, 10.0, 11.0, 0.0]]);
+        assert_eq!(cloud.log_scales, [[13.0, 14.0, 12.0]]);
+        assert_eq!((cloud.opacity_logits[0], &cloud.sh[..]), (2.0, &[9.0, 8.0, 7.0][..]));
+    }
+
+    #[test]
+    fn what_is_missing_is_named() {
+        let header = |properties: &str| {
+            let lines: String = properties.split(' ').map(|p| format!("property float {p}\n")).collect();
+            format!("ply\nformat binary_little_endian 1.0\nelement vertex 0\n{lines}end_header\n")
+        };
+        let error = |properties: &str| parse_splat_ply(header(properties).as_bytes()).unwrap_err().to_string();
+        let all = "x y z f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3";
+        assert!(error("x y z red green blue").contains("point cloud"));
+        assert!(
+            error(&all.replace("opacity ", "").replace(" rot_2", "")).contains("lack the properties opacity, rot_2")
+        );
+        assert!(error(&format!("{all} f_rest_0 f_rest_1")).contains("2 f_rest"));
+        let gap: String = (1..10).map(|i| format!(" f_rest_{i}")).collect();
+        assert!(error(&format!("{all}{gap}")).contains("f_rest_0"));
+        assert!(error("packed_position packed_rotation").contains("not supported yet"));
+    }
+}

@@ -1,0 +1,422 @@
+//! Distorted photographs become pinhole ones: same focal lengths, cropped so that every pixel shows something.
+
+use crate::Pixels;
+use glam::DVec2;
+use irradia_scene::{Intrinsics, Lens};
+
+/// The lens is evaluated on a grid this coarse, in pixels, and interpolated between. The error is the second derivative
+/// of the mapping times 8, a few thousandths of a pixel for photographic lenses.
+const GRID: u32 = 8;
+/// An undistorted image is at most this many times as wide and high as the photograph (COLMAP's `max_scale`); a fisheye's
+/// rim would otherwise stretch to infinity.
+const LARGEST: f64 = 2.0;
+/// A crop smaller than this on a side is no picture.
+const SMALLEST: i64 = 16;
+
+/// How photographs of one distorted camera are undistorted.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Undistortion {
+    /// The camera as it took the photograph.
+    source: Intrinsics,
+    /// First column of the crop, in pixels of the pinhole image that shares the source's principal point.
+    left: i64,
+    /// First row of the crop.
+    top: i64,
+    width: u32,
+    height: u32,
+}
+
+impl Undistortion {
+    /// The pinhole with the source's focal lengths, cropped to the largest upright rectangle in which every pixel lies
+    /// in the photograph; `None` when the lens leaves no such rectangle.
+    ///
+    /// The rectangle is found by peeling: of a box that is surely too large, the side with the largest part outside is
+    /// moved in until all four sides are inside. The valid region has no holes, so what is inside the sides is valid.
+    pub fn plan(source: &Intrinsics) -> Option<Self> {
+        let half = DVec2::new(f64::from(source.width), f64::from(source.height)) * (0.5 * LARGEST);
+        let (cx, cy) = (f64::from(source.cx), f64::from(source.cy));
+        let largest = Crop {
+            left: (cx - half.x) as i64,
+            top: (cy - half.y) as i64,
+            right: (cx + half.x) as i64,
+            bottom: (cy + half.y) as i64,
+        };
+        let mut crop = largest;
+        let reach = reach(
+            &source.lens,
+            (half.x / f64::from(source.fx)).hypot(half.y / f64::from(source.fy)),
+        );
+        let valid = |x: f64, y: f64| is_valid(source, reach, x, y);
+
+        let step = (i64::from(source.width.max(source.height)) / 256).max(1);
+        loop {
+            let outside = Side::ALL.map(|side| crop.outside(side, 64, valid));
+            let worst = (0..4).max_by_key(|i| outside[*i]).expect("four sides");
+            if outside[worst] == 0 {
+                break;
+            }
+            crop.move_in(Side::ALL[worst], step);
+            if crop.right - crop.left < SMALLEST || crop.bottom - crop.top < SMALLEST {
+                return None;
+            }
+        }
+        // Peeling overshoots by less than a step: give back single rows and columns, looking more closely.
+        for side in Side::ALL {
+            for _ in 0..step {
+                let mut larger = crop;
+                larger.move_in(side, -1);
+                if !largest.contains(&larger) || Side::ALL.iter().any(|side| larger.outside(*side, 256, valid) > 0) {
+                    break;
+                }
+                crop = larger;
+            }
+        }
+        Some(Self {
+            source: *source,
+            left: crop.left,
+            top: crop.top,
+            width: (crop.right - crop.left) as u32,
+            height: (crop.bottom - crop.top) as u32,
+        })
+    }
+
+    /// The camera of the undistorted images.
+    pub fn pinhole(&self) -> Intrinsics {
+        Intrinsics {
+            width: self.width,
+            height: self.height,
+            cx: (f64::from(self.source.cx) - self.left as f64) as f32,
+            cy: (f64::from(self.source.cy) - self.top as f64) as f32,
+            lens: Lens::Pinhole,
+            ..self.source
+        }
+    }
+
+    /// Undistorts an image of the source's size, bilinearly.
+    pub fn apply(&self, from: &Pixels) -> Pixels {
+        match from.channels {
+            1 => self.apply_channels::<1>(from),
+            3 => self.apply_channels::<3>(from),
+            _ => self.apply_channels::<4>(from),
+        }
+    }
+
+    fn apply_channels<const C: usize>(&self, from: &Pixels) -> Pixels {
+        let grid_columns = self.width.div_ceil(GRID) + 1;
+        let grid_row = |y: u32| -> Vec<[f32; 2]> {
+            (0..grid_columns)
+                .map(|column| self.source_index(column * GRID, y))
+                .collect()
+        };
+        let mut data = Vec::with_capacity(self.width as usize * self.height as usize * C);
+        let mut upper = grid_row(0);
+        for first in (0..self.height).step_by(GRID as usize) {
+            let lower = grid_row(first + GRID);
+            for y in first..(first + GRID).min(self.height) {
+                let t = (y - first) as f32 / GRID as f32;
+                let mix = |i: usize, axis: usize| upper[i][axis] + (lower[i][axis] - upper[i][axis]) * t;
+                for column in 0..grid_columns as usize - 1 {
+                    let start = [mix(column, 0), mix(column, 1)];
+                    let end = [mix(column + 1, 0), mix(column + 1, 1)];
+                    let slope = [(end[0] - start[0]) / GRID as f32, (end[1] - start[1]) / GRID as f32];
+                    for i in 0..GRID.min(self.width - column as u32 * GRID) {
+                        let at = [start[0] + slope[0] * i as f32, start[1] + slope[1] * i as f32];
+                        data.extend(sample::<C>(from, at));
+                    }
+                }
+            }
+            upper = lower;
+        }
+        Pixels {
+            width: self.width,
+            height: self.height,
+            channels: from.channels,
+            data,
+        }
+    }
+
+    /// Where the centre of undistorted pixel `(x, y)` lies in the photograph, in units in which pixel centres are whole.
+    fn source_index(&self, x: u32, y: u32) -> [f32; 2] {
+        let at = distorted_pixel(
+            &self.source,
+            (i64::from(x) + self.left) as f64 + 0.5,
+            (i64::from(y) + self.top) as f64 + 0.5,
+        );
+        [(at.x - 0.5) as f32, (at.y - 0.5) as f32]
+    }
+}
+
+/// Bilinear, clamped to the image; with 4 channels colour is weighted by alpha.
+fn sample<const C: usize>(from: &Pixels, at: [f32; 2]) -> [u8; C] {
+    let (last_x, last_y) = (from.width as usize - 1, from.height as usize - 1);
+    let x = at[0].clamp(0.0, last_x as f32);
+    let y = at[1].clamp(0.0, last_y as f32);
+    let (x0, y0) = (x as usize, y as usize);
+    let (x1, y1) = ((x0 + 1).min(last_x), (y0 + 1).min(last_y));
+    let (u, v) = (x - x0 as f32, y - y0 as f32);
+    let pixel = |x: usize, y: usize| -> &[u8; C] {
+        let start = (y * from.width as usize + x) * C;
+        from.data[start..start + C].try_into().expect("C values")
+    };
+    let corners = [
+        (pixel(x0, y0), (1.0 - u) * (1.0 - v)),
+        (pixel(x1, y0), u * (1.0 - v)),
+        (pixel(x0, y1), (1.0 - u) * v),
+        (pixel(x1, y1), u * v),
+    ];
+    let mut sums = [0f32; C];
+    let mut color_weight = 0.0;
+    for (pixel, weight) in corners {
+        let color = if C == 4 { weight * f32::from(pixel[3]) } else { weight };
+        color_weight += color;
+        for c in 0..C {
+            sums[c] += f32::from(pixel[c]) * if c < 3 { color } else { weight };
+        }
+    }
+    if C == 4 {
+        let scale = if color_weight > 0.0 { 1.0 / color_weight } else { 0.0 };
+        sums[..3].iter_mut().for_each(|v| *v *= scale);
+    }
+    sums.map(|v| (v + 0.5) as u8)
+}
+
+#[derive(Clone, Copy, Debug)]
+struct Crop {
+    left: i64,
+    top: i64,
+    right: i64,
+    bottom: i64,
+}
+
+#[derive(Clone, Copy, Debug)]
+enum Side {
+    Left,
+    Top,
+    Right,
+    Bottom,
+}
+
+impl Side {
+    const ALL: [Self; 4] = [Self::Left, Self::Top, Self::Right, Self::Bottom];
+}
+
+impl Crop {
+    /// How many of `samples` + 1 pixel centres along a side are outside the photograph.
+    fn outside(&self, side: Side, samples: u32, valid: impl Fn(f64, f64) -> bool) -> usize {
+        let (left, top) = (self.left as f64 + 0.5, self.top as f64 + 0.5);
+        let (right, bottom) = (self.right as f64 - 0.5, self.bottom as f64 - 0.5);
+        let count = (0..=samples).filter(|i| {
+            let t = f64::from(*i) / f64::from(samples);
+            let (x, y) = (left + (right - left) * t, top + (bottom - top) * t);
+            !match side {
+                Side::Left => valid(left, y),
+                Side::Top => valid(x, top),
+                Side::Right => valid(right, y),
+                Side::Bottom => valid(x, bottom),
+            }
+        });
+        count.count()
+    }
+
+    fn contains(&self, other: &Self) -> bool {
+        self.left <= other.left && self.top <= other.top && self.right >= other.right && self.bottom >= other.bottom
+    }
+
+    fn move_in(&mut self, side: Side, by: i64) {
+        match side {
+            Side::Left => self.left += by,
+            Side::Top => self.top += by,
+            Side::Right => self.right -= by,
+            Side::Bottom => self.bottom -= by,
+        }
+    }
+}
+
+fn plane_point(k: &Intrinsics, x: f64, y: f64) -> DVec2 {
+    DVec2::new(
+        (x - f64::from(k.cx)) / f64::from(k.fx),
+        (y - f64::from(k.cy)) / f64::from(k.fy),
+    )
+}
+
+fn distorted_pixel(k: &Intrinsics, x: f64, y: f64) -> DVec2 {
+    let p = k.lens.distort(plane_point(k, x, y));
+    DVec2::new(
+        f64::from(k.fx) * p.x + f64::from(k.cx),
+        f64::from(k.fy) * p.y + f64::from(k.cy),
+    )
+}
+
+/// Whether an undistorted pixel lies between the centres of the photograph's outermost pixels, on this side of a fold.
+fn is_valid(k: &Intrinsics, reach: f64, x: f64, y: f64) -> bool {
+    if plane_point(k, x, y).length() >= reach {
+        return false;
+    }
+    let at = distorted_pixel(k, x, y);
+    (0.5..=f64::from(k.width) - 0.5).contains(&at.x) && (0.5..=f64::from(k.height) - 0.5).contains(&at.y)
+}
+
+/// The radius on the undistorted plane, at most `largest`, up to which the lens takes larger radii to larger radii.
+/// Beyond it a polynomial folds back and would show the picture twice.
+fn reach(lens: &Lens, largest: f64) -> f64 {
+    let radial = match *lens {
+        Lens::Pinhole => return f64::INFINITY,
+        Lens::Opencv { k, .. } => Lens::Opencv { k, p: [0.0; 2] },
+        fisheye => fisheye,
+    };
+    const STEPS: u32 = 2000;
+    let mut before = 0.0;
+    for i in 1..=STEPS {
+        let radius = largest * f64::from(i) / f64::from(STEPS);
+        let distorted = radial.distort(DVec2::new(radius, 0.0)).x;
+        if distorted.is_nan() || distorted <= before {
+            return largest * f64::from(i - 1) / f64::from(STEPS);
+        }
+        before = distorted;
+    }
+    f64::INFINITY
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn camera(lens: Lens) -> Intrinsics {
+        Intrinsics {
+            width: 320,
+            height: 240,
+            fx: 250.0,
+            fy: 255.0,
+            cx: 150.0,
+            cy: 125.0,
+            lens,
+        }
+    }
+
+    const LENSES: [Lens; 4] = [
+        Lens::Opencv {
+            k: [-0.25, 0.06, 0.0, 0.0, 0.0, 0.0],
+            p: [0.001, -0.002],
+        },
+        Lens::Opencv {
+            k: [0.2, 0.01, 0.0, 0.0, 0.0, 0.0],
+            p: [0.0, 0.0],
+        },
+        Lens::Opencv {
+            k: [0.3, 0.1, 0.01, 0.25, 0.02, 0.0],
+            p: [0.0, 0.001],
+        },
+        Lens::Fisheye {
+            k: [0.02, -0.01, 0.003, -0.0005],
+        },
+    ];
+
+    #[test]
+    fn the_crop_is_valid_throughout_and_cannot_grow() {
+        for lens in LENSES {
+            let source = camera(lens);
+            let plan = Undistortion::plan(&source).unwrap();
+            let valid = |x: i64, y: i64| {
+                is_valid(
+                    &source,
+                    f64::INFINITY,
+                    (x + plan.left) as f64 + 0.5,
+                    (y + plan.top) as f64 + 0.5,
+                )
+            };
+            let (w, h) = (i64::from(plan.width), i64::from(plan.height));
+            assert!((0..h).all(|y| (0..w).all(|x| valid(x, y))), "{lens:?} {plan:?}");
+            assert!(
+                (0..h).any(|y| !valid(-2, y)) && (0..h).any(|y| !valid(w + 1, y)),
+                "{lens:?} {plan:?}"
+            );
+            assert!(
+                (0..w).any(|x| !valid(x, -2)) && (0..w).any(|x| !valid(x, h + 1)),
+                "{lens:?} {plan:?}"
+            );
+            assert!(w * h > 320 * 240 / 2, "{lens:?} {plan:?}");
+        }
+    }
+
+    /// The value of an image that is smooth over the *undistorted* plane, so that undistortion must give it back.
+    fn pattern(p: DVec2) -> [f64; 3] {
+        [
+            128.0 + 150.0 * p.x,
+            128.0 + 150.0 * p.y,
+            128.0 + 90.0 * (4.0 * p.x + 3.0 * p.y).sin(),
+        ]
+    }
+
+    #[test]
+    fn a_photograph_taken_through_the_lens_is_straightened() {
+        for lens in LENSES {
+            let source = camera(lens);
+            let mut photo = Pixels {
+                width: 320,
+                height: 240,
+                channels: 3,
+                data: Vec::new(),
+            };
+            for y in 0..240 {
+                for x in 0..320 {
+                    let distorted = plane_point(&source, f64::from(x) + 0.5, f64::from(y) + 0.5);
+                    let p = lens.undistort(distorted).unwrap_or_default();
+                    photo.data.extend(pattern(p).map(|v| v.round() as u8));
+                }
+            }
+            let plan = Undistortion::plan(&source).unwrap();
+            let pinhole = plan.pinhole();
+            let straight = plan.apply(&photo);
+            assert_eq!((straight.width, straight.height), (pinhole.width, pinhole.height));
+            let mut worst = 0f64;
+            for (i, pixel) in straight.data.chunks_exact(3).enumerate() {
+                let (x, y) = (i as u32 % pinhole.width, i as u32 / pinhole.width);
+                let expected = pattern(plane_point(&pinhole, f64::from(x) + 0.5, f64::from(y) + 0.5));
+                for c in 0..3 {
+                    worst = worst.max((f64::from(pixel[c]) - expected[c].clamp(0.0, 255.0)).abs());
+                }
+            }
+            // Two roundings to 8 bits, and curvature between bilinear samples.
+            assert!(worst < 1.6, "{lens:?} {worst}");
+        }
+    }
+
+    #[test]
+    fn a_fold_is_kept_out_and_a_lens_without_a_picture_is_refused() {
+        let folding = camera(Lens::Opencv {
+            k: [-0.9, 0.0, 0.0, 0.0, 0.0, 0.0],
+            p: [0.0; 2],
+        });
+        let plan = Undistortion::plan(&folding).unwrap();
+        // d(r - 0.9 r^3)/dr = 0 at r = 0.6086.
+        let pinhole = plan.pinhole();
+        let corner = plane_point(&pinhole, 0.5, 0.5);
+        assert!(corner.length() < 0.6086, "{corner}");
+        let outside = Intrinsics {
+            cx: 5000.0,
+            ..camera(Lens::Opencv {
+                k: [0.1, 0.0, 0.0, 0.0, 0.0, 0.0],
+                p: [0.0; 2],
+            })
+        };
+        assert_eq!(Undistortion::plan(&outside), None);
+        let wild = camera(Lens::Fisheye { k: [f64::NAN; 4] });
+        assert_eq!(Undistortion::plan(&wild), None);
+    }
+
+    #[test]
+    fn a_half_turn_fisheye_stays_within_twice_the_size() {
+        let source = Intrinsics {
+            fx: 100.0,
+            fy: 100.0,
+            cx: 160.0,
+            cy: 120.0,
+            ..camera(Lens::Fisheye { k: [0.0; 4] })
+        };
+        let pinhole = Undistortion::plan(&source).unwrap().pinhole();
+        assert!(
+            pinhole.width <= 640 && pinhole.height <= 480 && pinhole.width > 320,
+            "{pinhole:?}"
+        );
+    }
+}

@@ -1,0 +1,326 @@
+//! Real datasets and splat files made by others, read where they lie; see each test's first line for which.
+
+use glam::{Vec2, Vec3};
+use irradia_formats::{DatasetFormat, DatasetOptions, Kind, describe, detect, read_dataset, read_splats};
+use irradia_scene::{Dataset, Lens, View};
+use std::collections::HashSet;
+use std::path::{Path, PathBuf};
+
+/// The folder of shared data, or a loud line and `None`; with `IRRADIA_REQUIRE_SHARED` its absence fails the test.
+fn shared(name: &str) -> Option<PathBuf> {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR"))
+        .join("../../../shared/data")
+        .join(name);
+    if path.exists() {
+        return Some(path);
+    }
+    assert!(
+        std::env::var_os("IRRADIA_REQUIRE_SHARED").is_none(),
+        "{} is absent and IRRADIA_REQUIRE_SHARED is set",
+        path.display()
+    );
+    eprintln!("SKIPPED (no ../shared): {name}");
+    None
+}
+
+fn read(path: &Path) -> Dataset {
+    read_dataset(path, &DatasetOptions::default()).unwrap_or_else(|error| panic!("{error}"))
+}
+
+fn with(path: &Path, downscale: f32, max_side: Option<u32>) -> Dataset {
+    let options = DatasetOptions {
+        downscale,
+        max_side,
+        ..DatasetOptions::default()
+    };
+    read_dataset(path, &options).unwrap_or_else(|error| panic!("{error}"))
+}
+
+fn sizes(dataset: &Dataset) -> HashSet<(u32, u32)> {
+    dataset
+        .views
+        .iter()
+        .map(|v| (v.camera.intrinsics.width, v.camera.intrinsics.height))
+        .collect()
+}
+
+/// Names are sorted, indices cover the views, cameras are valid pinholes, and the first photo has its camera's size.
+fn check_invariants(dataset: &Dataset) {
+    assert!(dataset.views.windows(2).all(|pair| pair[0].name < pair[1].name));
+    assert!(dataset.train.is_sorted() && dataset.test.is_sorted());
+    let all: HashSet<usize> = dataset.train.iter().chain(&dataset.test).copied().collect();
+    assert_eq!(all.len(), dataset.train.len() + dataset.test.len());
+    for view in &dataset.views {
+        let k = &view.camera.intrinsics;
+        assert!(k.is_valid() && k.lens == Lens::Pinhole && view.camera.pose.is_valid());
+        assert!((view.camera.pose.rotation.length() - 1.0).abs() < 1e-5);
+    }
+    let view = &dataset.views[0];
+    let photo = view.photo.load().unwrap();
+    assert_eq!(
+        (photo.width, photo.height),
+        (view.camera.intrinsics.width, view.camera.intrinsics.height)
+    );
+    assert_eq!(photo.data.len() as u32, photo.width * photo.height * photo.channels);
+}
+
+/// The point nearest, in the sense of least squares, to all optical axes.
+fn point_of_attention(dataset: &Dataset) -> Vec3 {
+    let mut a = glam::Mat3::ZERO;
+    let mut b = Vec3::ZERO;
+    for view in &dataset.views {
+        let d = view.camera.pose.rotation * Vec3::Z;
+        let off_axis = glam::Mat3::IDENTITY - glam::Mat3::from_cols(d * d.x, d * d.y, d * d.z);
+        a += off_axis;
+        b += off_axis * view.camera.pose.position;
+    }
+    a.inverse() * b
+}
+
+fn in_front(view: &View, point: Vec3) -> bool {
+    view.camera.pose.camera_from_world(point).z > 0.0
+}
+
+/// Whether points land where they were seen, told by colour: the mean absolute difference, in 8-bit steps, between a
+/// point's colour and the pixel it projects to, over the points that every fifth view sees. Shifting everything by 1
+/// pixel doubles it.
+fn colour_error(dataset: &Dataset) -> f64 {
+    let points = dataset.points.as_ref().expect("points");
+    let (mut sum, mut count) = (0.0, 0u32);
+    for view in dataset.views.iter().step_by(5) {
+        let photo = view.photo.load().unwrap();
+        for index in &view.points_seen {
+            let Some((pixel, _)) = view.camera.project(points.positions[*index as usize]) else {
+                continue;
+            };
+            if pixel.x < 0.0 || pixel.y < 0.0 || pixel.x as u32 >= photo.width || pixel.y as u32 >= photo.height {
+                continue;
+            }
+            let at = ((pixel.y as u32 * photo.width + pixel.x as u32) * photo.channels) as usize;
+            for c in 0..3 {
+                sum += f64::from(photo.data[at + c].abs_diff(points.colors[*index as usize][c]));
+                count += 1;
+            }
+        }
+    }
+    assert!(count > 3000, "{count}");
+    sum / f64::from(count)
+}
+
+#[test]
+fn fox_is_undistorted_and_its_missing_images_are_told_once() {
+    let Some(path) = shared("fox") else { return };
+    assert_eq!(detect(&path).unwrap(), Kind::Dataset(DatasetFormat::Nerfstudio));
+    let dataset = read(&path);
+    check_invariants(&dataset);
+    assert_eq!(
+        (dataset.views.len(), dataset.train.len(), dataset.test.len()),
+        (50, 43, 7)
+    );
+    assert_eq!(dataset.warnings.len(), 1);
+    assert!(
+        dataset.warnings[0].starts_with("17 of 67 views have no image file"),
+        "{}",
+        dataset.warnings[0]
+    );
+    let k = dataset.views[0].camera.intrinsics;
+    assert!((k.fx - 687.76).abs() < 1e-3 && (k.fy - 687.245).abs() < 1e-3);
+    // k1 > 0 pulls the corners in: the crop is a little smaller than 540x960, the principal point moves with it.
+    assert!((500..540).contains(&k.width) && (900..960).contains(&k.height), "{k:?}");
+    assert_eq!(sizes(&dataset).len(), 1, "one camera, one crop");
+    let centre = point_of_attention(&dataset);
+    assert!(dataset.views.iter().all(|view| in_front(view, centre)));
+    let small = with(&path, 1.0, Some(200));
+    assert_eq!(
+        sizes(&small).into_iter().map(|(w, h)| w.max(h)).collect::<Vec<_>>(),
+        [200]
+    );
+    check_invariants(&small);
+}
+
+#[test]
+fn fox_colmap_splits_by_its_list_and_its_points_land_on_their_colours() {
+    let Some(path) = shared("fox_colmap") else { return };
+    let dataset = read(&path);
+    check_invariants(&dataset);
+    assert_eq!(dataset.kind, "COLMAP (binary)");
+    assert_eq!(sizes(&dataset), HashSet::from([(270, 480)]));
+    let held_out: Vec<&str> = dataset.test.iter().map(|i| dataset.views[*i].name.as_str()).collect();
+    let expected = ["0001", "0012", "0027", "0042", "0073", "0089", "0110"].map(|n| format!("images/{n}.png"));
+    assert_eq!(held_out, expected);
+    assert_eq!(dataset.train.len(), 43);
+    assert!(dataset.points.as_ref().unwrap().len() > 10_000);
+    assert!(dataset.views.iter().all(|view| view.points_seen.len() > 100));
+    // Seen: 10.6; 21 when shifted by a pixel, 49 by twenty.
+    let error = colour_error(&dataset);
+    assert!(error < 13.0, "{error}");
+    assert!(dataset.warnings.is_empty(), "{:?}", dataset.warnings);
+}
+
+#[test]
+fn lund_door_text_model_is_undistorted_onto_its_points() {
+    let Some(path) = shared("lund_door") else { return };
+    let dataset = read(&path);
+    check_invariants(&dataset);
+    assert_eq!(
+        (dataset.kind.as_str(), dataset.views.len(), dataset.test.len()),
+        ("COLMAP (text)", 12, 2)
+    );
+    assert_eq!(dataset.points.as_ref().unwrap().len(), 11_384);
+    let k = dataset.views[0].camera.intrinsics;
+    // k1 < 0 pushes the corners out: undistorted, the picture bulges beyond the photograph's frame.
+    assert!(
+        k.width >= 640 && k.height >= 960 && (k.fx - 1217.69).abs() < 1e-2,
+        "{k:?}"
+    );
+    // Seen: 5.6; 13 when shifted by a pixel.
+    let error = colour_error(&dataset);
+    assert!(error < 8.0, "{error}");
+    assert!(colour_error(&with(&path, 2.0, None)) < 16.0);
+}
+
+#[test]
+fn chair_keeps_alpha_and_its_own_split() {
+    let Some(path) = shared("chair") else { return };
+    let dataset = read(&path);
+    check_invariants(&dataset);
+    assert_eq!(
+        (dataset.train.len(), dataset.test.len(), dataset.views.len()),
+        (100, 50, 150)
+    );
+    assert!(
+        dataset
+            .test
+            .iter()
+            .all(|i| dataset.views[*i].name.starts_with("test/r_"))
+    );
+    assert_eq!(dataset.views[dataset.train[0]].name, "train/r_0.png");
+    let k = dataset.views[0].camera.intrinsics;
+    let expected = 200.0 / (0.5f32 * 0.691_111_2).tan();
+    assert!((k.fx - expected).abs() < 1e-2 && k.fx == k.fy && (k.cx, k.cy) == (200.0, 200.0));
+    // The chair stands in the middle of the world, which all cameras look at: it shows there in nearly all of them.
+    let mut shows = 0;
+    for view in &dataset.views {
+        let photo = view.photo.load().unwrap();
+        let (pixel, _) = view.camera.project(Vec3::ZERO).expect("in front");
+        assert!(
+            (pixel - Vec2::new(200.0, 200.0)).length() < 1.0,
+            "{} {pixel}",
+            view.name
+        );
+        let at = (pixel.y as usize * photo.width as usize + pixel.x as usize) * 4;
+        assert!(photo.channels == 4 && photo.data[3] == 0, "the corner is empty");
+        shows += usize::from(photo.data[at + 3] > 0);
+    }
+    assert!(shows > 130, "{shows}");
+    assert_eq!(sizes(&with(&path, 2.5, None)), HashSet::from([(160, 160)]));
+}
+
+#[test]
+fn fern_takes_the_images_there_are() {
+    let Some(path) = shared("fern") else { return };
+    assert_eq!(
+        detect(&path).unwrap(),
+        Kind::Dataset(DatasetFormat::Llff),
+        "its COLMAP model lacks images.bin"
+    );
+    let dataset = read(&path);
+    check_invariants(&dataset);
+    assert_eq!((dataset.views.len(), dataset.test.len()), (20, 3));
+    assert_eq!(sizes(&dataset), HashSet::from([(504, 378)]));
+    let k = dataset.views[0].camera.intrinsics;
+    assert!((k.fx - 3260.5263 / 8.0).abs() < 1e-3 && (k.cx, k.cy) == (252.0, 189.0));
+    assert!(dataset.warnings[0].contains("images_8"));
+    assert!(dataset.points.is_none());
+    let [near, far] = dataset.views[0].depth_bounds.expect("LLFF has them");
+    assert!((near - 17.74709).abs() < 1e-4 && (far - 78.25749).abs() < 1e-4);
+    // Forward-facing: all look the same way, and what they look at is in front of all.
+    let forward = dataset.views[0].camera.pose.rotation * Vec3::Z;
+    let up = dataset.views[0].camera.pose.rotation * Vec3::NEG_Y;
+    for view in &dataset.views {
+        assert!((view.camera.pose.rotation * Vec3::Z).dot(forward) > 0.9);
+        assert!((view.camera.pose.rotation * Vec3::NEG_Y).dot(up) > 0.9);
+    }
+    assert_eq!(
+        sizes(&with(&path, 8.0, None)),
+        HashSet::from([(504, 378)]),
+        "images_8 is what 8 means"
+    );
+    assert_eq!(sizes(&with(&path, 2.0, None)), HashSet::from([(252, 189)]));
+}
+
+#[test]
+fn mary_rose_has_masks_that_keep_the_tankard() {
+    let Some(path) = shared("maryRose") else { return };
+    let dataset = with(&path, 4.0, None);
+    check_invariants(&dataset);
+    assert_eq!(
+        (dataset.views.len(), sizes(&dataset)),
+        (69, HashSet::from([(864, 864)]))
+    );
+    assert!(dataset.warnings.is_empty(), "{:?}", dataset.warnings);
+    let centre = point_of_attention(&dataset);
+    for view in dataset.views.iter().step_by(7) {
+        let photo = view.photo.load().unwrap();
+        let mask = photo.mask.expect("a mask");
+        assert!(mask.iter().all(|v| *v == 0 || *v == 255));
+        let (pixel, _) = view.camera.project(centre).expect("in front");
+        let at = |x: f32, y: f32| mask[y as usize * photo.width as usize + x as usize];
+        assert_eq!(
+            at(pixel.x, pixel.y),
+            255,
+            "{}: the cameras turn about the tankard",
+            view.name
+        );
+        let kept = mask.iter().filter(|v| **v == 255).count() as f64 / mask.len() as f64;
+        assert!((0.03..0.97).contains(&kept), "{kept}");
+    }
+}
+
+#[test]
+fn a_folder_without_poses_says_what_was_looked_for() {
+    let Some(path) = shared("lund_street_unposed") else {
+        return;
+    };
+    let error = read_dataset(&path, &DatasetOptions::default())
+        .err()
+        .unwrap()
+        .to_string();
+    for word in [
+        "lund_street_unposed",
+        "COLMAP",
+        "transforms.json",
+        "transforms_train.json",
+        "poses_bounds.npy",
+    ] {
+        assert!(error.contains(word), "{error}");
+    }
+}
+
+#[test]
+fn every_ply_among_the_splats_is_read_or_named_as_unsupported() {
+    let Some(path) = shared("splats") else { return };
+    let (mut read, mut compressed) = (0, 0);
+    let mut folders = vec![path];
+    while let Some(folder) = folders.pop() {
+        for path in std::fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path()) {
+            if path.is_dir() {
+                folders.push(path);
+            } else if path.extension().is_some_and(|extension| extension == "ply") {
+                match read_splats(&path) {
+                    Ok(cloud) => {
+                        assert!(cloud.is_consistent() && !cloud.is_empty() && cloud.sh_degree == 3);
+                        assert!(cloud.means.as_flattened().iter().all(|v| v.is_finite()));
+                        assert!(describe(&path).unwrap().to_string().contains("SH degree"));
+                        read += 1;
+                    }
+                    Err(error) => {
+                        assert!(error.to_string().contains("compressed PLY"), "{error}");
+                        compressed += 1;
+                    }
+                }
+            }
+        }
+    }
+    assert_eq!((read, compressed), (1, 2));
+}

@@ -1,0 +1,127 @@
+/// Resamples 8-bit pixels `from [height, width, channels]`, `size` being `[width, height]`, to exactly `to` by area: an output
+/// pixel is the mean of what it covers, parts of pixels counted in part. Values are averaged as they are stored (sRGB),
+/// colour weighted by alpha where there is one (4 channels), so that the colour of transparent pixels does not bleed into
+/// edges. Sizes may also grow: then it repeats pixels.
+///
+/// # Panics
+/// When the length does not match, a size is zero, or the channels are not 1, 3 or 4.
+pub fn resize_area(from: &[u8], channels: u32, size: [u32; 2], to: [u32; 2]) -> Vec<u8> {
+    let channels = channels as usize;
+    assert_eq!(from.len(), size[0] as usize * size[1] as usize * channels, "pixels of the given size");
+    assert!(!size.contains(&0) && !to.contains(&0), "no size is zero");
+    let across = spans(size[0], to[0]);
+    let down = spans(size[1], to[1]);
+    let stride = size[0] as usize * channels;
+    let mut data = Vec::with_capacity(to[0] as usize * to[1] as usize * channels);
+    let mut sums = vec![0f32; to[0] as usize * channels];
+    for span in &down {
+        sums.fill(0.0);
+        for (row, weight) in span.weights() {
+            let row = &from[row * stride..(row + 1) * stride];
+            match channels {
+                1 => add_row::<1>(&mut sums, row, &across, weight),
+                3 => add_row::<3>(&mut sums, row, &across, weight),
+                4 => add_row::<4>(&mut sums, row, &across, weight),
+                _ => panic!("1, 3 or 4 channels"),
+            }
+        }
+        // Rounding: `as u8` truncates and saturates.
+        if channels == 4 {
+            for pixel in sums.chunks_exact(4) {
+                let alpha = pixel[3];
+                let scale = if alpha > 0.0 { 255.0 / alpha } else { 0.0 };
+                data.extend(pixel[..3].iter().map(|v| (v * scale + 0.5) as u8));
+                data.push((alpha + 0.5) as u8);
+            }
+        } else {
+            data.extend(sums.iter().map(|v| (v + 0.5) as u8));
+        }
+    }
+    data
+}
+
+/// Adds a row, averaged across and times `weight`; with 4 channels colour is multiplied by alpha / 255 on the way.
+fn add_row<const C: usize>(sums: &mut [f32], row: &[u8], across: &[Span], weight: f32) {
+    for (sum, span) in sums.chunks_exact_mut(C).zip(across) {
+        for (x, share) in span.weights() {
+            let pixel: &[u8; C] = row[x * C..(x + 1) * C].try_into().expect("C values");
+            let share = share * weight;
+            let color_share = if C == 4 {
+                share * f32::from(pixel[3]) * (1.0 / 255.0)
+            } else {
+                share
+            };
+            for c in 0..C {
+                sum[c] += f32::from(pixel[c]) * if c < 3 { color_share } else { share };
+            }
+        }
+    }
+}
+
+/// The source pixels that one output pixel covers along one axis, as a weighted mean.
+struct Span {
+    first: usize,
+    last: usize,
+    first_weight: f32,
+    inner_weight: f32,
+    last_weight: f32,
+}
+
+impl Span {
+    fn weights(&self) -> impl Iterator<Item = (usize, f32)> {
+        (self.first..=self.last).map(|i| {
+            let weight = if i == self.first {
+                self.first_weight
+            } else if i == self.last {
+                self.last_weight
+            } else {
+                self.inner_weight
+            };
+            (i, weight)
+        })
+    }
+}
+
+fn spans(from: u32, to: u32) -> Vec<Span> {
+    let scale = f64::from(from) / f64::from(to);
+    (0..to)
+        .map(|i| {
+            let (start, end) = (f64::from(i) * scale, f64::from(i + 1) * scale);
+            let first = (start as usize).min(from as usize - 1);
+            // The end belongs to the next pixel when it falls on a border, give or take rounding.
+            let last = ((end - 1e-6).max(start) as usize).clamp(first, from as usize - 1);
+            let share = |pixel: usize| {
+                let overlap = end.min(pixel as f64 + 1.0) - start.max(pixel as f64);
+                (overlap / scale) as f32
+            };
+            Span {
+                first,
+                last,
+                first_weight: if first == last { 1.0 } else { share(first) },
+                inner_weight: (1.0 / scale) as f32,
+                last_weight: share(last),
+            }
+        })
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn means_over_whole_and_partial_pixels() {
+        assert_eq!(resize_area(&[0, 100, 40, 40, 100, 200, 40, 80], 1, [4, 2], [2, 1]), [100, 50]);
+        // 3 -> 2: each output covers one pixel and half of the middle one.
+        assert_eq!(resize_area(&[90, 30, 0], 1, [3, 1], [2, 1]), [70, 10]);
+        let constant = resize_area(&vec![77; 541 * 37], 1, [541, 37], [200, 13]);
+        assert!(constant.iter().all(|v| *v == 77));
+        assert_eq!(resize_area(&[10, 20], 1, [2, 1], [4, 2]), [10, 10, 20, 20, 10, 10, 20, 20]);
+    }
+
+    #[test]
+    fn transparent_pixels_lend_no_colour() {
+        let two = [200, 100, 50, 255, 0, 255, 0, 0];
+        assert_eq!(resize_area(&two, 4, [2, 1], [1, 1]), [200, 100, 50, 128]);
+    }
+}

@@ -1,0 +1,196 @@
+//! A run on disk: everything that the next step depends on, so that a resumed run writes the bytes that an unbroken one
+//! would have written. Only bytes are made and read here; where they go is the caller's.
+
+use crate::recipe::{Param, Recipe};
+use crate::schedule::Clock;
+use crate::trainer::{TrainError, TrainOptions, Trainer};
+use irradia_compute::Planes;
+use irradia_scene::Dataset;
+use irradia_splat::{COLUMN_NAMES, SplatState, Splats};
+use safetensors::tensor::{Dtype, SafeTensors, TensorView};
+use std::collections::HashMap;
+use std::sync::Arc;
+
+const FORMAT: &str = "irradia-checkpoint-1";
+const OWNERS: [&str; 3] = ["splats", "first_moments", "second_moments"];
+
+/// `trainer` as a safetensors file: columns `[components, N]` of splats and moments, statistics, and the clock.
+pub fn to_bytes(trainer: &Trainer) -> Vec<u8> {
+    let state = &trainer.state;
+    let mut arrays: Vec<(String, Dtype, Vec<usize>, Vec<u8>)> = Vec::new();
+    for (owner, splats) in OWNERS.iter().zip([&state.splats, &state.moments[0], &state.moments[1]]) {
+        for (name, planes) in COLUMN_NAMES.iter().zip(splats.columns()) {
+            arrays.push((
+                format!("{owner}.{name}"),
+                Dtype::F32,
+                vec![planes.count(), planes.len()],
+                plane_bytes(planes),
+            ));
+        }
+    }
+    let statistics = &state.statistics;
+    arrays.push((
+        "statistics".into(),
+        Dtype::F32,
+        vec![statistics.count(), statistics.len()],
+        plane_bytes(statistics),
+    ));
+    let clock = &trainer.clock;
+    let whole = [
+        clock.step,
+        clock.stage as u64,
+        clock.stage_step,
+        u64::from(clock.was_reset),
+    ];
+    let real: Vec<f64> = [
+        clock.time,
+        clock.stage_time,
+        trainer.pace,
+        trainer.seconds,
+        trainer.cpu_seconds,
+    ]
+    .into_iter()
+    .chain(clock.carried)
+    .collect();
+    arrays.push((
+        "clock.whole".into(),
+        Dtype::U64,
+        vec![whole.len()],
+        whole.iter().flat_map(|v| v.to_le_bytes()).collect(),
+    ));
+    arrays.push((
+        "clock.real".into(),
+        Dtype::F64,
+        vec![real.len()],
+        real.iter().flat_map(|v| v.to_le_bytes()).collect(),
+    ));
+    let views = arrays.iter().map(|(name, dtype, shape, bytes)| {
+        let view = TensorView::new(*dtype, shape.clone(), bytes).expect("shape and bytes agree");
+        (name.as_str(), view)
+    });
+    let metadata = HashMap::from([
+        ("format".to_owned(), FORMAT.to_owned()),
+        ("recipe".to_owned(), trainer.recipe.to_toml()),
+        ("seed".to_owned(), trainer.options.seed.to_string()),
+    ]);
+    safetensors::serialize(views, Some(metadata)).expect("in memory")
+}
+
+/// The recipe that a checkpoint was made with.
+///
+/// # Errors
+/// When the bytes are not a checkpoint of this program.
+pub fn recipe_of(bytes: &[u8]) -> Result<(Recipe, u64), TrainError> {
+    let wrong = |why: &str| TrainError::Checkpoint(format!("not a checkpoint of this program: {why}"));
+    let (_, header) = SafeTensors::read_metadata(bytes).map_err(|e| wrong(&e.to_string()))?;
+    let metadata = header.metadata().as_ref().ok_or_else(|| wrong("no metadata"))?;
+    if metadata.get("format").map(String::as_str) != Some(FORMAT) {
+        return Err(wrong(&format!("its format is not {FORMAT}")));
+    }
+    let text = metadata.get("recipe").ok_or_else(|| wrong("no recipe"))?;
+    let recipe = Recipe::parse("in the checkpoint", text, &[]).map_err(|e| TrainError::Checkpoint(e.to_string()))?;
+    let seed = metadata
+        .get("seed")
+        .and_then(|s| s.parse().ok())
+        .ok_or_else(|| wrong("no seed"))?;
+    Ok((recipe, seed))
+}
+
+/// The trainer that [`to_bytes`] saw, on the same `dataset`.
+///
+/// # Errors
+/// When the bytes are not a whole checkpoint.
+pub fn from_bytes(bytes: &[u8], dataset: Arc<Dataset>, options: TrainOptions) -> Result<Trainer, TrainError> {
+    let wrong = |why: String| TrainError::Checkpoint(format!("the checkpoint is damaged: {why}"));
+    let (recipe, seed) = recipe_of(bytes)?;
+    let file = SafeTensors::deserialize(bytes).map_err(|e| wrong(e.to_string()))?;
+    let array = |name: &str, dtype: Dtype| -> Result<(Vec<usize>, &[u8]), TrainError> {
+        let view = file.tensor(name).map_err(|e| wrong(e.to_string()))?;
+        if view.dtype() != dtype {
+            return Err(wrong(format!("{name} is not {dtype:?}")));
+        }
+        Ok((view.shape().to_vec(), view.data()))
+    };
+    let planes = |name: &str| -> Result<Planes, TrainError> {
+        let (shape, bytes) = array(name, Dtype::F32)?;
+        let [count, len] = shape[..] else {
+            return Err(wrong(format!("{name} has {} dimensions", shape.len())));
+        };
+        let mut planes = Planes::zeros(count, len);
+        let values = bytes
+            .as_chunks()
+            .0
+            .iter()
+            .map(|b| f32::from_le_bytes(*b))
+            .collect::<Vec<_>>();
+        for c in 0..count {
+            planes.plane_mut(c)[..len].copy_from_slice(&values[c * len..(c + 1) * len]);
+        }
+        Ok(planes)
+    };
+    let splats = |owner: &str| -> Result<Splats, TrainError> {
+        Ok(Splats {
+            means: planes(&format!("{owner}.means"))?,
+            quats: planes(&format!("{owner}.quats"))?,
+            log_scales: planes(&format!("{owner}.log_scales"))?,
+            opacity_logits: planes(&format!("{owner}.opacity_logits"))?,
+            sh: planes(&format!("{owner}.sh"))?,
+        })
+    };
+    let state = SplatState {
+        splats: splats(OWNERS[0])?,
+        moments: [splats(OWNERS[1])?, splats(OWNERS[2])?],
+        statistics: planes("statistics")?,
+    };
+    let like = |s: &Splats| s.columns().map(|c| (c.count(), c.len()));
+    let shape = like(&state.splats);
+    let expected = like(&Splats::zeros(state.splats.len(), state.splats.sh_degree()));
+    if state.moments.iter().any(|m| like(m) != shape)
+        || shape != expected
+        || state.statistics.len() != state.splats.len()
+    {
+        return Err(wrong("its columns have different lengths".into()));
+    }
+    let whole: Vec<u64> = array("clock.whole", Dtype::U64)?
+        .1
+        .as_chunks()
+        .0
+        .iter()
+        .map(|b| u64::from_le_bytes(*b))
+        .collect();
+    let real: Vec<f64> = array("clock.real", Dtype::F64)?
+        .1
+        .as_chunks()
+        .0
+        .iter()
+        .map(|b| f64::from_le_bytes(*b))
+        .collect();
+    let ([step, stage, stage_step, was_reset], [time, stage_time, pace, seconds, cpu_seconds, carried @ ..]) =
+        (&whole[..], &real[..])
+    else {
+        return Err(wrong("its clock has the wrong length".into()));
+    };
+    let carried: [f64; Param::ALL.len()] = carried
+        .try_into()
+        .map_err(|_| wrong("its clock has the wrong length".into()))?;
+    let mut trainer = Trainer::without_splats(dataset, recipe, TrainOptions { seed, ..options })?;
+    trainer.state = state;
+    (trainer.pace, trainer.seconds, trainer.cpu_seconds) = (*pace, *seconds, *cpu_seconds);
+    trainer.clock = Clock {
+        step: *step,
+        time: *time,
+        stage: *stage as usize,
+        stage_time: *stage_time,
+        stage_step: *stage_step,
+        carried,
+        was_reset: *was_reset != 0,
+    };
+    Ok(trainer)
+}
+
+fn plane_bytes(planes: &Planes) -> Vec<u8> {
+    (0..planes.count())
+        .flat_map(|c| &planes.plane(c)[..planes.len()])
+        .flat_map(|v| v.to_le_bytes())
+        .collect()
+}

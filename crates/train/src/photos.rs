@@ -1,0 +1,226 @@
+//! The training photographs in memory, as 8 bits, within a budget: a scene larger than memory still trains.
+
+use irradia_scene::{Dataset, LoadError, Photo};
+use rayon::prelude::*;
+use std::collections::HashMap;
+use std::sync::Arc;
+
+/// A photograph ready for the loss.
+#[derive(Debug)]
+pub struct Prepared {
+    /// Columns.
+    pub width: u32,
+    /// Rows.
+    pub height: u32,
+    /// `[H, W, 3]`, over the background.
+    pub rgb: Vec<u8>,
+    /// `[H, W]`, where the photograph has an alpha channel.
+    pub alpha: Option<Vec<u8>>,
+    /// `[H, W]`, 0 where the pixel must not be trained on.
+    pub mask: Option<Vec<u8>>,
+}
+
+impl Prepared {
+    /// `photo` at `width` x `height` over `background`.
+    pub fn new(photo: &Photo, width: u32, height: u32, background: [f32; 3]) -> Self {
+        let photo = photo.resized(width, height);
+        Self {
+            width,
+            height,
+            rgb: photo.over(background),
+            alpha: photo.alpha(),
+            mask: photo.mask,
+        }
+    }
+
+    fn bytes(&self) -> usize {
+        self.rgb.len() + self.alpha.as_ref().map_or(0, Vec::len) + self.mask.as_ref().map_or(0, Vec::len)
+    }
+}
+
+/// Photographs that are loaded when needed and dropped when they would exceed the budget.
+pub struct PhotoCache {
+    dataset: Arc<Dataset>,
+    background: [f32; 3],
+    budget: usize,
+    held: HashMap<usize, Arc<Prepared>>,
+    bytes: usize,
+    /// Size relative to the data's; a change drops everything.
+    scale: f32,
+}
+
+impl PhotoCache {
+    /// Holds at most `budget` bytes, but always the photograph in use.
+    pub fn new(dataset: Arc<Dataset>, background: [f32; 3], budget: usize) -> Self {
+        Self {
+            dataset,
+            background,
+            budget,
+            held: HashMap::new(),
+            bytes: 0,
+            scale: 1.0,
+        }
+    }
+
+    /// View `coming[0]`'s photograph at `scale`. When it must be loaded, those that come next are too, in parallel, as
+    /// many as there is room for; those that come last, or not at all, make room.
+    ///
+    /// # Errors
+    /// When a photograph cannot be read.
+    pub fn get(&mut self, coming: &[usize], scale: f32) -> Result<Arc<Prepared>, LoadError> {
+        if scale != self.scale {
+            self.held.clear();
+            self.bytes = 0;
+            self.scale = scale;
+        }
+        let view = coming[0];
+        if let Some(photo) = self.held.get(&view) {
+            return Ok(photo.clone());
+        }
+        let wanted = self.plan_loads(coming);
+        let (dataset, background) = (&self.dataset, self.background);
+        let loaded: Vec<(usize, Result<Prepared, LoadError>)> = wanted
+            .into_par_iter()
+            .map(|view| (view, load(dataset, view, scale, background)))
+            .collect();
+        for (view, photo) in loaded {
+            let photo = Arc::new(photo?);
+            self.bytes += photo.bytes();
+            self.held.insert(view, photo);
+        }
+        Ok(self.held[&view].clone())
+    }
+
+    /// Which views to load now: as many of the coming ones as fit beside what is needed sooner. Makes the room.
+    fn plan_loads(&mut self, coming: &[usize]) -> Vec<usize> {
+        let size = |view: usize| {
+            let k = self.dataset.views[view].camera.intrinsics.scaled(self.scale);
+            4 * k.width as usize * k.height as usize
+        };
+        let mut planned = 0;
+        let keep: Vec<usize> = coming
+            .iter()
+            .copied()
+            .take_while(|view| {
+                planned += size(*view);
+                planned <= self.budget || *view == coming[0]
+            })
+            .collect();
+        let all_fit = keep.len() == coming.len();
+        if !all_fit || self.bytes + planned > self.budget {
+            let bytes = &mut self.bytes;
+            self.held.retain(|view, photo| {
+                let stays = keep.contains(view);
+                if !stays {
+                    *bytes -= photo.bytes();
+                }
+                stays
+            });
+        }
+        // When not everything fits, a batch of a few a thread keeps the threads busy without waiting long.
+        let batch = if all_fit {
+            keep.len()
+        } else {
+            4 * rayon::current_num_threads()
+        };
+        keep.into_iter()
+            .filter(|view| !self.held.contains_key(view))
+            .take(batch)
+            .collect()
+    }
+}
+
+fn load(dataset: &Dataset, view: usize, scale: f32, background: [f32; 3]) -> Result<Prepared, LoadError> {
+    let view = &dataset.views[view];
+    let photo = view.photo.load()?;
+    let k = &view.camera.intrinsics;
+    if (photo.width, photo.height) != (k.width, k.height) {
+        return Err(LoadError(format!(
+            "{}: the photograph has {}x{} pixels where its camera has {}x{}: was the file replaced while training?",
+            view.name, photo.width, photo.height, k.width, k.height
+        )));
+    }
+    let k = k.scaled(scale);
+    Ok(Prepared::new(&photo, k.width, k.height, background))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use irradia_scene::{Camera, Intrinsics, PhotoSource, Pose, View};
+    use std::sync::atomic::{AtomicUsize, Ordering};
+
+    struct Counting(AtomicUsize, u8);
+    impl PhotoSource for Counting {
+        fn load(&self) -> Result<Photo, LoadError> {
+            self.0.fetch_add(1, Ordering::Relaxed);
+            Ok(Photo {
+                width: 10,
+                height: 10,
+                channels: 3,
+                data: vec![self.1; 300],
+                mask: None,
+            })
+        }
+    }
+
+    fn dataset(n: u8) -> (Arc<Dataset>, Vec<Arc<Counting>>) {
+        let sources: Vec<_> = (0..n).map(|i| Arc::new(Counting(AtomicUsize::new(0), i))).collect();
+        let camera = Camera::new(
+            Pose {
+                rotation: glam::Quat::IDENTITY,
+                position: glam::Vec3::ZERO,
+            },
+            Intrinsics::from_fov_x(10, 10, 1.0),
+        );
+        let views = sources
+            .iter()
+            .map(|s| View {
+                name: format!("{}", s.1),
+                camera,
+                photo: s.clone(),
+                depth_bounds: None,
+                points_seen: vec![],
+            })
+            .collect();
+        (
+            Arc::new(Dataset {
+                views,
+                ..Default::default()
+            }),
+            sources,
+        )
+    }
+
+    fn loads(sources: &[Arc<Counting>]) -> usize {
+        sources.iter().map(|s| s.0.load(Ordering::Relaxed)).sum()
+    }
+
+    #[test]
+    fn with_room_each_photograph_is_loaded_once() {
+        let (data, sources) = dataset(20);
+        let mut cache = PhotoCache::new(data, [0.0; 3], 1 << 20);
+        for epoch in 0..3 {
+            for i in 0..20 {
+                let coming: Vec<usize> = (0..20).map(|k| (i + k + epoch) % 20).collect();
+                assert_eq!(cache.get(&coming, 1.0).unwrap().rgb[0] as usize, coming[0]);
+            }
+        }
+        assert_eq!(loads(&sources), 20);
+        assert_eq!(cache.get(&[3], 0.5).unwrap().rgb.len(), 75);
+    }
+
+    #[test]
+    fn without_room_it_stays_within_the_budget_and_still_serves() {
+        let (data, sources) = dataset(20);
+        let mut cache = PhotoCache::new(data, [0.0; 3], 2000);
+        for i in 0..40 {
+            let coming: Vec<usize> = (0..20).map(|k| (i + k) % 20).collect();
+            assert_eq!(cache.get(&coming, 1.0).unwrap().rgb[0] as usize, coming[0]);
+            assert!(cache.bytes <= 2000 && cache.bytes == cache.held.values().map(|p| p.bytes()).sum::<usize>());
+        }
+        assert!(loads(&sources) >= 35);
+        let mut tiny = PhotoCache::new(dataset(3).0, [0.0; 3], 1);
+        assert!(tiny.get(&[0, 1, 2], 1.0).is_ok() && tiny.get(&[1, 2, 0], 1.0).is_ok());
+    }
+}

@@ -1,0 +1,563 @@
+//! A recipe: one way of training, as a file. Raw TOML, then overrides, then this validated value.
+
+use irradia_splat::densify::classic::ClassicOptions;
+use serde::{Deserialize, Deserializer, Serialize};
+use std::collections::BTreeMap;
+
+/// The recipes that come with the program: name and text.
+pub const BUILT_IN: [(&str, &str); 1] = [("classic", include_str!("../../../recipes/classic.toml"))];
+
+/// Why a recipe was refused: one line that names the key.
+#[derive(Debug, thiserror::Error)]
+pub enum RecipeError {
+    /// No such built-in recipe.
+    #[error("no recipe is called `{name}`; there are {known}, or give the path of a .toml file")]
+    Unknown {
+        /// What was asked for.
+        name: String,
+        /// What there is.
+        known: String,
+    },
+    /// Not TOML, or not this shape.
+    #[error("recipe {origin}: {message}")]
+    Invalid {
+        /// File or built-in name.
+        origin: String,
+        /// One line.
+        message: String,
+    },
+    /// A `--set` that does not fit.
+    #[error("--set {assignment}: {message}")]
+    Override {
+        /// As given.
+        assignment: String,
+        /// One line.
+        message: String,
+    },
+}
+
+/// One way of training.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Recipe {
+    /// Short name.
+    pub name: String,
+    /// What it is and where it comes from.
+    pub about: String,
+    /// Never more splats than this.
+    pub max_splats: usize,
+    /// Held-out views are looked at every so many steps while training.
+    pub eval_every: u64,
+    /// How frames are rendered.
+    pub render: RenderKnobs,
+    /// The first splats.
+    pub init: InitKnobs,
+    /// Adam's constants.
+    pub adam: AdamKnobs,
+    /// Knobs over the whole run; a stage may overrule them.
+    pub params: Params,
+    /// What happens, in order.
+    pub stage: Vec<Stage>,
+}
+
+/// How frames are rendered.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RenderKnobs {
+    /// Behind the scene, sRGB; images with alpha are laid over it.
+    pub background: [f32; 3],
+    /// Scale opacities by the area that the 0.3 pixel dilation adds.
+    pub antialias: bool,
+}
+
+/// The first splats.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct InitKnobs {
+    /// Their opacity.
+    pub opacity: f32,
+    /// Factor on the distance to the nearest neighbours that makes their size.
+    pub scale: f32,
+    /// How many, where the dataset has no points.
+    pub random_points: usize,
+}
+
+/// Adam's constants.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct AdamKnobs {
+    /// Decay of the first moment.
+    pub beta1: f32,
+    /// Decay of the second moment.
+    pub beta2: f32,
+    /// Added to the root.
+    pub epsilon: f32,
+}
+
+/// A part of the run.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Stage {
+    /// Short name, unique in the recipe.
+    pub name: String,
+    /// Its length in recipe steps: `--steps` and `--budget` stretch or shrink the whole run.
+    pub steps: u64,
+    /// Knobs over this stage.
+    #[serde(default)]
+    pub params: Params,
+    /// How splats are added and removed; none are when absent.
+    #[serde(default)]
+    pub density: Option<Density>,
+}
+
+/// Knobs by name.
+pub type Params = BTreeMap<Param, Knob>;
+
+/// What can change over time.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Param {
+    /// Size of the training images relative to the data's.
+    ImageScale,
+    /// SH bands in use.
+    ShDegree,
+    /// w in (1 - w) L1 + w (1 - SSIM).
+    SsimWeight,
+    /// Weight of the mean |alpha - alpha of the photograph|, where it has one.
+    AlphaWeight,
+    /// Learning rate of the means, in units of the scene's extent.
+    RateMeans,
+    /// Learning rate of the quaternions.
+    RateQuats,
+    /// Learning rate of the ln scales.
+    RateScales,
+    /// Learning rate of the opacity logits.
+    RateOpacities,
+    /// Learning rate of the SH's DC coefficients.
+    RateShDc,
+    /// Learning rate of the other SH coefficients.
+    RateShRest,
+}
+
+impl Param {
+    /// All of them, in order.
+    pub const ALL: [Param; 10] = [
+        Param::ImageScale,
+        Param::ShDegree,
+        Param::SsimWeight,
+        Param::AlphaWeight,
+        Param::RateMeans,
+        Param::RateQuats,
+        Param::RateScales,
+        Param::RateOpacities,
+        Param::RateShDc,
+        Param::RateShRest,
+    ];
+
+    /// The value where no recipe says anything.
+    pub fn default_value(self) -> f64 {
+        match self {
+            Param::ImageScale => 1.0,
+            _ => 0.0,
+        }
+    }
+}
+
+/// A value over time.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+#[serde(untagged)]
+pub enum Knob {
+    /// Always the same.
+    Const(f64),
+    /// From one value to another over the stage (or the run).
+    Ramp {
+        /// At the start; goes on from the value in force when absent.
+        #[serde(skip_serializing_if = "Option::is_none")]
+        from: Option<f64>,
+        /// At the end.
+        to: f64,
+        /// How it goes from one to the other.
+        shape: Shape,
+    },
+    /// `[at, value]` pairs: `value` holds from recipe step `at` of the stage (or run) on.
+    Steps {
+        /// In ascending order of `at`.
+        steps: Vec<(u64, f64)>,
+    },
+}
+
+/// How a ramp runs.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, Default)]
+#[serde(rename_all = "snake_case")]
+pub enum Shape {
+    /// Straight.
+    #[default]
+    Linear,
+    /// Straight in the logarithm; both ends must be positive.
+    Log,
+    /// Half a cosine.
+    Cosine,
+}
+
+/// What a file may say for a knob; serde's own message for an untagged enum would name nothing.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct RawKnob {
+    from: Option<f64>,
+    to: Option<f64>,
+    shape: Option<Shape>,
+    steps: Option<Vec<(u64, f64)>>,
+}
+
+impl<'de> Deserialize<'de> for Knob {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        use serde::de::Error;
+        match toml::Value::deserialize(deserializer)? {
+            toml::Value::Integer(v) => Ok(Knob::Const(v as f64)),
+            toml::Value::Float(v) => Ok(Knob::Const(v)),
+            table @ toml::Value::Table(_) => {
+                let raw = RawKnob::deserialize(table).map_err(|e| D::Error::custom(e.message()))?;
+                match (raw.to, raw.steps) {
+                    (Some(to), None) => Ok(Knob::Ramp {
+                        from: raw.from,
+                        to,
+                        shape: raw.shape.unwrap_or_default(),
+                    }),
+                    (None, Some(steps)) if raw.from.is_none() && raw.shape.is_none() => Ok(Knob::Steps { steps }),
+                    _ => Err(D::Error::custom(
+                        "a knob is a number, { from, to, shape } or { steps = [[at, value], ..] }",
+                    )),
+                }
+            }
+            other => Err(D::Error::custom(format!(
+                "a knob is a number or a table, not {}",
+                other.type_str()
+            ))),
+        }
+    }
+}
+
+/// How splats are added and removed.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "strategy", rename_all = "snake_case")]
+pub enum Density {
+    /// Clone, split, prune and reset, as in 3DGS.
+    Classic(ClassicKnobs),
+}
+
+/// Knobs of [`irradia_splat::densify::classic`].
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ClassicKnobs {
+    /// Steps (of the run, not stretched) between rounds.
+    pub every: u64,
+    /// Mean screen gradient, normalised device coordinates, from which a splat is densified.
+    pub gradient_threshold: f32,
+    /// Size that divides what is cloned from what is split, in units of the scene's extent.
+    pub small: f32,
+    /// Opacity below which a splat is removed.
+    pub min_opacity: f32,
+    /// Half size on screen above which a splat is removed, pixels, once opacities were reset.
+    pub max_extent: f32,
+    /// World size above which a splat is removed, in units of the scene's extent, once opacities were reset.
+    pub max_scale: f32,
+    /// Steps (of the run, not stretched) between resets of the opacities; 0 for never.
+    pub reset_every: u64,
+    /// What opacities are lowered to.
+    pub reset_to: f32,
+}
+
+impl ClassicKnobs {
+    /// With sizes in world units.
+    pub fn options(&self, extent: f32, prune_large: bool, max_splats: usize) -> ClassicOptions {
+        ClassicOptions {
+            gradient_threshold: self.gradient_threshold,
+            small: self.small * extent,
+            min_opacity: self.min_opacity,
+            max_extent: prune_large.then_some(self.max_extent),
+            max_scale: self.max_scale * extent,
+            max_splats,
+        }
+    }
+}
+
+impl Recipe {
+    /// The text of the built-in recipe `name`.
+    ///
+    /// # Errors
+    /// When there is none, naming those there are.
+    pub fn built_in(name: &str) -> Result<&'static str, RecipeError> {
+        BUILT_IN
+            .iter()
+            .find(|(n, _)| *n == name)
+            .map(|(_, text)| *text)
+            .ok_or_else(|| RecipeError::Unknown {
+                name: name.to_owned(),
+                known: BUILT_IN.map(|(n, _)| n).join(", "),
+            })
+    }
+
+    /// Parses `text`, applies `overrides` (`stage.grow.params.ssim_weight=0.3`, `max_splats=50000`) and validates.
+    ///
+    /// # Errors
+    /// One line that names the key and, for an unknown one, the nearest that is known.
+    pub fn parse(origin: &str, text: &str, overrides: &[String]) -> Result<Self, RecipeError> {
+        let invalid = |message: String| RecipeError::Invalid {
+            origin: origin.to_owned(),
+            message,
+        };
+        let table: toml::Table = text.parse().map_err(|e: toml::de::Error| invalid(one_line(&e)))?;
+        let mut root = toml::Value::Table(table);
+        for assignment in overrides {
+            apply(&mut root, assignment).map_err(|message| RecipeError::Override {
+                assignment: assignment.clone(),
+                message,
+            })?;
+        }
+        let recipe = Self::deserialize(root).map_err(|e| {
+            let message = suggest(&one_line(&e));
+            match overrides.last() {
+                Some(last) => invalid(format!("{message} (with --set {last})")),
+                None => invalid(message),
+            }
+        })?;
+        recipe.validate().map_err(invalid)?;
+        Ok(recipe)
+    }
+
+    /// The resolved recipe as TOML, to be written into the run.
+    pub fn to_toml(&self) -> String {
+        toml::to_string(self).expect("a recipe is always valid TOML")
+    }
+
+    /// A hash of the resolved recipe (FNV-1a, 64 bits, hexadecimal), by which runs of the same recipe are known.
+    pub fn hash(&self) -> String {
+        let hash = self.to_toml().bytes().fold(0xcbf2_9ce4_8422_2325u64, |h, b| {
+            (h ^ u64::from(b)).wrapping_mul(0x0100_0000_01b3)
+        });
+        format!("{hash:016x}")
+    }
+
+    /// Recipe steps of all stages.
+    pub fn total_steps(&self) -> u64 {
+        self.stage.iter().map(|s| s.steps).sum()
+    }
+
+    fn validate(&self) -> Result<(), String> {
+        if self.stage.is_empty() {
+            return Err("there must be at least one [[stage]]".into());
+        }
+        if self.max_splats == 0 || self.eval_every == 0 {
+            return Err("max_splats and eval_every must be at least 1".into());
+        }
+        if !(self.init.opacity > 0.0 && self.init.opacity < 1.0 && self.init.scale > 0.0) {
+            return Err("init.opacity must lie between 0 and 1 and init.scale above 0".into());
+        }
+        for (i, stage) in self.stage.iter().enumerate() {
+            if stage.steps == 0 {
+                return Err(format!("stage.{}.steps must be at least 1", stage.name));
+            }
+            if self.stage[..i].iter().any(|s| s.name == stage.name) {
+                return Err(format!("two stages are called {}", stage.name));
+            }
+            if let Some(Density::Classic(knobs)) = &stage.density
+                && knobs.every == 0
+            {
+                return Err(format!("stage.{}.density.every must be at least 1", stage.name));
+            }
+        }
+        let everywhere = std::iter::once(("params".to_owned(), &self.params));
+        let stages = self
+            .stage
+            .iter()
+            .map(|s| (format!("stage.{}.params", s.name), &s.params));
+        for (place, params) in everywhere.chain(stages) {
+            for (param, knob) in params {
+                check_knob(*param, knob).map_err(|why| format!("{place}: {param:?}: {why}"))?;
+            }
+        }
+        Ok(())
+    }
+}
+
+fn check_knob(param: Param, knob: &Knob) -> Result<(), String> {
+    let values: Vec<f64> = match knob {
+        Knob::Const(v) => vec![*v],
+        Knob::Ramp { from, to, shape } => {
+            let ends: Vec<f64> = from.iter().copied().chain([*to]).collect();
+            if *shape == Shape::Log && ends.iter().any(|v| *v <= 0.0) {
+                return Err("a log ramp needs ends above 0".into());
+            }
+            ends
+        }
+        Knob::Steps { steps } => {
+            if steps.is_empty() || steps[0].0 != 0 || steps.windows(2).any(|w| w[0].0 >= w[1].0) {
+                return Err("steps must start at 0 and ascend".into());
+            }
+            steps.iter().map(|(_, v)| *v).collect()
+        }
+    };
+    let (low, high) = match param {
+        Param::ImageScale => (0.01, 1.0),
+        Param::ShDegree => (0.0, 3.0),
+        Param::SsimWeight => (0.0, 1.0),
+        _ => (0.0, f64::MAX),
+    };
+    match values.iter().find(|v| !(low..=high).contains(*v)) {
+        Some(v) if high == f64::MAX => Err(format!("{v} is below 0")),
+        Some(v) => Err(format!("{v} is not within {low} to {high}")),
+        None => Ok(()),
+    }
+}
+
+/// Sets one value by its path; a list of tables (`stage`) is entered by its items' `name`.
+fn apply(root: &mut toml::Value, assignment: &str) -> Result<(), String> {
+    let (path, value) = assignment.split_once('=').ok_or("say key=value")?;
+    let value: toml::Value = format!("v = {value}")
+        .parse::<toml::Table>()
+        .or_else(|_| format!("v = {value:?}").parse::<toml::Table>())
+        .map_err(|_| format!("`{value}` is not a TOML value"))?
+        .remove("v")
+        .ok_or("no value")?;
+    let keys: Vec<&str> = path.trim().split('.').collect();
+    let (last, parents) = keys.split_last().expect("split gives one at least");
+    let mut at = root;
+    for key in parents {
+        at = match at {
+            toml::Value::Table(table) => table
+                .entry(*key)
+                .or_insert_with(|| toml::Value::Table(toml::Table::new())),
+            toml::Value::Array(items) => {
+                let names: Vec<String> = items
+                    .iter()
+                    .filter_map(|i| i.get("name")?.as_str().map(str::to_owned))
+                    .collect();
+                items
+                    .iter_mut()
+                    .find(|item| item.get("name").and_then(toml::Value::as_str) == Some(key))
+                    .ok_or_else(|| format!("no `{key}` there; there are {}", names.join(", ")))?
+            }
+            other => return Err(format!("`{key}` lies inside a {}", other.type_str())),
+        };
+    }
+    match at {
+        toml::Value::Table(table) => {
+            table.insert((*last).to_owned(), value);
+            Ok(())
+        }
+        other => Err(format!("`{last}` lies inside a {}", other.type_str())),
+    }
+}
+
+fn one_line(error: &toml::de::Error) -> String {
+    error.message().lines().collect::<Vec<_>>().join(" ")
+}
+
+/// Adds the nearest known key to serde's "unknown field `x`, expected one of `a`, `b`".
+fn suggest(message: &str) -> String {
+    let names: Vec<&str> = message.split('`').skip(1).step_by(2).collect();
+    if !message.starts_with("unknown") || names.len() < 2 {
+        return message.to_owned();
+    }
+    let unknown = names[0];
+    let nearest = names[1..]
+        .iter()
+        .min_by_key(|known| edit_distance(unknown, known))
+        .expect("one at least");
+    format!("unknown key `{unknown}`; the nearest known one is `{nearest}`")
+}
+
+/// Levenshtein's distance.
+fn edit_distance(a: &str, b: &str) -> usize {
+    let b: Vec<char> = b.chars().collect();
+    let mut row: Vec<usize> = (0..=b.len()).collect();
+    for (i, ca) in a.chars().enumerate() {
+        let mut diagonal = row[0];
+        row[0] = i + 1;
+        for (j, cb) in b.iter().enumerate() {
+            let substituted = diagonal + usize::from(ca != *cb);
+            diagonal = row[j + 1];
+            row[j + 1] = substituted.min(diagonal + 1).min(row[j] + 1);
+        }
+    }
+    row[b.len()]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn parse(overrides: &[&str]) -> Result<Recipe, String> {
+        let overrides: Vec<String> = overrides.iter().map(|s| (*s).to_owned()).collect();
+        Recipe::parse("classic", Recipe::built_in("classic").unwrap(), &overrides).map_err(|e| e.to_string())
+    }
+
+    #[test]
+    fn every_built_in_recipe_is_valid_and_survives_being_written() {
+        for (name, text) in BUILT_IN {
+            let recipe = Recipe::parse(name, text, &[]).unwrap();
+            assert_eq!(recipe.name, name);
+            let again = Recipe::parse(name, &recipe.to_toml(), &[]).unwrap();
+            assert_eq!((again.hash(), &again), (recipe.hash(), &recipe));
+        }
+    }
+
+    #[test]
+    fn overrides_reach_stages_by_name_and_change_the_hash() {
+        let recipe = parse(&["stage.grow.params.ssim_weight=0.3", "max_splats=777", "name=mine"]).unwrap();
+        let grow = recipe.stage.iter().find(|s| s.name == "grow").unwrap();
+        assert_eq!(grow.params[&Param::SsimWeight], Knob::Const(0.3));
+        assert_eq!((recipe.max_splats, recipe.name.as_str()), (777, "mine"));
+        assert_ne!(recipe.hash(), parse(&[]).unwrap().hash());
+        let ramp = parse(&["params.rate_means={ from = 1e-3, to = 1e-5, shape = 'cosine' }"]).unwrap();
+        assert_eq!(
+            ramp.params[&Param::RateMeans],
+            Knob::Ramp {
+                from: Some(1e-3),
+                to: 1e-5,
+                shape: Shape::Cosine
+            }
+        );
+    }
+
+    #[test]
+    fn unknown_keys_are_refused_with_the_nearest_known() {
+        for (bad, near) in [
+            ("max_splat=5", "max_splats"),
+            ("params.ssim_wieght=0.2", "ssim_weight"),
+            ("init.opacty=0.2", "opacity"),
+            ("stage.grow.density.evry=3", "every"),
+        ] {
+            let message = parse(&[bad]).unwrap_err();
+            assert!(
+                message.contains(&format!("nearest known one is `{near}`")),
+                "{bad}: {message}"
+            );
+        }
+        assert!(
+            parse(&["stage.groww.steps=3"])
+                .unwrap_err()
+                .contains("there are warmup, grow")
+        );
+    }
+
+    #[test]
+    fn senseless_values_are_refused_by_name() {
+        for (bad, part) in [
+            ("stage.grow.steps=0", "stage.grow.steps"),
+            ("params.ssim_weight=1.5", "SsimWeight"),
+            ("params.rate_means={ to = 0.0, shape = 'log' }", "log ramp"),
+            ("params.sh_degree={ steps = [[5, 1]] }", "start at 0"),
+            ("params.sh_degree={ steps = [[0, 1]], to = 3 }", "a knob is"),
+            ("params.sh_degree=true", "a knob is"),
+            ("init.opacity=1", "init.opacity"),
+            ("nonsense", "key=value"),
+            ("name.deeper=3", "inside a string"),
+        ] {
+            let message = parse(&[bad]).unwrap_err();
+            assert!(message.contains(part) && !message.contains('\n'), "{bad}: {message}");
+        }
+        assert!(Recipe::built_in("clasic").unwrap_err().to_string().contains("classic"));
+        assert!(Recipe::parse("x.toml", "name = ", &[]).is_err());
+    }
+}

@@ -1,0 +1,205 @@
+//! What a run came to: the figures (`report.json`) and a page that shows them (`report.html`).
+//!
+//! The page is one file: style, script and data are inside it, pictures are named relative to it. It opens from disk
+//! with no network.
+
+mod machine;
+
+pub use machine::{Machine, cpu_seconds, machine, peak_rss_bytes};
+
+use serde::{Deserialize, Deserializer, Serialize};
+
+/// Everything a run is judged by. Numbers that are not finite are written as `null` and read back as NaN.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Report {
+    /// Version of the program.
+    pub version: String,
+    /// What computed, such as `cpu, 2 threads, avx512`.
+    pub device: String,
+    /// The dataset, as the user named it.
+    pub dataset: String,
+    /// Name of the recipe.
+    pub recipe: String,
+    /// Hash of the resolved recipe, hexadecimal.
+    pub recipe_hash: String,
+    /// The resolved recipe.
+    pub recipe_toml: String,
+    /// Seed of the run.
+    pub seed: u64,
+    /// Steps taken.
+    pub steps: u64,
+    /// Wall-clock seconds of the training loop alone.
+    #[serde(deserialize_with = "or_nan")]
+    pub seconds: f64,
+    /// Processor seconds of the training loop alone, all threads together.
+    #[serde(deserialize_with = "or_nan")]
+    pub cpu_seconds: f64,
+    /// Wall-clock seconds of everything, loading and evaluation too.
+    #[serde(deserialize_with = "or_nan")]
+    pub total_seconds: f64,
+    /// Gaussians at the end.
+    pub splats: u64,
+    /// Most memory the process ever held, bytes; 0 where the system does not say.
+    pub peak_rss_bytes: u64,
+    /// Mean over the held-out views, dB.
+    #[serde(deserialize_with = "or_nan")]
+    pub psnr: f64,
+    /// Mean over the held-out views.
+    #[serde(deserialize_with = "or_nan")]
+    pub ssim: f64,
+    /// Mean over the held-out views; `None` without the network's weights.
+    pub lpips: Option<f64>,
+    /// The held-out views.
+    pub views: Vec<ViewReport>,
+    /// The stages of the recipe, in order.
+    pub stages: Vec<StageReport>,
+    /// How the run went, in order of steps.
+    pub curve: Vec<CurvePoint>,
+    /// Where it ran.
+    pub machine: Machine,
+    /// What went wrong without ending the run, one line each.
+    pub warnings: Vec<String>,
+}
+
+/// One held-out view.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct ViewReport {
+    /// Name within the dataset.
+    pub name: String,
+    /// dB.
+    #[serde(deserialize_with = "or_nan")]
+    pub psnr: f64,
+    /// Structural similarity.
+    #[serde(deserialize_with = "or_nan")]
+    pub ssim: f64,
+    /// Perceptual distance, where there are weights.
+    pub lpips: Option<f64>,
+    /// The photograph, a path relative to the report with forward slashes; empty where none was written.
+    pub truth: String,
+    /// The rendering, likewise.
+    pub render: String,
+    /// Their difference, likewise.
+    pub error: String,
+}
+
+/// One stage of the recipe.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct StageReport {
+    /// As the recipe names it.
+    pub name: String,
+    /// Its first step.
+    pub first_step: u64,
+    /// Its last step.
+    pub last_step: u64,
+    /// Wall-clock seconds of the loop within it.
+    #[serde(deserialize_with = "or_nan")]
+    pub seconds: f64,
+}
+
+/// The run at one step.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct CurvePoint {
+    /// Steps taken.
+    pub step: u64,
+    /// Wall-clock seconds of the loop so far.
+    #[serde(deserialize_with = "or_nan")]
+    pub seconds: f64,
+    /// Training loss.
+    #[serde(deserialize_with = "or_nan")]
+    pub loss: f64,
+    /// PSNR in dB, where it was measured at this step.
+    pub psnr: Option<f64>,
+    /// Gaussians.
+    pub splats: u64,
+}
+
+fn or_nan<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f64, D::Error> {
+    Ok(Option::<f64>::deserialize(deserializer)?.unwrap_or(f64::NAN))
+}
+
+const PAGE: &str = include_str!("page.html");
+const STYLE: &str = include_str!("page.css");
+const SCRIPT: &str = include_str!("page.js");
+
+/// The report as one HTML page, for a file beside the pictures its views name.
+///
+/// All text reaches the page as data that the script sets as text, never as markup.
+pub fn to_html(report: &Report) -> String {
+    let data = serde_json::to_string(report).expect("plain data always serialises");
+    // Within a script element only `<` can end the data (`</script>`, `<!--`); JSON strings may escape any character.
+    let data = data.replace('<', "\\u003c");
+    // The data goes in last: nothing in it is looked at for marks.
+    PAGE.replace("/*STYLE*/", STYLE).replace("/*SCRIPT*/", SCRIPT).replace("/*DATA*/", &data)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn embedded(html: &str) -> serde_json::Value {
+        let opening = "<script id=\"data\" type=\"application/json\">";
+        let start = html.find(opening).expect("data element") + opening.len();
+        let end = start + html[start..].find("</script>").expect("its end");
+        serde_json::from_str(&html[start..end]).expect("JSON")
+    }
+
+    #[test]
+    fn hostile_text_stays_data() {
+        let evil = "</script><script>alert(1)</script><!-- /*SCRIPT*/ & \" ' \u{2028}";
+        let report = Report {
+            dataset: evil.into(),
+            warnings: vec![evil.into()],
+            views: vec![ViewReport { name: evil.into(), ..Default::default() }],
+            ..Default::default()
+        };
+        let html = to_html(&report);
+        assert!(!html.contains("<script>alert"));
+        assert_eq!(html.matches("</script>").count(), 2, "data and program, nothing else");
+        let value = embedded(&html);
+        assert_eq!(value["dataset"], evil);
+        assert_eq!(value["views"][0]["name"], evil);
+    }
+
+    #[test]
+    fn what_is_not_finite_becomes_null_and_comes_back_as_nan() {
+        let report = Report {
+            psnr: f64::NAN,
+            ssim: f64::INFINITY,
+            lpips: Some(f64::NAN),
+            curve: vec![CurvePoint { loss: f64::NEG_INFINITY, ..Default::default() }],
+            ..Default::default()
+        };
+        let value = embedded(&to_html(&report));
+        assert!(value["psnr"].is_null() && value["ssim"].is_null() && value["lpips"].is_null());
+        assert!(value["curve"][0]["loss"].is_null());
+        let back: Report = serde_json::from_str(&serde_json::to_string(&report).expect("writes")).expect("reads");
+        assert!(back.psnr.is_nan() && back.curve[0].loss.is_nan() && back.lpips.is_none());
+    }
+
+    #[test]
+    fn a_report_reads_back_equal() {
+        let report = Report {
+            version: "0.1.0".into(),
+            seed: u64::MAX,
+            psnr: 31.25,
+            lpips: Some(0.125),
+            peak_rss_bytes: 123_456_789_012,
+            stages: vec![StageReport { name: "grow".into(), first_step: 0, last_step: 499, seconds: 1.5 }],
+            curve: vec![CurvePoint { step: 10, seconds: 0.5, loss: 0.1, psnr: Some(20.0), splats: 5 }],
+            ..Default::default()
+        };
+        let text = serde_json::to_string_pretty(&report).expect("writes");
+        assert_eq!(serde_json::from_str::<Report>(&text).expect("reads"), report);
+    }
+
+    #[test]
+    fn the_page_asks_nothing_of_the_network() {
+        let html = to_html(&Report::default());
+        // The one address allowed is the name of the SVG namespace, which is never fetched.
+        let rest = html.replace("http://www.w3.org/2000/svg", "");
+        for word in ["http://", "https://", "src=\"//", "@import", "url("] {
+            assert!(!rest.contains(word), "{word}");
+        }
+        assert!(!html.contains("/*STYLE*/") && !html.contains("/*SCRIPT*/") && !html.contains("/*DATA*/"));
+    }
+}

@@ -1,0 +1,141 @@
+//! The loop around [`Trainer::step`]: when to stop, when to look, whom to tell.
+
+use crate::eval::{Metrics, evaluate_views};
+use crate::event::{Event, Observer, Signal};
+use crate::schedule::plan;
+use crate::trainer::{TrainError, Trainer};
+
+/// When a run ends before its recipe does.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct RunLimits {
+    /// Held-out PSNR in dB at which to stop.
+    pub until_psnr: Option<f64>,
+    /// Seconds of training into which the whole recipe is to be fitted.
+    pub budget: Option<f64>,
+}
+
+/// Steps between looks at the held-out views when `until_psnr` waits for them.
+const UNTIL_PSNR_EVERY: u64 = 50;
+
+/// Trains until the recipe is over, a limit is reached or an observer says stop; returns why it ended.
+///
+/// # Errors
+/// When a photograph cannot be read.
+pub fn run(
+    trainer: &mut Trainer,
+    limits: &RunLimits,
+    observers: &mut [&mut dyn Observer],
+) -> Result<String, TrainError> {
+    let mut events = vec![Event::Started {
+        recipe: trainer.recipe.name.clone(),
+        step: trainer.clock.step,
+        total_steps: trainer.total_steps(),
+        splats: trainer.state.len(),
+        views: trainer.dataset.train.len(),
+    }];
+    if trainer.clock.step == 0 {
+        events.push(Event::StageEntered {
+            stage: trainer.stage_name().to_owned(),
+            step: 0,
+            seconds: 0.0,
+        });
+    }
+    if limits.until_psnr.is_some() {
+        trainer.recipe.eval_every = trainer.recipe.eval_every.min(UNTIL_PSNR_EVERY);
+    }
+    let mut pacer = limits.budget.map(Pacer::new);
+    let mut signal = tell(trainer, &mut events, observers);
+    let mut reason = None;
+    while reason.is_none() && !trainer.finished() {
+        if signal == Signal::Stop {
+            reason = Some("stopped");
+            break;
+        }
+        if let Some(pacer) = &mut pacer {
+            pacer.adjust(trainer);
+        }
+        let looks = plan(&trainer.recipe, &trainer.clock).evaluate;
+        let report = trainer.step(&mut events)?;
+        events.insert(0, Event::Step(report));
+        if looks && !trainer.dataset.test.is_empty() {
+            let psnr = held_out_psnr(trainer)?;
+            events.push(Event::Evaluated {
+                step: trainer.clock.step,
+                seconds: trainer.seconds,
+                psnr,
+                splats: trainer.state.len(),
+            });
+            if limits.until_psnr.is_some_and(|limit| psnr >= limit) {
+                reason = Some("held-out PSNR reached");
+            }
+        }
+        signal = tell(trainer, &mut events, observers);
+    }
+    let reason = reason.unwrap_or("recipe complete").to_owned();
+    events.push(Event::Finished {
+        step: trainer.clock.step,
+        seconds: trainer.seconds,
+        reason: reason.clone(),
+    });
+    tell(trainer, &mut events, observers);
+    Ok(reason)
+}
+
+fn tell(trainer: &Trainer, events: &mut Vec<Event>, observers: &mut [&mut dyn Observer]) -> Signal {
+    let mut strongest = Signal::Continue;
+    for event in events.drain(..) {
+        for observer in observers.iter_mut() {
+            strongest = strongest.max(observer.on_event(&event, trainer));
+        }
+    }
+    strongest
+}
+
+/// Mean PSNR over the held-out views, with the SH bands in use now.
+fn held_out_psnr(trainer: &Trainer) -> Result<f64, TrainError> {
+    let options = trainer.render_options(plan(&trainer.recipe, &trainer.clock).sh_degree);
+    let mut psnr = Vec::new();
+    evaluate_views(
+        &trainer.state.splats,
+        &trainer.dataset,
+        &trainer.dataset.test,
+        &options,
+        Metrics::Psnr,
+        |view| {
+            psnr.push(view.metrics.psnr);
+        },
+    )?;
+    Ok(psnr.iter().sum::<f64>() / psnr.len() as f64)
+}
+
+/// Fits the recipe into a time: the pace of each step is what is left of the recipe over the steps that still fit.
+struct Pacer {
+    budget: f64,
+    /// The trainer's seconds before the last step.
+    before: Option<f64>,
+    seconds_a_step: Option<f64>,
+}
+
+impl Pacer {
+    fn new(budget: f64) -> Self {
+        Self {
+            budget,
+            before: None,
+            seconds_a_step: None,
+        }
+    }
+
+    fn adjust(&mut self, trainer: &mut Trainer) {
+        if let Some(before) = self.before {
+            let step = trainer.seconds - before;
+            // A moving mean over some 50 steps; the first step also warms caches and is let in at full weight.
+            self.seconds_a_step = Some(self.seconds_a_step.map_or(step, |mean| 0.98 * mean + 0.02 * step));
+        }
+        self.before = Some(trainer.seconds);
+        let left = (self.budget - trainer.seconds).max(0.0);
+        let recipe_left = trainer.recipe.total_steps() as f64 - trainer.clock.time;
+        // Before anything was measured: 10 ms, the order of a step on two cores.
+        let steps = (left / self.seconds_a_step.unwrap_or(0.01)).max(1.0);
+        trainer.pace = recipe_left / steps;
+    }
+}

@@ -125,7 +125,12 @@ pub trait Lanes:
     /// Where `mask` is set `self`, elsewhere `other`.
     fn or_where_not(self, mask: Self::Mask, other: Self) -> Self;
     /// `2^self`. Relative error below 2.5e-7 for `self >= -126`; less is taken as -126. Not for `self > 127`.
-    fn exp2(self) -> Self;
+    #[inline(always)]
+    fn exp2(self) -> Self {
+        self.max(self.splat(-126.0)).exp2_in_range()
+    }
+    /// As [`Lanes::exp2`], unspecified below -126: one instruction less where such lanes are masked anyway.
+    fn exp2_in_range(self) -> Self;
     /// `1 / self`, within two units in the last place.
     fn recip(self) -> Self;
     /// Sum of the lanes, in a fixed order.
@@ -167,6 +172,38 @@ pub trait Mask: Copy + Debug {
     fn none(self) -> bool {
         self.bits() == 0
     }
+}
+
+/// `[f(0), f(1), ..]` written out: `each!(i in 3 => a[i] + b[i])`.
+///
+/// A closure, as `array::from_fn` and `map` take, is a function of its own and does not inherit the wide instructions of
+/// the function it stands in; where the compiler does not inline it, every lane operation becomes a call.
+#[macro_export]
+macro_rules! each {
+    ($i:ident in 2 => $value:expr) => {
+        $crate::each!(@ $i, $value, 0, 1)
+    };
+    ($i:ident in 3 => $value:expr) => {
+        $crate::each!(@ $i, $value, 0, 1, 2)
+    };
+    ($i:ident in 4 => $value:expr) => {
+        $crate::each!(@ $i, $value, 0, 1, 2, 3)
+    };
+    ($i:ident in 5 => $value:expr) => {
+        $crate::each!(@ $i, $value, 0, 1, 2, 3, 4)
+    };
+    ($i:ident in 7 => $value:expr) => {
+        $crate::each!(@ $i, $value, 0, 1, 2, 3, 4, 5, 6)
+    };
+    ($i:ident in 10 => $value:expr) => {
+        $crate::each!(@ $i, $value, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9)
+    };
+    ($i:ident in 12 => $value:expr) => {
+        $crate::each!(@ $i, $value, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11)
+    };
+    (@ $i:ident, $value:expr, $($at:literal),*) => {
+        [$({ let $i: usize = $at; $value }),*]
+    };
 }
 
 /// Work that is generic over the instruction set.

@@ -123,17 +123,18 @@ impl Lanes for Four {
         Four(std::array::from_fn(|i| if mask.0[i] { self.0[i] } else { other.0[i] }))
     }
     #[inline(always)]
-    fn exp2(self) -> Self {
+    fn exp2_in_range(self) -> Self {
         // Adding and taking away 1.5 * 2^23 rounds to the nearest whole number without a library call.
         const MAGIC: f32 = 12_582_912.0;
-        let x = self.max(Four([-126.0; N]));
-        let n = x.each(|v| (v + MAGIC) - MAGIC);
-        let f = x - n;
+        let n = self.each(|v| (v + MAGIC) - MAGIC);
+        let f = self - n;
         let mut p = Four([EXP2[5]; N]);
         for k in (0..5).rev() {
             p = p.mul_add(f, Four([EXP2[k]; N]));
         }
-        p.zip(n, |p, n| p * f32::from_bits(((n as i32 + 127) << 23) as u32))
+        p.zip(n, |p, n| {
+            p * f32::from_bits(((n as i32).wrapping_add(127) << 23) as u32)
+        })
     }
     #[inline(always)]
     fn recip(self) -> Self {
@@ -230,7 +231,7 @@ impl Lanes for f64 {
         if mask { self } else { other }
     }
     #[inline(always)]
-    fn exp2(self) -> Self {
+    fn exp2_in_range(self) -> Self {
         f64::exp2(self)
     }
     #[inline(always)]

@@ -156,7 +156,7 @@ macro_rules! float_lanes {
                 $vector(unsafe { $select })
             }
             #[inline(always)]
-            fn exp2(self) -> Self {
+            fn exp2_in_range(self) -> Self {
                 let $exp_v = self;
                 $exp2
             }
@@ -273,7 +273,6 @@ fn polynomial<V: Lanes>(f: V) -> V {
 
 #[inline(always)]
 fn exp2_16(v: F32x16) -> F32x16 {
-    let v = v.max(v.splat(-126.0));
     // SAFETY: the vector proves the instruction set.
     unsafe {
         let n = _mm512_roundscale_ps::<NEAREST>(v.0);
@@ -283,7 +282,6 @@ fn exp2_16(v: F32x16) -> F32x16 {
 
 #[inline(always)]
 fn exp2_8(v: F32x8) -> F32x8 {
-    let v = v.max(v.splat(-126.0));
     // SAFETY: the vector proves the instruction set.
     unsafe {
         let n = _mm256_round_ps::<NEAREST>(v.0);

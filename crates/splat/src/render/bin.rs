@@ -1,15 +1,25 @@
 //! Which splat touches which tile, front to back: one depth sort, then a stable split into tiles.
 //!
-//! A splat is tested against tile *columns*: within the column's band of x its ellipse (the set alpha >= 1/255) spans one
-//! exact interval of y, which gives at once the tiles touched and, in each, the rows of pixels worth visiting.
+//! A tile is 16 x 16 pixels in 16 blocks of 8 x 2. A splat is tested against *bands* 8 pixels wide: within a band of x its
+//! ellipse (the set alpha >= 1/255) spans one exact interval of y, which gives at once the tiles touched and, in each, the
+//! blocks worth visiting. Blocks of 8 x 2 waste fewer lanes on small splats than rows of 16: on fox (12,000 splats) the
+//! blend visits 5.0 M pairs a frame instead of 7.2 M.
 
 use super::blend::{Footprint2d, LOG2_ALPHA_MIN};
+use irradia_compute::each;
+use irradia_compute::simd::{Kernel, Lanes, Level, Simd};
 use irradia_compute::sort::{Pair, pair, payload, sort_by_key};
 use rayon::prelude::*;
-use std::sync::atomic::{AtomicU8, AtomicU64, Ordering::Relaxed};
+use std::sync::atomic::{AtomicU16, AtomicU64, Ordering::Relaxed};
 
 /// Width and height of a tile, pixels.
 pub(super) const TILE: usize = 16;
+/// Columns of a block.
+pub(super) const BLOCK_WIDTH: usize = 8;
+/// Rows of a block.
+pub(super) const BLOCK_HEIGHT: usize = 2;
+/// Blocks above each other in a tile; block b is number `b % 8` from the top in the band `b / 8` from the left.
+pub(super) const BAND_BLOCKS: usize = TILE / BLOCK_HEIGHT;
 
 /// A splat in a tile.
 #[derive(Clone, Copy, Debug)]
@@ -17,17 +27,8 @@ pub(super) struct Entry {
     pub splat: u32,
     /// The splat's and tile's place in splat-major order: where its gradient goes.
     pub slot: u32,
-    /// First row of pixels in the low 4 bits, last in the high 4.
-    pub rows: u8,
-}
-
-impl Entry {
-    /// Bit r is set for the rows to visit.
-    #[inline(always)]
-    pub fn row_mask(&self) -> u32 {
-        let (first, last) = (u32::from(self.rows & 15), u32::from(self.rows >> 4));
-        (2u32 << last) - (1u32 << first)
-    }
+    /// Bit b is set for the blocks to visit.
+    pub blocks: u16,
 }
 
 /// The lists of all tiles; buffers are reused from frame to frame.
@@ -42,7 +43,7 @@ pub(super) struct Bins {
     /// Tile t holds `entries[starts[t]..starts[t + 1]]`.
     starts: Vec<u32>,
     entries: Vec<AtomicU64>,
-    rows: Vec<AtomicU8>,
+    blocks: Vec<AtomicU16>,
     entry_count: usize,
     /// For each visible splat: its first slot in the upper 32 bits, how many in the lower.
     slots: Vec<AtomicU64>,
@@ -51,8 +52,8 @@ pub(super) struct Bins {
 /// What one thread found, for a run of the depth order.
 #[derive(Default)]
 struct Part {
-    /// Tile and rows, splat by splat: a hit's number over all parts is its slot.
-    hits: Vec<(u32, u8)>,
+    /// Tile and blocks, splat by splat: a hit's number over all parts is its slot.
+    hits: Vec<(u32, u16)>,
     /// For each splat of the run: how many hits.
     counts: Vec<u32>,
     /// Hits a tile; then where this part's next hit of the tile goes.
@@ -82,13 +83,13 @@ impl Bins {
         into.extend(
             self.entries[range.clone()]
                 .iter()
-                .zip(&self.rows[range])
-                .map(|(entry, rows)| {
+                .zip(&self.blocks[range])
+                .map(|(entry, blocks)| {
                     let entry = entry.load(Relaxed);
                     Entry {
                         splat: entry as u32,
                         slot: (entry >> 32) as u32,
-                        rows: rows.load(Relaxed),
+                        blocks: blocks.load(Relaxed),
                     }
                 }),
         );
@@ -107,7 +108,7 @@ impl Bins {
     }
 
     /// Sorts and splits. `depth_keys[i]` is the bit pattern of splat i's (positive) depth, `u32::MAX` where invisible.
-    pub fn build(&mut self, width: u32, height: u32, footprints: &[Footprint2d], depth_keys: &[u32]) {
+    pub fn build(&mut self, level: Level, width: u32, height: u32, footprints: &[Footprint2d], depth_keys: &[u32]) {
         self.tiles_x = (width as usize).div_ceil(TILE);
         self.tiles_y = (height as usize).div_ceil(TILE);
         let (tiles_x, tiles_y) = (self.tiles_x, self.tiles_y);
@@ -130,18 +131,13 @@ impl Bins {
             .par_iter_mut()
             .zip(self.order.par_chunks(run))
             .for_each(|(part, order)| {
-                part.hits.clear();
-                part.counts.clear();
-                part.tiles.clear();
-                part.tiles.resize(tiles, 0);
-                for item in order {
-                    let before = part.hits.len();
-                    touched_tiles(&footprints[payload(item) as usize], tiles_x, tiles_y, |tile, rows| {
-                        part.hits.push((tile, rows));
-                        part.tiles[tile as usize] += 1;
-                    });
-                    part.counts.push((part.hits.len() - before) as u32);
-                }
+                level.run(FindHits {
+                    part,
+                    order,
+                    footprints,
+                    tiles_x,
+                    tiles_y,
+                });
             });
 
         // Where each part's hits of each tile begin: tile-major, then part by part, which keeps the depth order.
@@ -158,7 +154,7 @@ impl Bins {
         self.entry_count = at as usize;
         if self.entries.len() < self.entry_count {
             self.entries.resize_with(self.entry_count, AtomicU64::default);
-            self.rows.resize_with(self.entry_count, AtomicU8::default);
+            self.blocks.resize_with(self.entry_count, AtomicU16::default);
         }
 
         let mut first = 0u32;
@@ -174,7 +170,7 @@ impl Bins {
         if self.slots.len() < footprints.len() {
             self.slots.resize_with(footprints.len(), AtomicU64::default);
         }
-        let (entries, all_rows, slots) = (&self.entries, &self.rows, &self.slots);
+        let (entries, all_blocks, slots) = (&self.entries, &self.blocks, &self.slots);
         self.parts
             .par_iter_mut()
             .zip(self.order.par_chunks(run))
@@ -184,10 +180,10 @@ impl Bins {
                 for (item, count) in order.iter().zip(&part.counts) {
                     let splat = payload(item);
                     slots[splat as usize].store(u64::from(slot) << 32 | u64::from(*count), Relaxed);
-                    for (tile, rows) in hits.by_ref().take(*count as usize) {
+                    for (tile, blocks) in hits.by_ref().take(*count as usize) {
                         let to = &mut part.tiles[*tile as usize];
                         entries[*to as usize].store(u64::from(slot) << 32 | u64::from(splat), Relaxed);
-                        all_rows[*to as usize].store(*rows, Relaxed);
+                        all_blocks[*to as usize].store(*blocks, Relaxed);
                         *to += 1;
                         slot += 1;
                     }
@@ -196,49 +192,114 @@ impl Bins {
     }
 }
 
-/// Calls `hit(tile, rows)` for every tile in which some pixel centre may lie inside the splat's ellipse.
-#[inline]
-fn touched_tiles(s: &Footprint2d, tiles_x: usize, tiles_y: usize, mut hit: impl FnMut(u32, u8)) {
+/// Finds the tiles of one run of splats. A kernel only so that rounding is an instruction and not a library call.
+struct FindHits<'a> {
+    part: &'a mut Part,
+    order: &'a [Pair],
+    footprints: &'a [Footprint2d],
+    tiles_x: usize,
+    tiles_y: usize,
+}
+
+impl Kernel for FindHits<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<S: Simd>(self, _: S)
+    where
+        S::F: Lanes<Scalar = f32>,
+    {
+        let Self {
+            part,
+            order,
+            footprints,
+            tiles_x,
+            tiles_y,
+        } = self;
+        part.hits.clear();
+        part.counts.clear();
+        part.tiles.clear();
+        part.tiles.resize(tiles_x * tiles_y, 0);
+        for item in order {
+            let before = part.hits.len();
+            touched_tiles(&footprints[payload(item) as usize], tiles_x, tiles_y, |tile, blocks| {
+                part.hits.push((tile, blocks));
+                part.tiles[tile as usize] += 1;
+            });
+            part.counts.push((part.hits.len() - before) as u32);
+        }
+    }
+}
+
+/// Calls `hit(tile, blocks)` for every tile in which some pixel centre may lie inside the splat's ellipse.
+#[inline(always)]
+fn touched_tiles(s: &Footprint2d, tiles_x: usize, tiles_y: usize, mut hit: impl FnMut(u32, u16)) {
     /// Rounding in the bounds must not lose a pixel: this much is added on every side, pixels.
     const SLACK: f32 = 1e-2;
+    const WIDTH: f32 = BLOCK_WIDTH as f32;
     let [x, y] = s.xy;
     let [ex, ey] = s.extent;
     let [a, b, c] = s.quadratic;
-    let tile = TILE as f32;
-    // Pixel centres of column t lie at 16 t + 0.5 ..= 16 t + 15.5.
-    let first_column = ((x - ex - SLACK - (tile - 0.5)) / tile).ceil().max(0.0);
-    let last_column = ((x + ex + SLACK - 0.5) / tile).floor().min(tiles_x as f32 - 1.0);
+    // Pixel centres of band k lie at 8 k + 0.5 ..= 8 k + 7.5.
+    let bands = (tiles_x * TILE / BLOCK_WIDTH) as f32;
+    let first_band = ((x - ex - SLACK - (WIDTH - 0.5)) / WIDTH).ceil().max(0.0);
+    let last_band = ((x + ex + SLACK - 0.5) / WIDTH).floor().min(bands - 1.0);
+    if last_band < first_band {
+        return;
+    }
+    let (first_band, last_band) = (first_band as usize, last_band as usize);
     // d^T conic d <= t with conic = -(a, b / 2, c).
     let t = s.log2_opacity - LOG2_ALPHA_MIN as f32;
     let (inv_ex, middle_slope) = (1.0 / ex.max(1e-6), -0.5 * b / c);
     let half_height_squared = -t / c;
     // Where the ellipse is highest and lowest: dx = +- x_at_top.
     let x_at_top = -0.5 * b / a * ey;
-    let mut column = first_column;
-    while column <= last_column {
-        let left = (column * tile + 0.5 - x).max(-ex);
-        let right = (column * tile + tile - 0.5 - x).min(ex);
-        let boundary = |dx: f32| {
-            let u = dx * inv_ex;
-            (half_height_squared * (1.0 - u * u).max(0.0)).sqrt()
-        };
+    let last_image_row = (tiles_y * TILE) as f32 - 1.0;
+    // First and last block from the image's top within band k; the first is above the last where there is none.
+    let span = |k: usize| {
+        let left = (k as f32 * WIDTH + 0.5 - x).max(-ex);
+        let right = (k as f32 * WIDTH + WIDTH - 0.5 - x).min(ex);
         // `right < left` only within the slack: then both clamps give an end of the ellipse.
         let dx_high = x_at_top.min(right).max(left);
         let dx_low = (-x_at_top).min(right).max(left);
-        let high = middle_slope * dx_high + boundary(dx_high);
-        let low = middle_slope * dx_low - boundary(dx_low);
+        let (u_high, u_low) = (dx_high * inv_ex, dx_low * inv_ex);
+        let high = middle_slope * dx_high + (half_height_squared * (1.0 - u_high * u_high).max(0.0)).sqrt();
+        let low = middle_slope * dx_low - (half_height_squared * (1.0 - u_low * u_low).max(0.0)).sqrt();
         // Rows whose centre r + 0.5 lies in [y + low, y + high].
         let first_row = (y + low - 0.5 - SLACK).ceil().max(0.0);
-        let last_row = (y + high - 0.5 + SLACK).floor().min((tiles_y * TILE) as f32 - 1.0);
+        let last_row = (y + high - 0.5 + SLACK).floor().min(last_image_row);
         if first_row <= last_row {
-            let (first_row, last_row) = (first_row as usize, last_row as usize);
-            for tile_row in first_row / TILE..=last_row / TILE {
-                let top = first_row.saturating_sub(tile_row * TILE);
-                let bottom = (last_row - tile_row * TILE).min(TILE - 1);
-                hit((tile_row * tiles_x + column as usize) as u32, (top | bottom << 4) as u8);
+            (first_row as usize / BLOCK_HEIGHT, last_row as usize / BLOCK_HEIGHT)
+        } else {
+            (usize::MAX, 0)
+        }
+    };
+    const BANDS: usize = TILE / BLOCK_WIDTH;
+    for column in first_band / BANDS..=last_band / BANDS {
+        let spans = each!(i in 2 => {
+            let k = BANDS * column + i;
+            if (first_band..=last_band).contains(&k) { span(k) } else { (usize::MAX, 0) }
+        });
+        let first = spans[0].0.min(spans[1].0);
+        let last = spans[0].1.max(spans[1].1);
+        if first > last {
+            continue;
+        }
+        for tile_row in first / BAND_BLOCKS..=last / BAND_BLOCKS {
+            let top = tile_row * BAND_BLOCKS;
+            let mask = |(first, last): (usize, usize)| {
+                let (first, last) = (first.max(top), last.min(top + BAND_BLOCKS - 1));
+                if first > last {
+                    0
+                } else {
+                    (2u32 << (last - top)) - (1 << (first - top))
+                }
+            };
+            let blocks = mask(spans[0]) | mask(spans[1]) << BAND_BLOCKS;
+            if blocks != 0 {
+                hit((tile_row * tiles_x + column) as u32, blocks as u16);
             }
         }
-        column += 1.0;
     }
 }
 
@@ -248,12 +309,12 @@ mod tests {
     use irradia_scene::Rng;
     use std::collections::HashMap;
 
-    /// Every pixel that the formula touches is in a listed tile and row; and not many rows are listed in vain.
+    /// Every pixel that the formula touches is in a listed tile and block; and not many blocks are listed in vain.
     #[test]
-    fn no_touched_pixel_is_lost_and_rows_are_tight() {
+    fn no_touched_pixel_is_lost_and_blocks_are_tight() {
         let mut rng = Rng::new(3, 1);
         let (tiles_x, tiles_y) = (5, 4);
-        let (mut listed_rows, mut needed_rows) = (0usize, 0usize);
+        let (mut listed_blocks, mut needed_blocks) = (0usize, 0usize);
         for _ in 0..400 {
             let (sx, sy) = ((rng.range(-1.0, 4.5)).exp(), (rng.range(-1.0, 3.0)).exp());
             let angle = rng.range(0.0, 3.15);
@@ -274,39 +335,34 @@ mod tests {
                 extent: [(reach * covariance[0]).sqrt(), (reach * covariance[2]).sqrt()],
                 ..Default::default()
             };
-            let mut rows = HashMap::new();
-            touched_tiles(&s, tiles_x, tiles_y, |tile, r| {
-                assert!(rows.insert(tile, r).is_none(), "a tile is listed once");
+            let mut blocks = HashMap::new();
+            touched_tiles(&s, tiles_x, tiles_y, |tile, b| {
+                assert!(blocks.insert(tile, b).is_none(), "a tile is listed once");
             });
             for tile in 0..(tiles_x * tiles_y) as u32 {
                 let corner = [(tile as usize % tiles_x) * TILE, (tile as usize / tiles_x) * TILE];
-                for r in 0..TILE {
-                    let needed = (0..TILE).any(|i| {
+                for block in 0..16 {
+                    let needed = (0..16).any(|i| {
+                        let column = block / BAND_BLOCKS * BLOCK_WIDTH + i % BLOCK_WIDTH;
+                        let row = block % BAND_BLOCKS * BLOCK_HEIGHT + i / BLOCK_WIDTH;
                         let d = [
-                            (corner[0] + i) as f32 + 0.5 - s.xy[0],
-                            (corner[1] + r) as f32 + 0.5 - s.xy[1],
+                            (corner[0] + column) as f32 + 0.5 - s.xy[0],
+                            (corner[1] + row) as f32 + 0.5 - s.xy[1],
                         ];
                         let [a, b, c] = s.quadratic;
                         a * d[0] * d[0] + b * d[0] * d[1] + c * d[1] * d[1] + s.log2_opacity >= LOG2_ALPHA_MIN as f32
                     });
-                    let listed = rows.get(&tile).is_some_and(|rows| {
-                        let entry = Entry {
-                            splat: 0,
-                            slot: 0,
-                            rows: *rows,
-                        };
-                        entry.row_mask() >> r & 1 == 1
-                    });
-                    assert!(listed || !needed, "tile {tile} row {r} of {s:?}");
-                    listed_rows += usize::from(listed);
-                    needed_rows += usize::from(needed);
+                    let listed = blocks.get(&tile).is_some_and(|blocks| blocks >> block & 1 == 1);
+                    assert!(listed || !needed, "tile {tile} block {block} of {s:?}");
+                    listed_blocks += usize::from(listed);
+                    needed_blocks += usize::from(needed);
                 }
             }
         }
-        // Between two pixel centres a thin ellipse may pass unseen; nothing else is listed in vain.
+        // Between pixel centres a thin ellipse may pass unseen; nothing else is listed in vain.
         assert!(
-            listed_rows < needed_rows + needed_rows / 20,
-            "{listed_rows} listed, {needed_rows} needed"
+            listed_blocks < needed_blocks + needed_blocks / 20,
+            "{listed_blocks} listed, {needed_blocks} needed"
         );
     }
 }

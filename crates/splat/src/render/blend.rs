@@ -2,11 +2,12 @@
 //!
 //! Symbols: `p = a dx^2 + b dx dy + c dy^2 + l` is log2 of alpha before the cap (conic and opacity folded into it, so that
 //! a fragment costs two fused operations and one exponential), `T` transmittance, `w = alpha T` weight.
-//! A tile is 16 pixels wide and high: one row is one AVX-512 vector, two of AVX2.
+//! Pixels are held block by block (8 columns, 2 rows): a block is one AVX-512 vector, two of AVX2.
 //! A pixel that has ended (a splat would have brought T to 1e-4 or below) is stored with the sign of T flipped: every
 //! later product then fails the same test, which saves a mask in the inner loop.
 
-use super::bin::{Entry, TILE};
+use super::bin::{BAND_BLOCKS, BLOCK_HEIGHT, BLOCK_WIDTH, Entry, TILE};
+use irradia_compute::each;
 use irradia_compute::simd::{Kernel, Lanes, Mask, Simd};
 
 /// Alpha never exceeds this (Inria code).
@@ -32,11 +33,13 @@ pub(super) struct Footprint2d {
     pub extent: [f32; 2],
 }
 
+/// Pixels of a block.
+pub(super) const BLOCK: usize = BLOCK_WIDTH * BLOCK_HEIGHT;
 /// Pixels of a tile.
 pub(super) const TILE_PIXELS: usize = TILE * TILE;
-/// Channels a tile's forward state has: red, green, blue, depth, transmittance; `[channel, row, column]`.
+/// Channels a tile's forward state has: red, green, blue, depth, transmittance; `[channel, block, pixel]`.
 pub(super) const CHANNELS: usize = 5;
-/// Sums a splat collects in each tile, in this order: the moments 1, dx, dy, dx^2, dx dy, dy^2 of v_p, then the
+/// Sums a splat collects in each tile, in this order: the moments 1, dx, dy, dx^2, dx dy, dy^2 of v_p / ln 2, then the
 /// gradients of red, green, blue and depth.
 pub(super) const SUMS: usize = 10;
 
@@ -57,7 +60,7 @@ pub(super) struct Fragment<F: Lanes> {
 /// One splat over one vector of pixels: `p` as above, `transmittance` in front.
 #[inline(always)]
 pub(super) fn fragment<F: Lanes>(p: F, transmittance: F) -> Fragment<F> {
-    let raw = p.exp2();
+    let raw = p.exp2_in_range(); // Below -126 nothing is touched.
     let cap = p.splat(ALPHA_MAX);
     let alpha = raw.min(cap);
     let touched = p.splat(LOG2_ALPHA_MIN).le(p);
@@ -74,17 +77,16 @@ pub(super) fn fragment<F: Lanes>(p: F, transmittance: F) -> Fragment<F> {
     }
 }
 
-/// The gradient of `p`, for a fragment that is drawn: `dL/dalpha = T g - rest / (1 - alpha)`, where `g` is the splat's
+/// The gradient of `p`, divided by ln 2, for a fragment that is drawn: `dL/dalpha = T g - rest / (1 - alpha)`, where `g` is the splat's
 /// colour (and depth) times the pixel's gradient and `rest` the same for all that lies behind, weighted, background too.
 #[inline(always)]
 pub(super) fn fragment_vjp<F: Lanes>(at: &Fragment<F>, transmittance: F, g: F, rest: F) -> F {
     let one = g.splat(1.0);
-    let v_alpha = transmittance * g - rest * (one - at.alpha).recip();
-    let v_p = v_alpha * at.alpha * g.splat(std::f64::consts::LN_2);
-    v_p.zero_where_not(at.drawn.and_not(at.capped))
+    let v_alpha = (-rest).mul_add((one - at.alpha).recip(), transmittance * g);
+    (v_alpha * at.alpha).zero_where_not(at.drawn.and_not(at.capped))
 }
 
-/// Blends one tile front to back into `out [CHANNELS, TILE, TILE]`.
+/// Blends one tile front to back into `out [CHANNELS, blocks, BLOCK]`.
 pub(super) struct BlendTile<'a> {
     pub footprints: &'a [Footprint2d],
     /// The tile's splats, front to back.
@@ -123,58 +125,75 @@ impl BlendTile<'_> {
         let (red, colors) = colors.split_at_mut(TILE_PIXELS);
         let (green, colors) = colors.split_at_mut(TILE_PIXELS);
         let (blue, depths) = colors.split_at_mut(TILE_PIXELS);
-        // Bit r: some pixel of row r has not ended.
-        let mut live: u32 = (1 << TILE) - 1;
+        // Bit b: some pixel of block b has not ended.
+        let mut live = u32::from(u16::MAX);
         for entry in self.entries {
-            let mut rows = entry.row_mask() & live;
-            if rows == 0 {
+            let blocks = u32::from(entry.blocks) & live;
+            if blocks == 0 {
                 if live == 0 {
                     return;
                 }
                 continue;
             }
             let s = &self.footprints[entry.splat as usize];
-            let over = Parabola::<S>::new(simd, s, self.corner);
-            let color = s.color.map(|v| simd.set(v));
+            let color = each!(c in 3 => simd.set(s.color[c]));
             let depth = simd.set(s.depth);
-            while rows != 0 {
-                let row = rows.trailing_zeros() as usize;
-                rows &= rows - 1;
-                let dy = simd.set(over.dy(row));
-                let mut ended = false;
-                for part in 0..TILE / S::LANES {
-                    let at = row * TILE + part * S::LANES;
-                    let t = simd.load(&transmittances[at..]);
-                    let f = fragment(over.p(part, dy), t);
-                    let w = f.weight.zero_where_not(f.drawn);
-                    w.mul_add(color[0], simd.load(&red[at..])).store(&mut red[at..]);
-                    w.mul_add(color[1], simd.load(&green[at..])).store(&mut green[at..]);
-                    w.mul_add(color[2], simd.load(&blue[at..])).store(&mut blue[at..]);
-                    if DEPTH {
-                        w.mul_add(depth, simd.load(&depths[at..])).store(&mut depths[at..]);
-                    }
-                    f.behind.or_where_not(f.drawn, t).store(&mut transmittances[at..]);
-                    if !f.ends.none() {
-                        (-t.abs())
-                            .or_where_not(f.ends, f.behind.or_where_not(f.drawn, t))
-                            .store(&mut transmittances[at..]);
-                        ended = true;
-                    }
+            for band in 0..TILE / BLOCK_WIDTH {
+                let mut todo = band_blocks(blocks, band);
+                if todo == 0 {
+                    continue;
                 }
-                if ended && transmittances[row * TILE..][..TILE].iter().all(|t| *t < 0.0) {
-                    live &= !(1 << row);
+                let over = Parabola::<S>::new(simd, s, self.corner, band);
+                while todo != 0 {
+                    let block = todo.trailing_zeros() as usize;
+                    todo &= todo - 1;
+                    let mut ended = false;
+                    for part in 0..BLOCK / S::LANES {
+                        let at = (band * BAND_BLOCKS + block) * BLOCK + part * S::LANES;
+                        let t = simd.load(&transmittances[at..]);
+                        let f = fragment(over.p(part, over.dy(simd, part, block)), t);
+                        let w = f.weight.zero_where_not(f.drawn);
+                        w.mul_add(color[0], simd.load(&red[at..])).store(&mut red[at..]);
+                        w.mul_add(color[1], simd.load(&green[at..])).store(&mut green[at..]);
+                        w.mul_add(color[2], simd.load(&blue[at..])).store(&mut blue[at..]);
+                        if DEPTH {
+                            w.mul_add(depth, simd.load(&depths[at..])).store(&mut depths[at..]);
+                        }
+                        let t_next = f.behind.or_where_not(f.drawn, t);
+                        t_next.store(&mut transmittances[at..]);
+                        if !f.ends.none() {
+                            (-t.abs()).or_where_not(f.ends, t_next).store(&mut transmittances[at..]);
+                            ended = true;
+                        }
+                    }
+                    if ended {
+                        live &= !ended_block(transmittances, band * BAND_BLOCKS + block);
+                    }
                 }
             }
         }
     }
 }
 
-/// `p` over a tile, with all that does not depend on the row worked out.
+/// The bits of `blocks` that lie in `band`, from bit 0.
+#[inline(always)]
+fn band_blocks(blocks: u32, band: usize) -> u32 {
+    blocks >> (band * BAND_BLOCKS) & ((1 << BAND_BLOCKS) - 1)
+}
+
+/// The bit of `block` if all its pixels have ended, else 0.
+#[inline(always)]
+fn ended_block(transmittances: &[f32], block: usize) -> u32 {
+    let all = transmittances[block * BLOCK..][..BLOCK].iter().all(|t| *t < 0.0);
+    u32::from(all) << block
+}
+
+/// `p` over a band of a tile, with all that does not depend on the row worked out.
 struct Parabola<S: Simd> {
-    y: f32,
     c: S::F,
-    /// For each part of a row: dx, b dx, and a dx^2 + l.
+    /// For each part of a block: dx, dy in the topmost block, b dx, and a dx^2 + l.
     dx: [S::F; 4],
+    dy: [S::F; 4],
     slope: [S::F; 4],
     level: [S::F; 4],
 }
@@ -184,21 +203,23 @@ where
     S::F: Lanes<Scalar = f32>,
 {
     #[inline(always)]
-    fn new(simd: S, s: &Footprint2d, corner: [f32; 2]) -> Self {
+    fn new(simd: S, s: &Footprint2d, corner: [f32; 2], band: usize) -> Self {
         let zero = simd.splat(0.0);
-        let [a, b, c] = s.quadratic.map(|v| simd.set(v));
+        let [a, b, c] = each!(i in 3 => simd.set(s.quadratic[i]));
         let l = simd.set(s.log2_opacity);
         let mut over = Self {
-            y: s.xy[1] - corner[1],
             c,
             dx: [zero; 4],
+            dy: [zero; 4],
             slope: [zero; 4],
             level: [zero; 4],
         };
-        let x = simd.set(s.xy[0] - corner[0]);
-        for part in 0..TILE / S::LANES {
-            let dx = simd.load(&COLUMN_CENTRES[part * S::LANES..]) - x;
+        let x = simd.set(s.xy[0] - corner[0] - (band * BLOCK_WIDTH) as f32);
+        let y = simd.set(s.xy[1] - corner[1]);
+        for part in 0..BLOCK / S::LANES {
+            let dx = simd.load(&PIXEL_X[part * S::LANES..]) - x;
             over.dx[part] = dx;
+            over.dy[part] = simd.load(&PIXEL_Y[part * S::LANES..]) - y;
             over.slope[part] = b * dx;
             over.level[part] = (a * dx).mul_add(dx, l);
         }
@@ -206,8 +227,8 @@ where
     }
 
     #[inline(always)]
-    fn dy(&self, row: usize) -> f32 {
-        COLUMN_CENTRES[row] - self.y
+    fn dy(&self, simd: S, part: usize, block: usize) -> S::F {
+        self.dy[part] + simd.set(BLOCK_TOP[block])
     }
 
     #[inline(always)]
@@ -216,16 +237,16 @@ where
     }
 }
 
-/// Pixel centres within a tile.
-const COLUMN_CENTRES: [f32; TILE] = {
-    let mut centres = [0.5; TILE];
-    let mut i = 0;
-    while i < TILE {
-        centres[i] += i as f32;
-        i += 1;
-    }
-    centres
-};
+/// Centres of a block's pixels from its left edge.
+const PIXEL_X: [f32; BLOCK] = [
+    0.5, 1.5, 2.5, 3.5, 4.5, 5.5, 6.5, 7.5, 0.5, 1.5, 2.5, 3.5, 4.5, 5.5, 6.5, 7.5,
+];
+/// Centres of a block's pixels from its top edge.
+const PIXEL_Y: [f32; BLOCK] = [
+    0.5, 0.5, 0.5, 0.5, 0.5, 0.5, 0.5, 0.5, 1.5, 1.5, 1.5, 1.5, 1.5, 1.5, 1.5, 1.5,
+];
+/// Top edges of a band's blocks.
+const BLOCK_TOP: [f32; BAND_BLOCKS] = [0.0, 2.0, 4.0, 6.0, 8.0, 10.0, 12.0, 14.0];
 
 /// Walks one tile front to back again and gives every entry's [`SUMS`] to `emit`.
 ///
@@ -235,9 +256,9 @@ pub(super) struct BlendTileVjp<'a, E: Fn(&Entry, [f32; SUMS])> {
     pub footprints: &'a [Footprint2d],
     pub entries: &'a [Entry],
     pub corner: [f32; 2],
-    /// Gradients of red, green, blue and depth over the tile, `[4, TILE, TILE]`; zero outside the image.
+    /// Gradients of red, green, blue and depth over the tile, `[4, blocks, BLOCK]`; zero outside the image.
     pub v_out: &'a [f32; (CHANNELS - 1) * TILE_PIXELS],
-    /// `color . v_color + depth v_depth - T v_alpha`, background included, `[TILE, TILE]`; overwritten.
+    /// `color . v_color + depth v_depth - T v_alpha`, background included, `[blocks, BLOCK]`; overwritten.
     pub rest: &'a mut [f32; TILE_PIXELS],
     pub with_depth: bool,
     pub emit: E,
@@ -268,73 +289,79 @@ impl<E: Fn(&Entry, [f32; SUMS])> BlendTileVjp<'_, E> {
         let mut transmittances = [1.0f32; TILE_PIXELS];
         let [v_red, v_green, v_blue, v_depth] = std::array::from_fn(|c| &self.v_out[c * TILE_PIXELS..][..TILE_PIXELS]);
         let zero = simd.splat(0.0);
-        let mut live: u32 = (1 << TILE) - 1;
+        let mut live = u32::from(u16::MAX);
         for entry in self.entries {
-            let mut rows = entry.row_mask() & live;
-            if rows == 0 {
+            let blocks = u32::from(entry.blocks) & live;
+            if blocks == 0 {
                 (self.emit)(entry, [0.0; SUMS]);
                 continue;
             }
             let s = &self.footprints[entry.splat as usize];
-            let over = Parabola::<S>::new(simd, s, self.corner);
-            let color = s.color.map(|v| simd.set(v));
+            let color = each!(c in 3 => simd.set(s.color[c]));
             let depth = simd.set(s.depth);
-            // Moments over rows of v_p: 1, dy, dy^2 in each column; dx joins at the end, for it does not change with the row.
-            let mut moments = [[zero; 3]; 4];
-            let mut v_color = [zero; 4];
-            while rows != 0 {
-                let row = rows.trailing_zeros() as usize;
-                rows &= rows - 1;
-                let dy = simd.set(over.dy(row));
-                let mut ended = false;
-                for part in 0..TILE / S::LANES {
-                    let at = row * TILE + part * S::LANES;
-                    let t = simd.load(&transmittances[at..]);
-                    let f = fragment(over.p(part, dy), t);
-                    let w = f.weight.zero_where_not(f.drawn);
-                    let v = [
-                        simd.load(&v_red[at..]),
-                        simd.load(&v_green[at..]),
-                        simd.load(&v_blue[at..]),
-                    ];
-                    let mut g = color[0].mul_add(v[0], color[1].mul_add(v[1], color[2] * v[2]));
-                    if DEPTH {
-                        let v = simd.load(&v_depth[at..]);
-                        g = depth.mul_add(v, g);
-                        v_color[3] = w.mul_add(v, v_color[3]);
-                    }
-                    for c in 0..3 {
-                        v_color[c] = w.mul_add(v[c], v_color[c]);
-                    }
-                    let rest = simd.load(&self.rest[at..]) - w * g;
-                    rest.store(&mut self.rest[at..]);
-                    let v_p = fragment_vjp(&f, t, g, rest);
-                    let m = &mut moments[part];
-                    m[0] += v_p;
-                    let v_dy = v_p * dy;
-                    m[1] += v_dy;
-                    m[2] = v_dy.mul_add(dy, m[2]);
-                    let t_next = f.behind.or_where_not(f.drawn, t);
-                    t_next.store(&mut transmittances[at..]);
-                    if !f.ends.none() {
-                        (-t.abs()).or_where_not(f.ends, t_next).store(&mut transmittances[at..]);
-                        ended = true;
-                    }
-                }
-                if ended && transmittances[row * TILE..][..TILE].iter().all(|t| *t < 0.0) {
-                    live &= !(1 << row);
-                }
-            }
             let mut sums = [zero; 6];
-            for part in 0..TILE / S::LANES {
-                let (dx, [m0, m1, m2]) = (over.dx[part], moments[part]);
-                let m0_dx = m0 * dx;
-                sums[0] += m0;
-                sums[1] += m0_dx;
-                sums[2] += m1;
-                sums[3] = m0_dx.mul_add(dx, sums[3]);
-                sums[4] = m1.mul_add(dx, sums[4]);
-                sums[5] += m2;
+            let mut v_color = [zero; 4];
+            for band in 0..TILE / BLOCK_WIDTH {
+                let mut todo = band_blocks(blocks, band);
+                if todo == 0 {
+                    continue;
+                }
+                let over = Parabola::<S>::new(simd, s, self.corner, band);
+                // Moments 1, dy, dy^2 of v_p in each column; dx joins at the end, for it is the same in all blocks of a band.
+                let mut moments = [[zero; 3]; 4];
+                while todo != 0 {
+                    let block = todo.trailing_zeros() as usize;
+                    todo &= todo - 1;
+                    let mut ended = false;
+                    for part in 0..BLOCK / S::LANES {
+                        let at = (band * BAND_BLOCKS + block) * BLOCK + part * S::LANES;
+                        let t = simd.load(&transmittances[at..]);
+                        let dy = over.dy(simd, part, block);
+                        let f = fragment(over.p(part, dy), t);
+                        let w = f.weight.zero_where_not(f.drawn);
+                        let v = [
+                            simd.load(&v_red[at..]),
+                            simd.load(&v_green[at..]),
+                            simd.load(&v_blue[at..]),
+                        ];
+                        let mut g = color[0].mul_add(v[0], color[1].mul_add(v[1], color[2] * v[2]));
+                        if DEPTH {
+                            let v = simd.load(&v_depth[at..]);
+                            g = depth.mul_add(v, g);
+                            v_color[3] = w.mul_add(v, v_color[3]);
+                        }
+                        for c in 0..3 {
+                            v_color[c] = w.mul_add(v[c], v_color[c]);
+                        }
+                        let rest = (-w).mul_add(g, simd.load(&self.rest[at..]));
+                        rest.store(&mut self.rest[at..]);
+                        let v_p = fragment_vjp(&f, t, g, rest);
+                        let m = &mut moments[part];
+                        m[0] += v_p;
+                        let v_dy = v_p * dy;
+                        m[1] += v_dy;
+                        m[2] = v_dy.mul_add(dy, m[2]);
+                        let t_next = f.behind.or_where_not(f.drawn, t);
+                        t_next.store(&mut transmittances[at..]);
+                        if !f.ends.none() {
+                            (-t.abs()).or_where_not(f.ends, t_next).store(&mut transmittances[at..]);
+                            ended = true;
+                        }
+                    }
+                    if ended {
+                        live &= !ended_block(&transmittances, band * BAND_BLOCKS + block);
+                    }
+                }
+                for part in 0..BLOCK / S::LANES {
+                    let (dx, [m0, m1, m2]) = (over.dx[part], moments[part]);
+                    let m0_dx = m0 * dx;
+                    sums[0] += m0;
+                    sums[1] += m0_dx;
+                    sums[2] += m1;
+                    sums[3] = m0_dx.mul_add(dx, sums[3]);
+                    sums[4] = m1.mul_add(dx, sums[4]);
+                    sums[5] += m2;
+                }
             }
             let [s0, s1, s2, s3, s4, s5] = sums;
             let [c0, c1, c2, c3] = v_color;

@@ -5,6 +5,7 @@
 
 mod bin;
 mod blend;
+mod chunk;
 mod project;
 mod sh;
 mod view;
@@ -17,15 +18,13 @@ pub use project::{ALPHA_MIN, DILATION};
 pub use view::ViewParams;
 
 use crate::Splats;
-use bin::{Bins, TILE};
-use blend::{BlendTile, BlendTileVjp, CHANNELS, Footprint2d, SUMS, TILE_PIXELS};
+use bin::{BAND_BLOCKS, BLOCK_HEIGHT, BLOCK_WIDTH, Bins, TILE};
+use blend::{BLOCK, BlendTile, BlendTileVjp, CHANNELS, Footprint2d, SUMS, TILE_PIXELS};
+use chunk::{GradientChunk, ProjectChunk, ProjectChunkVjp};
 use irradia_compute::Planes;
-use irradia_compute::simd::{Kernel, Lanes, Level, Mask, Simd};
-use project::{Footprint, FootprintGradient, Geometry, project, project_vjp};
+use irradia_compute::simd::Level;
 use rayon::prelude::*;
-use sh::{basis, basis_vjp, direction, direction_vjp};
 use std::cell::RefCell;
-use std::f64::consts::LOG2_E;
 use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
 
 /// How a frame is rendered.
@@ -88,7 +87,7 @@ pub struct Renderer {
     footprints: Vec<Footprint2d>,
     depth_keys: Vec<u32>,
     bins: Bins,
-    /// Tile-major `[tiles, CHANNELS, TILE, TILE]`.
+    /// Tile-major `[tiles, CHANNELS, blocks, BLOCK]`.
     tiles: Vec<f32>,
     color: Vec<f32>,
     alpha: Vec<f32>,
@@ -157,7 +156,7 @@ impl Renderer {
         (self.depth_keys[i] != u32::MAX).then(|| self.footprints[i].extent)
     }
 
-    /// Splat-pixel pairs that the last frame's blending visited (whole rows of 16), for benchmarks.
+    /// Splat-pixel pairs that the last frame's blending visited (whole blocks of 16), for benchmarks.
     pub fn pairs(&self) -> u64 {
         let mut entries = Vec::new();
         (0..self.bins.tile_count())
@@ -165,7 +164,7 @@ impl Renderer {
                 self.bins.tile_entries(tile, &mut entries);
                 entries
                     .iter()
-                    .map(|e| u64::from(e.row_mask().count_ones()) * TILE as u64)
+                    .map(|e| u64::from(e.blocks.count_ones()) * BLOCK as u64)
                     .sum::<u64>()
             })
             .sum()
@@ -175,7 +174,7 @@ impl Renderer {
     pub fn render(&mut self, splats: &Splats, view: &ViewParams, options: &RenderOptions) {
         self.project(splats, view, options);
         self.bins
-            .build(view.width, view.height, &self.footprints, &self.depth_keys);
+            .build(self.level, view.width, view.height, &self.footprints, &self.depth_keys);
         self.blend(view, options);
         self.view = Some(view.clone());
         self.options = *options;
@@ -228,32 +227,33 @@ impl Renderer {
         self.alpha.resize(pixels, 0.0);
         self.depth.resize(if options.depth { pixels } else { 0 }, 0.0);
         let tiles = &self.tiles;
-        let row = |channel: usize, y: usize, x: usize| {
+        // The eight pixels of a channel in row y from column x, a multiple of eight, on.
+        let run = |channel: usize, y: usize, x: usize| {
             let tile = (y / TILE) * bins.tiles_x + x / TILE;
-            let at = (tile * CHANNELS + channel) * TILE_PIXELS + (y % TILE) * TILE;
-            &tiles[at..at + TILE]
+            let at = (tile * CHANNELS + channel) * TILE_PIXELS + pixel_in_tile(x % TILE, y % TILE);
+            &tiles[at..at + BLOCK_WIDTH]
         };
         self.color.par_chunks_mut(width).enumerate().for_each(|(line, to)| {
             let (channel, y) = (line / height, line % height);
             let background = options.background[channel];
-            for (i, to) in to.chunks_mut(TILE).enumerate() {
-                let (color, t) = (row(channel, y, i * TILE), row(CHANNELS - 1, y, i * TILE));
+            for (i, to) in to.chunks_mut(BLOCK_WIDTH).enumerate() {
+                let (color, t) = (run(channel, y, i * BLOCK_WIDTH), run(CHANNELS - 1, y, i * BLOCK_WIDTH));
                 for ((to, color), t) in to.iter_mut().zip(color).zip(t) {
                     *to = color + t.abs() * background;
                 }
             }
         });
         self.alpha.par_chunks_mut(width).enumerate().for_each(|(y, to)| {
-            for (i, to) in to.chunks_mut(TILE).enumerate() {
-                for (to, t) in to.iter_mut().zip(row(CHANNELS - 1, y, i * TILE)) {
+            for (i, to) in to.chunks_mut(BLOCK_WIDTH).enumerate() {
+                for (to, t) in to.iter_mut().zip(run(CHANNELS - 1, y, i * BLOCK_WIDTH)) {
                     *to = 1.0 - t.abs();
                 }
             }
         });
         self.depth.par_chunks_mut(width).enumerate().for_each(|(y, to)| {
-            for (i, to) in to.chunks_mut(TILE).enumerate() {
+            for (i, to) in to.chunks_mut(BLOCK_WIDTH).enumerate() {
                 let len = to.len();
-                to.copy_from_slice(&row(3, y, i * TILE)[..len]);
+                to.copy_from_slice(&run(3, y, i * BLOCK_WIDTH)[..len]);
             }
         });
     }
@@ -301,26 +301,29 @@ impl Renderer {
                 let columns = TILE.min(width - x0);
                 for row in 0..TILE.min(height - y0) {
                     let image = (y0 + row) * width + x0;
-                    let at = row * TILE;
-                    for c in 0..3 {
-                        let from = &v_out.color[c * width * height + image..][..columns];
-                        v_tile[c * TILE_PIXELS + at..][..columns].copy_from_slice(from);
-                    }
-                    if let Some(v_depth) = v_out.depth {
-                        v_tile[3 * TILE_PIXELS + at..][..columns].copy_from_slice(&v_depth[image..][..columns]);
-                    }
-                    for i in 0..columns {
-                        let pixel = at + i;
-                        let t = state[(CHANNELS - 1) * TILE_PIXELS + pixel].abs();
-                        let mut total = v_out.alpha.map_or(0.0, |v| -t * v[image + i]);
+                    for column in (0..columns).step_by(BLOCK_WIDTH) {
+                        let run = BLOCK_WIDTH.min(columns - column);
+                        let (at, from) = (pixel_in_tile(column, row), image + column);
                         for c in 0..3 {
-                            total +=
-                                (state[c * TILE_PIXELS + pixel] + t * background[c]) * v_tile[c * TILE_PIXELS + pixel];
+                            let from = &v_out.color[c * width * height + from..][..run];
+                            v_tile[c * TILE_PIXELS + at..][..run].copy_from_slice(from);
                         }
-                        if v_out.depth.is_some() {
-                            total += state[3 * TILE_PIXELS + pixel] * v_tile[3 * TILE_PIXELS + pixel];
+                        if let Some(v_depth) = v_out.depth {
+                            v_tile[3 * TILE_PIXELS + at..][..run].copy_from_slice(&v_depth[from..][..run]);
                         }
-                        rest[pixel] = total;
+                        for i in 0..run {
+                            let pixel = at + i;
+                            let t = state[(CHANNELS - 1) * TILE_PIXELS + pixel].abs();
+                            let mut total = v_out.alpha.map_or(0.0, |v| -t * v[from + i]);
+                            for c in 0..3 {
+                                let color = state[c * TILE_PIXELS + pixel] + t * background[c];
+                                total += color * v_tile[c * TILE_PIXELS + pixel];
+                            }
+                            if v_out.depth.is_some() {
+                                total += state[3 * TILE_PIXELS + pixel] * v_tile[3 * TILE_PIXELS + pixel];
+                            }
+                            rest[pixel] = total;
+                        }
                     }
                 }
                 with_entries(bins, tile, |entries| {
@@ -389,6 +392,13 @@ impl Renderer {
     }
 }
 
+/// Where pixel (x, y) of a tile lies in its block-wise order.
+#[inline(always)]
+fn pixel_in_tile(x: usize, y: usize) -> usize {
+    let block = (x / BLOCK_WIDTH) * BAND_BLOCKS + y / BLOCK_HEIGHT;
+    block * BLOCK + (y % BLOCK_HEIGHT) * BLOCK_WIDTH + x % BLOCK_WIDTH
+}
+
 fn corner(bins: &Bins, tile: usize) -> [f32; 2] {
     [
         ((tile % bins.tiles_x) * TILE) as f32,
@@ -405,242 +415,4 @@ fn with_entries(bins: &Bins, tile: usize, work: impl FnOnce(&[bin::Entry])) {
         bins.tile_entries(tile, entries);
         work(entries);
     });
-}
-
-#[inline(always)]
-fn load_geometry<S: Simd>(simd: S, splats: &Splats, at: usize) -> Geometry<S::F>
-where
-    S::F: Lanes<Scalar = f32>,
-{
-    Geometry {
-        mean: std::array::from_fn(|c| simd.load(&splats.means.plane(c)[at..])),
-        quat: std::array::from_fn(|c| simd.load(&splats.quats.plane(c)[at..])),
-        log_scale: std::array::from_fn(|c| simd.load(&splats.log_scales.plane(c)[at..])),
-        opacity_logit: simd.load(&splats.opacity_logits.plane(0)[at..]),
-    }
-}
-
-struct ProjectChunk<'a> {
-    splats: &'a Splats,
-    view: &'a ViewParams,
-    options: &'a RenderOptions,
-    first: usize,
-    footprints: &'a mut [Footprint2d],
-    depth_keys: &'a mut [u32],
-}
-
-impl Kernel for ProjectChunk<'_> {
-    type Output = ();
-
-    #[inline(always)]
-    fn run<S: Simd>(self, simd: S)
-    where
-        S::F: Lanes<Scalar = f32>,
-    {
-        let view = self.view.lanes(simd);
-        let degree = self.options.sh_degree.min(self.splats.sh_degree());
-        let n = self.splats.len();
-        for at in (0..self.footprints.len()).step_by(S::LANES) {
-            let first = self.first + at;
-            let geometry = load_geometry(simd, self.splats, first);
-            let (footprint, visible) = project(&view, &geometry, self.options.antialias);
-            let inside = (1u32 << S::LANES.min(n.saturating_sub(first))) - 1;
-            let visible = visible.bits() & inside;
-            let keys = &mut self.depth_keys[at..at + S::LANES];
-            keys.fill(u32::MAX);
-            if visible == 0 {
-                continue;
-            }
-            let color = sh_color(self.splats, degree, first, geometry.mean, view.center);
-            let mut columns = [[0.0f32; 16]; 12];
-            let Footprint {
-                xy,
-                depth,
-                conic,
-                opacity,
-                extent,
-            } = footprint;
-            let half = simd.splat(-0.5 * LOG2_E);
-            let log2_opacity = opacity.map(f32::log2);
-            let values = [
-                xy[0],
-                xy[1],
-                conic[0] * half,
-                conic[1] * (half + half),
-                conic[2] * half,
-                log2_opacity,
-                color[0],
-                color[1],
-                color[2],
-                depth,
-                extent[0],
-                extent[1],
-            ];
-            for (to, value) in columns.iter_mut().zip(values) {
-                value.store(to);
-            }
-            for lane in (0..S::LANES).filter(|lane| visible >> lane & 1 == 1) {
-                let v = columns.map(|c| c[lane]);
-                if v.iter().any(|v| !v.is_finite()) {
-                    continue; // A poisoned splat is not drawn; the file reader and the optimiser are where it is told.
-                }
-                keys[lane] = v[9].to_bits();
-                self.footprints[at + lane] = Footprint2d {
-                    xy: [v[0], v[1]],
-                    quadratic: [v[2], v[3], v[4]],
-                    log2_opacity: v[5],
-                    color: [v[6], v[7], v[8]],
-                    depth: v[9],
-                    extent: [v[10], v[11]],
-                };
-            }
-        }
-    }
-}
-
-#[inline(always)]
-fn sh_color<F: Lanes<Scalar = f32>>(splats: &Splats, degree: u32, at: usize, mean: [F; 3], center: [F; 3]) -> [F; 3] {
-    let (d, _) = direction(mean, center);
-    let b = basis(degree, d);
-    let simd = mean[0].simd();
-    let mut color = [simd.splat(0.5); 3];
-    for k in 0..irradia_scene::sh::coefficients(degree) {
-        for (c, color) in color.iter_mut().enumerate() {
-            *color = b[k].mul_add(simd.load(&splats.sh.plane(3 * k + c)[at..]), *color);
-        }
-    }
-    color.map(|c| c.max(simd.splat(0.0)))
-}
-
-/// The columns of [`SplatGradients`] for one chunk of splats.
-struct GradientChunk<'a> {
-    active: &'a mut [f32],
-    screen: Vec<&'a mut [f32]>,
-    columns: [Vec<&'a mut [f32]>; 5],
-    non_finite: usize,
-}
-
-struct ProjectChunkVjp<'a, 'b> {
-    renderer: &'a Renderer,
-    splats: &'a Splats,
-    view: &'a ViewParams,
-    degree: u32,
-    first: usize,
-    chunk: &'a mut GradientChunk<'b>,
-}
-
-impl Kernel for ProjectChunkVjp<'_, '_> {
-    type Output = ();
-
-    #[inline(always)]
-    fn run<S: Simd>(self, simd: S)
-    where
-        S::F: Lanes<Scalar = f32>,
-    {
-        let view = self.view.lanes(simd);
-        let chunk = self.chunk;
-        let renderer = self.renderer;
-        let antialias = renderer.options.antialias;
-        for at in (0..chunk.active.len()).step_by(S::LANES) {
-            let first = self.first + at;
-            // Sum each visible splat's slots, in their order; [sum, lane]. What invisible lanes hold is masked below.
-            let mut sums = [[0.0f32; 16]; SUMS];
-            let mut image = [[1.0f32; 16]; 7];
-            let mut visible = [0.0f32; 16];
-            for lane in 0..S::LANES {
-                if renderer.depth_keys[first + lane] == u32::MAX {
-                    continue;
-                }
-                visible[lane] = 1.0;
-                let mut total = [0.0f32; SUMS];
-                for slot in renderer.bins.slots(first + lane) {
-                    let from = &renderer.sums[slot * SUMS..][..SUMS];
-                    for (total, from) in total.iter_mut().zip(from) {
-                        *total += f32::from_bits(from.load(Relaxed));
-                    }
-                }
-                for (to, total) in sums.iter_mut().zip(total) {
-                    to[lane] = total;
-                }
-                let s = &renderer.footprints[first + lane];
-                let [a, b, c] = s.quadratic;
-                for (to, value) in image
-                    .iter_mut()
-                    .zip([a, b, c, s.log2_opacity, s.color[0], s.color[1], s.color[2]])
-                {
-                    to[lane] = value;
-                }
-            }
-            let zero = simd.splat(0.0);
-            let visible = simd.load(&visible);
-            let shown = zero.lt(visible);
-            if shown.none() {
-                visible.store(&mut chunk.active[at..]);
-                continue;
-            }
-            let [s0, sx, sy, sxx, sxy, syy, red, green, blue, v_depth] = sums.map(|s| simd.load(&s));
-            let [a, b, c, log2_opacity, shown_red, shown_green, shown_blue] = image.map(|s| simd.load(&s));
-
-            // p = a dx^2 + b dx dy + c dy^2 + log2 opacity, dx = pixel - centre.
-            let two = simd.splat(2.0);
-            let v_xy = [-(two * a * sx + b * sy), -(b * sx + two * c * sy)];
-            let half = simd.splat(-0.5 * LOG2_E);
-            let v_footprint = FootprintGradient {
-                xy: v_xy,
-                depth: v_depth,
-                conic: [half * sxx, (half + half) * sxy, half * syy],
-                opacity: s0 * simd.splat(LOG2_E) * (-log2_opacity).exp2(),
-            };
-            let geometry = load_geometry(simd, self.splats, first);
-            let mut v = project_vjp(&view, &geometry, antialias, &v_footprint);
-
-            // Colour was clamped at 0 where it is not above.
-            let v_color: [S::F; 3] = [(red, shown_red), (green, shown_green), (blue, shown_blue)]
-                .map(|(v, shown)| v.zero_where_not(zero.lt(shown)));
-            let (d, inv_distance) = direction(geometry.mean, view.center);
-            let basis = basis(self.degree, d);
-            if self.degree > 0 {
-                let mut v_basis = [zero; sh::MAX_COEFFICIENTS];
-                for k in 1..irradia_scene::sh::coefficients(self.degree) {
-                    for c in 0..3 {
-                        let coefficient = simd.load(&self.splats.sh.plane(3 * k + c)[first..]);
-                        v_basis[k] = coefficient.mul_add(v_color[c], v_basis[k]);
-                    }
-                }
-                let v_d = direction_vjp(d, inv_distance, basis_vjp(self.degree, d, &v_basis));
-                for i in 0..3 {
-                    v.mean[i] += v_d[i];
-                }
-            }
-
-            // A sum of magnitudes is finite exactly where all of them are.
-            let mut magnitude = v.opacity_logit.abs() + v_color[0].abs() + v_color[1].abs() + v_color[2].abs();
-            for value in v.mean.into_iter().chain(v.quat).chain(v.log_scale) {
-                magnitude += value.abs();
-            }
-            let finite = magnitude.lt(simd.splat(f64::from(f32::MAX)));
-            let active = shown.and(finite);
-            chunk.non_finite += shown.and_not(finite).bits().count_ones() as usize;
-            visible.zero_where_not(active).store(&mut chunk.active[at..]);
-            for (value, to) in v_xy.iter().zip(&mut chunk.screen) {
-                value.store(&mut to[at..]);
-            }
-            let [means, quats, log_scales, opacity_logits, sh] = &mut chunk.columns;
-            for (value, to) in v.mean.iter().zip(means) {
-                value.store(&mut to[at..]);
-            }
-            for (value, to) in v.quat.iter().zip(quats) {
-                value.store(&mut to[at..]);
-            }
-            for (value, to) in v.log_scale.iter().zip(log_scales) {
-                value.store(&mut to[at..]);
-            }
-            v.opacity_logit.store(&mut opacity_logits[0][at..]);
-            for k in 0..irradia_scene::sh::coefficients(self.degree) {
-                for c in 0..3 {
-                    (basis[k] * v_color[c]).store(&mut sh[3 * k + c][at..]);
-                }
-            }
-        }
-    }
 }

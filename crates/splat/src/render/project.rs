@@ -6,7 +6,8 @@
 //! `conic = cov^-1 = [A B; B C]`. All functions are generic over lanes: `f32` vectors train, `f64` is tested.
 
 use super::view::ViewLanes;
-use irradia_compute::simd::{Lanes, Mask};
+use irradia_compute::each;
+use irradia_compute::simd::{Lanes, Mask, Scalar};
 
 /// Pixels squared added to the diagonal of the 2D covariance (Inria code, "low-pass filter").
 pub const DILATION: f64 = 0.3;
@@ -85,12 +86,12 @@ pub(super) fn exp<F: Lanes>(x: F) -> F {
 fn intermediate<F: Lanes>(view: &ViewLanes<F>, g: &Geometry<F>) -> Intermediate<F> {
     let one = view.near.splat(1.0);
     let two = view.near.splat(2.0);
-    let x: [F; 3] = std::array::from_fn(|i| dot(view.r[i], g.mean) + view.t[i]);
+    let x = each!(i in 3 => dot(view.r[i], g.mean) + view.t[i]);
     let inv_z = one / x[2];
-    let tangent = std::array::from_fn(|i| (x[i] * inv_z).min(view.limit[i]).max(-view.limit[i]));
+    let tangent = each!(i in 2 => (x[i] * inv_z).min(view.limit[i]).max(-view.limit[i]));
     let inv_q_norm =
         one / (g.quat[0] * g.quat[0] + g.quat[1] * g.quat[1] + g.quat[2] * g.quat[2] + g.quat[3] * g.quat[3]).sqrt();
-    let q = g.quat.map(|v| v * inv_q_norm);
+    let q = each!(n in 4 => g.quat[n] * inv_q_norm);
     let [w, i, j, k] = q;
     let rot = [
         [
@@ -109,15 +110,12 @@ fn intermediate<F: Lanes>(view: &ViewLanes<F>, g: &Geometry<F>) -> Intermediate<
             one - two * (i * i + j * j),
         ],
     ];
-    let scale = g.log_scale.map(exp);
+    let scale = each!(k in 3 => exp(g.log_scale[k]));
     // J = [[fx/z, 0, -fx tx/z], [0, fy/z, -fy ty/z]] with the clamped tangents tx, ty.
-    let jr: [[F; 3]; 2] = std::array::from_fn(|r| {
-        let j_scale = view.f[r] * inv_z;
-        std::array::from_fn(|c| j_scale * (view.r[r][c] - tangent[r] * view.r[2][c]))
-    });
-    let u: [[F; 3]; 2] =
-        std::array::from_fn(|r| std::array::from_fn(|c| dot(jr[r], [rot[0][c], rot[1][c], rot[2][c]])));
-    let v: [[F; 3]; 2] = std::array::from_fn(|r| std::array::from_fn(|c| u[r][c] * scale[c]));
+    let j_scale = each!(r in 2 => view.f[r] * inv_z);
+    let jr = each!(r in 2 => each!(c in 3 => j_scale[r] * (view.r[r][c] - tangent[r] * view.r[2][c])));
+    let u: [[F; 3]; 2] = each!(r in 2 => each!(c in 3 => dot(jr[r], [rot[0][c], rot[1][c], rot[2][c]])));
+    let v: [[F; 3]; 2] = each!(r in 2 => each!(c in 3 => u[r][c] * scale[c]));
     let cov = [dot(v[0], v[0]), dot(v[0], v[1]), dot(v[1], v[1])];
     // |V0 x V1|^2 (Lagrange) instead of a c - b^2: the difference of two large products loses needles to rounding.
     let cross = [
@@ -158,12 +156,9 @@ pub(super) fn project<F: Lanes>(view: &ViewLanes<F>, g: &Geometry<F>, antialias:
     } else {
         at.sigmoid
     };
-    let xy: [F; 2] = std::array::from_fn(|i| view.f[i] * at.x[i] * at.inv_z + view.c[i]);
+    let xy: [F; 2] = each!(i in 2 => view.f[i] * at.x[i] * at.inv_z + view.c[i]);
     // alpha >= 1/255 inside d^T conic d <= 2 ln(255 opacity), whose box has half sizes sqrt(2 ln(255 opacity) cov_ii).
-    let reach = (opacity * opacity.splat(1.0 / ALPHA_MIN)).map(|v| {
-        use irradia_compute::simd::Scalar;
-        Scalar::from_f64(2.0 * v.to_f64().max(1.0).ln())
-    });
+    let reach = (opacity * opacity.splat(1.0 / ALPHA_MIN)).map(|v| Scalar::from_f64(2.0 * v.to_f64().max(1.0).ln()));
     let extent = [(reach * a).sqrt(), (reach * c).sqrt()];
     let zero = reach.splat(0.0);
     let half = reach.splat(0.5);
@@ -237,14 +232,13 @@ pub(super) fn project_vjp<F: Lanes>(
 
     // cov = V V^T, V = U diag(s), U = (J R) Rot.
     let v_v: [[F; 3]; 2] = [
-        std::array::from_fn(|k| two * v_cov[0] * at.v[0][k] + v_cov[1] * at.v[1][k]),
-        std::array::from_fn(|k| two * v_cov[2] * at.v[1][k] + v_cov[1] * at.v[0][k]),
+        each!(k in 3 => two * v_cov[0] * at.v[0][k] + v_cov[1] * at.v[1][k]),
+        each!(k in 3 => two * v_cov[2] * at.v[1][k] + v_cov[1] * at.v[0][k]),
     ];
-    let v_log_scale = std::array::from_fn(|k| v_v[0][k] * at.v[0][k] + v_v[1][k] * at.v[1][k]);
-    let v_u: [[F; 3]; 2] = std::array::from_fn(|r| std::array::from_fn(|k| v_v[r][k] * at.scale[k]));
-    let v_rot: [[F; 3]; 3] =
-        std::array::from_fn(|j| std::array::from_fn(|k| at.jr[0][j] * v_u[0][k] + at.jr[1][j] * v_u[1][k]));
-    let v_jr: [[F; 3]; 2] = std::array::from_fn(|r| std::array::from_fn(|j| dot(v_u[r], at.rot[j])));
+    let v_log_scale = each!(k in 3 => v_v[0][k] * at.v[0][k] + v_v[1][k] * at.v[1][k]);
+    let v_u: [[F; 3]; 2] = each!(r in 2 => each!(k in 3 => v_v[r][k] * at.scale[k]));
+    let v_rot: [[F; 3]; 3] = each!(j in 3 => each!(k in 3 => at.jr[0][j] * v_u[0][k] + at.jr[1][j] * v_u[1][k]));
+    let v_jr: [[F; 3]; 2] = each!(r in 2 => each!(j in 3 => dot(v_u[r], at.rot[j])));
 
     // J R: row r is f_r / z (R_r - tangent_r R_2).
     let mut v_x = [zero; 3];
@@ -261,7 +255,7 @@ pub(super) fn project_vjp<F: Lanes>(
         v_x[2] -= v_free * tangent * at.inv_z;
     }
     v_x[2] += v_out.depth;
-    let v_mean = std::array::from_fn(|j| dot(v_x, [view.r[0][j], view.r[1][j], view.r[2][j]]));
+    let v_mean = each!(j in 3 => dot(v_x, [view.r[0][j], view.r[1][j], view.r[2][j]]));
 
     // Rot(q), then the normalisation of q.
     let [w, i, j, k] = at.q;
@@ -276,7 +270,7 @@ pub(super) fn project_vjp<F: Lanes>(
             - two * k * (m[0][0] + m[1][1])),
     ];
     let along = v_q[0] * w + v_q[1] * i + v_q[2] * j + v_q[3] * k;
-    let v_quat = std::array::from_fn(|n| (v_q[n] - at.q[n] * along) * at.inv_q_norm);
+    let v_quat = each!(n in 4 => (v_q[n] - at.q[n] * along) * at.inv_q_norm);
 
     Geometry {
         mean: v_mean,

@@ -1,3 +1,4 @@
+use irradia_compute::each;
 use irradia_compute::simd::Simd;
 use irradia_scene::Camera;
 
@@ -50,14 +51,15 @@ impl ViewParams {
 
     #[inline(always)]
     pub(super) fn lanes<S: Simd>(&self, simd: S) -> ViewLanes<S::F> {
+        let (limit, center) = (self.tangent_limit(), self.center());
         ViewLanes {
-            r: self.rotation.map(|row| row.map(|v| simd.splat(v))),
-            t: self.translation.map(|v| simd.splat(v)),
-            f: self.focal.map(|v| simd.splat(v)),
-            c: self.principal.map(|v| simd.splat(v)),
-            limit: self.tangent_limit().map(|v| simd.splat(v)),
-            size: [self.width, self.height].map(|v| simd.splat(f64::from(v))),
-            center: self.center().map(|v| simd.splat(v)),
+            r: each!(i in 3 => each!(j in 3 => simd.splat(self.rotation[i][j]))),
+            t: each!(i in 3 => simd.splat(self.translation[i])),
+            f: each!(i in 2 => simd.splat(self.focal[i])),
+            c: each!(i in 2 => simd.splat(self.principal[i])),
+            limit: each!(i in 2 => simd.splat(limit[i])),
+            size: [simd.splat(f64::from(self.width)), simd.splat(f64::from(self.height))],
+            center: each!(i in 3 => simd.splat(center[i])),
             near: simd.splat(self.near),
         }
     }

@@ -38,7 +38,10 @@ fn main() -> Result<()> {
 
     // The parts, over a few views, with what was trained.
     let mut renderer = Renderer::new();
-    let options = RenderOptions { sh_degree: 0, ..RenderOptions::default() };
+    let options = RenderOptions {
+        sh_degree: 0,
+        ..RenderOptions::default()
+    };
     let mut gradients = SplatGradients::default();
     let (mut forward, mut backward, mut pairs, mut entries) = (0.0, 0.0, 0, 0);
     let views = &dataset.train[..10.min(dataset.train.len())];
@@ -49,7 +52,15 @@ fn main() -> Result<()> {
             let start = ProcessTime::now();
             renderer.render(&trainer.state.splats, &view, &options);
             let middle = ProcessTime::now();
-            renderer.backward(&trainer.state.splats, &OutputGradient { color: &v_color, alpha: None, depth: None }, &mut gradients);
+            renderer.backward(
+                &trainer.state.splats,
+                &OutputGradient {
+                    color: &v_color,
+                    alpha: None,
+                    depth: None,
+                },
+                &mut gradients,
+            );
             if repeat > 0 {
                 forward += middle.duration_since(start).as_secs_f64();
                 backward += middle.elapsed().as_secs_f64();

@@ -1,2 +1,65 @@
-//! Placeholder entry.
-fn main() {}
+//! `irradia`: photographs in, a scene you can look at from anywhere out.
+#![forbid(unsafe_code)]
+
+mod command;
+mod run_folder;
+mod synth;
+
+use clap::{Parser, Subcommand};
+use std::process::ExitCode;
+
+#[derive(Parser)]
+#[command(version, about, max_term_width = 120)]
+struct Cli {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Subcommand)]
+enum Command {
+    /// Make a scene by ray tracing, train on it, measure and show it: no data needed
+    Demo(command::demo::Args),
+    /// Train a scene from posed photographs
+    Train(command::train::Args),
+    /// Measure a scene against photographs: PSNR, SSIM, LPIPS
+    Eval(command::eval::Args),
+    /// Render a scene into PNG frames
+    Render(command::render::Args),
+    /// Say what a file or dataset holds
+    Info(command::files::InfoArgs),
+    /// Convert a scene from one file format to another, by extension
+    Convert(command::files::ConvertArgs),
+    /// Write the demo scene as a dataset: images, depth, normals, points, cameras
+    Synth(command::demo::SynthArgs),
+}
+
+/// Marks an error as a mistake in the command line: exit code 2.
+#[derive(Debug)]
+pub struct Usage(pub String);
+
+impl std::fmt::Display for Usage {
+    fn fmt(&self, f: &mut std::fmt::Formatter) -> std::fmt::Result {
+        f.write_str(&self.0)
+    }
+}
+
+impl std::error::Error for Usage {}
+
+fn main() -> ExitCode {
+    let result = match Cli::parse().command {
+        Command::Demo(args) => command::demo::run(&args),
+        Command::Train(args) => command::train::run(&args),
+        Command::Eval(args) => command::eval::run(&args),
+        Command::Render(args) => command::render::run(&args),
+        Command::Info(args) => command::files::info(&args),
+        Command::Convert(args) => command::files::convert(&args),
+        Command::Synth(args) => command::demo::synth(&args),
+    };
+    match result {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("error: {error:#}");
+            ExitCode::from(if error.is::<Usage>() { 2 } else { 1 })
+        }
+    }
+}

@@ -1,1 +1,13 @@
-//! See the crate's description in Cargo.toml.
+//! How good a picture is: losses with gradients for training ([`loss`]) and metrics for reports ([`metric`]).
+//!
+//! Symbols: render is the picture under judgement, truth the photograph; H, W are rows and columns; colour is
+//! sRGB-encoded in \[0, 1\]. The two have separate code on purpose: the loss is fast and in single precision, the metric
+//! plain and in double, and each is a check of the other.
+#![forbid(unsafe_code)]
+
+pub mod loss;
+pub mod metric;
+mod window;
+
+pub use loss::{LossValues, LossWeights, PhotometricLoss, Target, Truth};
+pub use metric::{Evaluation, Lpips, LpipsError, evaluate, psnr, psnr_masked, ssim, ssim_masked};

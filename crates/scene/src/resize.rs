@@ -7,7 +7,11 @@
 /// When the length does not match, a size is zero, or the channels are not 1, 3 or 4.
 pub fn resize_area(from: &[u8], channels: u32, size: [u32; 2], to: [u32; 2]) -> Vec<u8> {
     let channels = channels as usize;
-    assert_eq!(from.len(), size[0] as usize * size[1] as usize * channels, "pixels of the given size");
+    assert_eq!(
+        from.len(),
+        size[0] as usize * size[1] as usize * channels,
+        "pixels of the given size"
+    );
     assert!(!size.contains(&0) && !to.contains(&0), "no size is zero");
     let across = spans(size[0], to[0]);
     let down = spans(size[1], to[1]);
@@ -111,12 +115,18 @@ mod tests {
 
     #[test]
     fn means_over_whole_and_partial_pixels() {
-        assert_eq!(resize_area(&[0, 100, 40, 40, 100, 200, 40, 80], 1, [4, 2], [2, 1]), [100, 50]);
+        assert_eq!(
+            resize_area(&[0, 100, 40, 40, 100, 200, 40, 80], 1, [4, 2], [2, 1]),
+            [100, 50]
+        );
         // 3 -> 2: each output covers one pixel and half of the middle one.
         assert_eq!(resize_area(&[90, 30, 0], 1, [3, 1], [2, 1]), [70, 10]);
         let constant = resize_area(&vec![77; 541 * 37], 1, [541, 37], [200, 13]);
         assert!(constant.iter().all(|v| *v == 77));
-        assert_eq!(resize_area(&[10, 20], 1, [2, 1], [4, 2]), [10, 10, 20, 20, 10, 10, 20, 20]);
+        assert_eq!(
+            resize_area(&[10, 20], 1, [2, 1], [4, 2]),
+            [10, 10, 20, 20, 10, 10, 20, 20]
+        );
     }
 
     #[test]

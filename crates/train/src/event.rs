@@ -129,4 +129,12 @@ pub enum Signal {
 pub trait Observer {
     /// Sees `event`; `trainer` is as it stands after it.
     fn on_event(&mut self, event: &Event, trainer: &crate::Trainer) -> Signal;
+
+    /// Writes a checkpoint, if that is this observer's business; its place, relative to the run.
+    ///
+    /// # Errors
+    /// One line; it is told as [`Event::Warned`] and training goes on.
+    fn save(&mut self, _trainer: &crate::Trainer) -> Result<Option<String>, String> {
+        Ok(None)
+    }
 }

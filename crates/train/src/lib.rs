@@ -6,6 +6,7 @@ pub mod eval;
 pub mod event;
 mod photos;
 pub mod recipe;
+pub mod report;
 mod run;
 pub mod schedule;
 mod trainer;

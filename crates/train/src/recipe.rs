@@ -48,6 +48,8 @@ pub struct Recipe {
     pub max_splats: usize,
     /// Held-out views are looked at every so many steps while training.
     pub eval_every: u64,
+    /// A checkpoint is written every so many steps.
+    pub checkpoint_every: u64,
     /// How frames are rendered.
     pub render: RenderKnobs,
     /// The first splats.
@@ -347,8 +349,8 @@ impl Recipe {
         if self.stage.is_empty() {
             return Err("there must be at least one [[stage]]".into());
         }
-        if self.max_splats == 0 || self.eval_every == 0 {
-            return Err("max_splats and eval_every must be at least 1".into());
+        if self.max_splats == 0 || self.eval_every == 0 || self.checkpoint_every == 0 {
+            return Err("max_splats, eval_every and checkpoint_every must be at least 1".into());
         }
         if !(self.init.opacity > 0.0 && self.init.opacity < 1.0 && self.init.scale > 0.0) {
             return Err("init.opacity must lie between 0 and 1 and init.scale above 0".into());

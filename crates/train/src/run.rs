@@ -46,32 +46,37 @@ pub fn run(
     let mut pacer = limits.budget.map(Pacer::new);
     let mut signal = tell(trainer, &mut events, observers);
     let mut reason = None;
-    while reason.is_none() && !trainer.finished() {
-        if signal == Signal::Stop {
-            reason = Some("stopped");
-            break;
-        }
+    while reason.is_none() && signal != Signal::Stop && !trainer.finished() {
         if let Some(pacer) = &mut pacer {
             pacer.adjust(trainer);
         }
-        let looks = plan(&trainer.recipe, &trainer.clock).evaluate;
+        let due = plan(&trainer.recipe, &trainer.clock);
         let report = trainer.step(&mut events)?;
         events.insert(0, Event::Step(report));
-        if looks && !trainer.dataset.test.is_empty() {
+        if due.evaluate && !trainer.dataset.test.is_empty() {
+            let (step, seconds, splats) = (trainer.clock.step, trainer.seconds, trainer.state.len());
             let psnr = held_out_psnr(trainer)?;
             events.push(Event::Evaluated {
-                step: trainer.clock.step,
-                seconds: trainer.seconds,
+                step,
+                seconds,
                 psnr,
-                splats: trainer.state.len(),
+                splats,
             });
             if limits.until_psnr.is_some_and(|limit| psnr >= limit) {
                 reason = Some("held-out PSNR reached");
             }
         }
         signal = tell(trainer, &mut events, observers);
+        if due.checkpoint || signal >= Signal::Save {
+            save(trainer, &mut events, observers);
+        }
     }
-    let reason = reason.unwrap_or("recipe complete").to_owned();
+    let stopped = if signal == Signal::Stop {
+        "stopped"
+    } else {
+        "recipe complete"
+    };
+    let reason = reason.unwrap_or(stopped).to_owned();
     events.push(Event::Finished {
         step: trainer.clock.step,
         seconds: trainer.seconds,
@@ -79,6 +84,19 @@ pub fn run(
     });
     tell(trainer, &mut events, observers);
     Ok(reason)
+}
+
+fn save(trainer: &Trainer, events: &mut Vec<Event>, observers: &mut [&mut dyn Observer]) {
+    for observer in observers.iter_mut() {
+        match observer.save(trainer) {
+            Ok(Some(path)) => events.push(Event::Saved {
+                step: trainer.clock.step,
+                path,
+            }),
+            Ok(None) => {}
+            Err(message) => events.push(Event::Warned { message }),
+        }
+    }
 }
 
 fn tell(trainer: &Trainer, events: &mut Vec<Event>, observers: &mut [&mut dyn Observer]) -> Signal {

@@ -1,6 +1,7 @@
 //! Everything that depends on time. [`plan`] is pure: what one step does. [`Clock::tick`] moves on by one step.
 
 use crate::recipe::{Density, Knob, Param, Recipe, Shape};
+use irradia_scene::Rng;
 use irradia_splat::Rates;
 
 /// Where a run stands.
@@ -43,6 +44,8 @@ pub struct StepPlan {
     pub reset_opacity: Option<f32>,
     /// Held-out views are evaluated, after the step.
     pub evaluate: bool,
+    /// A checkpoint is written, after the step.
+    pub checkpoint: bool,
 }
 
 impl Clock {
@@ -161,8 +164,34 @@ pub fn plan(recipe: &Recipe, clock: &Clock) -> StepPlan {
         gathers: density.is_some(),
         densify,
         reset_opacity,
-        evaluate: step % recipe.eval_every == 0,
+        evaluate: step.is_multiple_of(recipe.eval_every),
+        checkpoint: step.is_multiple_of(recipe.checkpoint_every),
     }
+}
+
+/// The stream of the run's seed that orders the views.
+const STREAM_VIEWS: u64 = 3;
+
+/// The training views from this step on, each once: shuffled anew in each pass over them. A function of the seed and the
+/// step alone, so that a resumed run sees what the first would have.
+pub fn coming_views(train: &[usize], seed: u64, clock: &Clock) -> Vec<usize> {
+    let n = train.len() as u64;
+    let pass = |number: u64| {
+        let mut order = train.to_vec();
+        Rng::new(seed ^ number.wrapping_mul(0x9e37_79b9_7f4a_7c15), STREAM_VIEWS).shuffle(&mut order);
+        order
+    };
+    let (number, at) = (clock.step / n, (clock.step % n) as usize);
+    let mut coming = pass(number)[at..].to_vec();
+    // What was seen in this pass comes again in the next.
+    let mut seen: Vec<usize> = coming.clone();
+    seen.sort_unstable();
+    coming.extend(
+        pass(number + 1)
+            .into_iter()
+            .filter(|view| seen.binary_search(view).is_err()),
+    );
+    coming
 }
 
 #[cfg(test)]
@@ -175,6 +204,7 @@ mod tests {
             about = ""
             max_splats = 10
             eval_every = 7
+            checkpoint_every = 1000
             render = { background = [0, 0, 0], antialias = false }
             init = { opacity = 0.1, scale = 1.0, random_points = 10 }
             adam = { beta1 = 0.9, beta2 = 0.999, epsilon = 1e-15 }
@@ -264,6 +294,28 @@ mod tests {
             assert!((p.last().unwrap().rates.means / expected - 1.0).abs() < 1e-4);
             assert_eq!(p.last().unwrap().sh_degree, 3);
         }
+    }
+
+    #[test]
+    fn every_pass_shows_each_view_once_in_a_new_order() {
+        let recipe = recipe();
+        let mut clock = Clock::new(&recipe);
+        let train = [3, 5, 8, 9, 11];
+        let mut seen = Vec::new();
+        for step in 0..15 {
+            clock.step = step;
+            let coming = coming_views(&train, 7, &clock);
+            let mut all = coming.clone();
+            all.sort_unstable();
+            assert_eq!(all, train, "what comes names each view once");
+            seen.push(coming[0]);
+        }
+        for pass in seen.chunks(5) {
+            let mut sorted = pass.to_vec();
+            sorted.sort_unstable();
+            assert_eq!(sorted, train);
+        }
+        assert!(seen[..5] != seen[5..10] || seen[5..10] != seen[10..]);
     }
 
     #[test]

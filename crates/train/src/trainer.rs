@@ -3,7 +3,7 @@
 use crate::event::{Event, StepReport};
 use crate::photos::{PhotoCache, Prepared};
 use crate::recipe::{Density, Recipe};
-use crate::schedule::{Clock, StepPlan, plan};
+use crate::schedule::{Clock, StepPlan, coming_views, plan};
 use cpu_time::ProcessTime;
 use irradia_compute::adam::AdamStep;
 use irradia_measure::{LossWeights, PhotometricLoss, Target, Truth};
@@ -55,8 +55,7 @@ impl Default for TrainOptions {
 
 /// Streams of the run's seed; each use of chance has its own.
 const STREAM_INIT: u64 = 1;
-const STREAM_VIEWS: u64 = 2;
-const STREAM_DENSIFY: u64 = 3;
+const STREAM_DENSIFY: u64 = 2;
 
 /// A run in the making.
 pub struct Trainer {
@@ -185,7 +184,7 @@ impl Trainer {
     /// When a photograph cannot be read.
     pub fn step(&mut self, events: &mut Vec<Event>) -> Result<StepReport, TrainError> {
         let plan = plan(&self.recipe, &self.clock);
-        let coming = self.coming_views();
+        let coming = coming_views(&self.dataset.train, self.options.seed, &self.clock);
         let photo = self.photos.get(&coming, plan.image_scale)?;
         let (started, cpu_started) = (Instant::now(), ProcessTime::now());
         let mut camera = self.dataset.views[coming[0]].camera;
@@ -254,28 +253,6 @@ impl Trainer {
             antialias: self.recipe.render.antialias,
             depth: false,
         }
-    }
-
-    /// The views from this step on, as many as there are: shuffled anew in each pass over them. A function of the seed and
-    /// the step alone, so that a resumed run sees what the first would have.
-    fn coming_views(&self) -> Vec<usize> {
-        let n = self.dataset.train.len() as u64;
-        let pass = |number: u64| {
-            let mut order = self.dataset.train.clone();
-            Rng::new(
-                self.options.seed ^ number.wrapping_mul(0x9e37_79b9_7f4a_7c15),
-                STREAM_VIEWS,
-            )
-            .shuffle(&mut order);
-            order
-        };
-        let (number, at) = (self.clock.step / n, (self.clock.step % n) as usize);
-        let mut coming = pass(number)[at..].to_vec();
-        coming.extend(pass(number + 1).into_iter().take(at));
-        // The next pass may name a view twice before all were seen once: each is wanted at its first place only.
-        let mut seen = std::collections::HashSet::new();
-        coming.retain(|view| seen.insert(*view));
-        coming
     }
 
     /// Loss and mean squared error; leaves the gradients in `v_color` and `v_alpha`.

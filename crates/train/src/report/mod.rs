@@ -5,7 +5,7 @@
 
 mod machine;
 
-pub use machine::{Machine, cpu_seconds, machine, peak_rss_bytes};
+pub use machine::{Machine, machine, peak_rss_bytes};
 
 use serde::{Deserialize, Deserializer, Serialize};
 
@@ -129,7 +129,9 @@ pub fn to_html(report: &Report) -> String {
     // Within a script element only `<` can end the data (`</script>`, `<!--`); JSON strings may escape any character.
     let data = data.replace('<', "\\u003c");
     // The data goes in last: nothing in it is looked at for marks.
-    PAGE.replace("/*STYLE*/", STYLE).replace("/*SCRIPT*/", SCRIPT).replace("/*DATA*/", &data)
+    PAGE.replace("/*STYLE*/", STYLE)
+        .replace("/*SCRIPT*/", SCRIPT)
+        .replace("/*DATA*/", &data)
 }
 
 #[cfg(test)]
@@ -149,7 +151,10 @@ mod tests {
         let report = Report {
             dataset: evil.into(),
             warnings: vec![evil.into()],
-            views: vec![ViewReport { name: evil.into(), ..Default::default() }],
+            views: vec![ViewReport {
+                name: evil.into(),
+                ..Default::default()
+            }],
             ..Default::default()
         };
         let html = to_html(&report);
@@ -166,7 +171,10 @@ mod tests {
             psnr: f64::NAN,
             ssim: f64::INFINITY,
             lpips: Some(f64::NAN),
-            curve: vec![CurvePoint { loss: f64::NEG_INFINITY, ..Default::default() }],
+            curve: vec![CurvePoint {
+                loss: f64::NEG_INFINITY,
+                ..Default::default()
+            }],
             ..Default::default()
         };
         let value = embedded(&to_html(&report));
@@ -184,8 +192,19 @@ mod tests {
             psnr: 31.25,
             lpips: Some(0.125),
             peak_rss_bytes: 123_456_789_012,
-            stages: vec![StageReport { name: "grow".into(), first_step: 0, last_step: 499, seconds: 1.5 }],
-            curve: vec![CurvePoint { step: 10, seconds: 0.5, loss: 0.1, psnr: Some(20.0), splats: 5 }],
+            stages: vec![StageReport {
+                name: "grow".into(),
+                first_step: 0,
+                last_step: 499,
+                seconds: 1.5,
+            }],
+            curve: vec![CurvePoint {
+                step: 10,
+                seconds: 0.5,
+                loss: 0.1,
+                psnr: Some(20.0),
+                splats: 5,
+            }],
             ..Default::default()
         };
         let text = serde_json::to_string_pretty(&report).expect("writes");

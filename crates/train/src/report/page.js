@@ -16,8 +16,8 @@
   const duration = (s) => {
     if (!known(s)) return "–";
     if (s < 60) return `${s.toFixed(1)} s`;
-    const minutes = Math.floor(s / 60);
-    return minutes < 60 ? `${minutes} min ${Math.round(s % 60)} s` : `${Math.floor(minutes / 60)} h ${minutes % 60} min`;
+    const [minutes, rest] = [Math.floor(Math.round(s) / 60), Math.round(s) % 60];
+    return minutes < 60 ? `${minutes} min ${rest} s` : `${Math.floor(minutes / 60)} h ${minutes % 60} min`;
   };
   const bytes = (b) => (!b ? "–" : b < 1e9 ? `${Math.round(b / 1e6)} MB` : `${(b / 1e9).toFixed(1)} GB`);
 

@@ -1,0 +1,98 @@
+//! `irradia eval`
+
+use super::{DataArgs, Split, file_stem, lpips, use_threads};
+use crate::Usage;
+use crate::run_folder::render_knobs_beside;
+use anyhow::Result;
+use irradia_formats::{read_splats, write_atomic, write_png};
+use irradia_splat::{RenderOptions, Splats};
+use irradia_train::eval::{Metrics, evaluate_views, mean};
+use serde_json::json;
+use std::path::PathBuf;
+
+#[derive(clap::Args)]
+pub struct Args {
+    /// The scene, such as RUN/scene.ply; background and filters are taken from the run it lies in
+    pub scene: PathBuf,
+    /// The photographs
+    #[arg(long)]
+    pub data: PathBuf,
+    /// Which views
+    #[arg(long, value_enum, default_value_t = Split::Test)]
+    pub split: Split,
+    /// Write the figures here
+    #[arg(long, value_name = "FILE")]
+    pub json: Option<PathBuf>,
+    /// Write the rendered views here
+    #[arg(long, value_name = "DIR")]
+    pub save_images: Option<PathBuf>,
+    /// LPIPS weights (lpips_squeeze.safetensors)
+    #[arg(long, value_name = "FILE")]
+    pub lpips: Option<PathBuf>,
+    /// Threads; all cores when absent
+    #[arg(long)]
+    pub threads: Option<usize>,
+    #[command(flatten)]
+    pub reading: DataArgs,
+}
+
+pub fn run(args: &Args) -> Result<()> {
+    use_threads(args.threads)?;
+    let cloud = read_splats(&args.scene)?;
+    let dataset = args.reading.read(&args.data)?;
+    let indices = args.split.of(&dataset);
+    if indices.is_empty() {
+        return Err(Usage(format!("{} has no such views: try --split all", args.data.display())).into());
+    }
+    let lpips = lpips(args.lpips.as_ref())?;
+    let knobs = render_knobs_beside(&args.scene);
+    let options = RenderOptions {
+        background: knobs.background,
+        antialias: knobs.antialias || cloud.antialiased,
+        ..RenderOptions::default()
+    };
+    let splats = Splats::from_cloud(&cloud);
+    let (mut rows, mut metrics, mut outcome) = (Vec::new(), Vec::new(), Ok(()));
+    evaluate_views(
+        &splats,
+        &dataset,
+        &indices,
+        &options,
+        Metrics::All(lpips.as_ref()),
+        |view| {
+            let m = view.metrics;
+            let tail = m.lpips.map_or(String::new(), |l| format!("  LPIPS {l:.4}"));
+            println!("{:<40} PSNR {:6.2} dB  SSIM {:.4}{tail}", view.name, m.psnr, m.ssim);
+            rows.push(json!({ "name": view.name, "psnr": m.psnr, "ssim": m.ssim, "lpips": m.lpips }));
+            metrics.push(m);
+            if let Some(folder) = &args.save_images {
+                let path = folder.join(format!("{}.png", file_stem(&view.name)));
+                let image = &view.render;
+                let written = std::fs::create_dir_all(folder)
+                    .map_err(anyhow::Error::from)
+                    .and_then(|()| Ok(write_png(&path, image.width, image.height, 3, &image.to_u8())?));
+                if let Err(error) = written {
+                    outcome = Err(error);
+                }
+            }
+        },
+    )?;
+    outcome?;
+    let mean = mean(&metrics);
+    let tail = mean.lpips.map_or(String::new(), |l| format!("  LPIPS {l:.4}"));
+    println!(
+        "{:<40} PSNR {:6.2} dB  SSIM {:.4}{tail}",
+        format!("mean of {}", metrics.len()),
+        mean.psnr,
+        mean.ssim
+    );
+    if let Some(path) = &args.json {
+        let figures = json!({
+            "scene": args.scene, "data": args.data, "splats": splats.len(),
+            "psnr": mean.psnr, "ssim": mean.ssim, "lpips": mean.lpips, "views": rows,
+        });
+        let bytes = serde_json::to_vec_pretty(&figures)?;
+        write_atomic(path, |out| out.write_all(&bytes))?;
+    }
+    Ok(())
+}

@@ -1,0 +1,189 @@
+//! What a run writes while it goes: `events.jsonl`, checkpoints, and the curves for its report.
+
+use crate::run_folder::RunFolder;
+use anyhow::{Context, Result};
+use irradia_train::event::{Event, Observer, Signal};
+use irradia_train::report::{CurvePoint, StageReport};
+use irradia_train::{Trainer, checkpoint};
+use std::fs::{self, File, OpenOptions};
+use std::io::Write;
+
+/// Points that a curve has, about: more would not be seen.
+const CURVE_POINTS: u64 = 1000;
+
+/// Writes as the run goes.
+pub struct Journal {
+    folder: RunFolder,
+    events: File,
+    /// Loss, PSNR and count over the run.
+    pub curve: Vec<CurvePoint>,
+    /// Stages entered.
+    pub stages: Vec<StageReport>,
+    /// Lines that should reach the report.
+    pub warnings: Vec<String>,
+    non_finite: usize,
+    failed: bool,
+}
+
+impl Journal {
+    /// Begins, or goes on behind step `from`: what an interrupted run had written beyond is dropped.
+    pub fn open(folder: &RunFolder, from: u64) -> Result<Self> {
+        let path = folder.file("events.jsonl");
+        let mut journal = Self {
+            folder: folder.clone(),
+            events: OpenOptions::new()
+                .create(true)
+                .append(true)
+                .open(&path)
+                .with_context(|| format!("cannot write {}", path.display()))?,
+            curve: Vec::new(),
+            stages: Vec::new(),
+            warnings: Vec::new(),
+            non_finite: 0,
+            failed: false,
+        };
+        let text = fs::read_to_string(&path).unwrap_or_default();
+        let mut kept = String::new();
+        for line in text.lines() {
+            // A line cut by a power failure is no JSON: it and what follows is dropped.
+            let Ok(value) = serde_json::from_str::<serde_json::Value>(line) else {
+                break;
+            };
+            if value["step"].as_u64().is_some_and(|step| step > from) {
+                continue;
+            }
+            journal.recall(&value);
+            kept.push_str(line);
+            kept.push('\n');
+        }
+        if kept.len() < text.len() {
+            folder.write("events.jsonl", kept.as_bytes())?;
+            journal.events = OpenOptions::new()
+                .append(true)
+                .open(&path)
+                .with_context(|| format!("cannot write {}", path.display()))?;
+        }
+        Ok(journal)
+    }
+
+    /// Takes an earlier event into the curves.
+    fn recall(&mut self, event: &serde_json::Value) {
+        let step = event["step"].as_u64().unwrap_or(0);
+        let seconds = event["seconds"].as_f64().unwrap_or(f64::NAN);
+        match event["event"].as_str() {
+            Some("step") => self.curve.push(CurvePoint {
+                step,
+                seconds,
+                loss: event["loss"].as_f64().unwrap_or(f64::NAN),
+                psnr: None,
+                splats: event["splats"].as_u64().unwrap_or(0),
+            }),
+            Some("evaluated") => self.evaluated(
+                step,
+                seconds,
+                event["psnr"].as_f64(),
+                event["splats"].as_u64().unwrap_or(0),
+            ),
+            Some("stage_entered") => self.stage(event["stage"].as_str().unwrap_or("").to_owned(), step, seconds),
+            _ => {}
+        }
+    }
+
+    fn evaluated(&mut self, step: u64, seconds: f64, psnr: Option<f64>, splats: u64) {
+        match self.curve.last_mut() {
+            Some(point) if point.step == step => point.psnr = psnr,
+            _ => self.curve.push(CurvePoint {
+                step,
+                seconds,
+                loss: f64::NAN,
+                psnr,
+                splats,
+            }),
+        }
+    }
+
+    fn stage(&mut self, name: String, step: u64, seconds: f64) {
+        self.end_stage(step, seconds);
+        self.stages.push(StageReport {
+            name,
+            first_step: step + 1,
+            last_step: step + 1,
+            seconds,
+        });
+    }
+
+    /// A stage's `seconds` holds its start until it ends.
+    fn end_stage(&mut self, step: u64, seconds: f64) {
+        if let Some(last) = self.stages.last_mut() {
+            last.last_step = step;
+            last.seconds = seconds - last.seconds;
+        }
+    }
+
+    fn write(&mut self, event: &Event) {
+        let line = serde_json::to_string(event).expect("an event is plain data") + "\n";
+        if let Err(error) = self.events.write_all(line.as_bytes())
+            && !self.failed
+        {
+            // A full disk must not end the training; one word about it is enough.
+            self.failed = true;
+            let message = format!(
+                "cannot write {}: {error}; training goes on",
+                self.folder.file("events.jsonl").display()
+            );
+            eprintln!("warning: {message}");
+            self.warnings.push(message);
+        }
+    }
+
+    /// The last words about what was counted.
+    pub fn finish(&mut self) {
+        if self.non_finite > 0 {
+            self.warnings.push(format!(
+                "{} times a splat rested for a step because its gradient was not finite",
+                self.non_finite
+            ));
+        }
+    }
+}
+
+impl Observer for Journal {
+    fn on_event(&mut self, event: &Event, trainer: &Trainer) -> Signal {
+        match event {
+            Event::Step(report) => {
+                self.non_finite += report.non_finite;
+                let apart = (trainer.total_steps() / CURVE_POINTS).max(1);
+                if self.curve.last().is_some_and(|last| report.step < last.step + apart) {
+                    return Signal::Continue;
+                }
+                self.curve.push(CurvePoint {
+                    step: report.step,
+                    seconds: report.seconds,
+                    loss: report.loss,
+                    psnr: None,
+                    splats: report.splats as u64,
+                });
+            }
+            Event::Evaluated {
+                step,
+                seconds,
+                psnr,
+                splats,
+            } => self.evaluated(*step, *seconds, Some(*psnr), *splats as u64),
+            Event::StageEntered { stage, step, seconds } => self.stage(stage.clone(), *step, *seconds),
+            Event::Finished { step, seconds, .. } => self.end_stage(*step, *seconds),
+            Event::Warned { message } => self.warnings.push(message.clone()),
+            Event::Started { .. } | Event::Densified { .. } | Event::Saved { .. } => {}
+        }
+        self.write(event);
+        Signal::Continue
+    }
+
+    fn save(&mut self, trainer: &Trainer) -> Result<Option<String>, String> {
+        let bytes = checkpoint::to_bytes(trainer);
+        self.folder
+            .write_checkpoint(trainer.clock.step, &bytes)
+            .map(Some)
+            .map_err(|e| format!("no checkpoint: {e:#}"))
+    }
+}

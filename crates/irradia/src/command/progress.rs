@@ -1,0 +1,119 @@
+//! What a run shows on the terminal: a bar, or plain lines where there is no terminal.
+
+use indicatif::{ProgressBar, ProgressStyle};
+use irradia_train::Trainer;
+use irradia_train::event::{Event, Observer, Signal, StepReport};
+use std::io::IsTerminal;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+/// Shows progress and hands Ctrl-C on.
+pub struct Progress {
+    bar: Option<ProgressBar>,
+    stop: Arc<AtomicBool>,
+    /// Moving mean of the training views' squared error.
+    mse: Option<f64>,
+    held_out: Option<f64>,
+    /// When the last plain line was printed and the steps made then.
+    last_line: (Instant, u64),
+    started: Instant,
+    first_step: u64,
+    stage: String,
+}
+
+/// Time between plain lines.
+const LINE_EVERY: Duration = Duration::from_secs(5);
+
+impl Progress {
+    /// `stop` ends the run at the next step when it is set.
+    pub fn new(stop: Arc<AtomicBool>) -> Self {
+        Self {
+            bar: std::io::stderr().is_terminal().then(|| {
+                let style = "{bar:30} {pos}/{len} {msg} eta {eta}";
+                ProgressBar::new(0).with_style(ProgressStyle::with_template(style).expect("a valid template"))
+            }),
+            stop,
+            mse: None,
+            held_out: None,
+            last_line: (Instant::now(), 0),
+            started: Instant::now(),
+            first_step: 0,
+            stage: String::new(),
+        }
+    }
+
+    fn say(&self, line: &str) {
+        match &self.bar {
+            Some(bar) => bar.suspend(|| eprintln!("{line}")),
+            None => eprintln!("{line}"),
+        }
+    }
+
+    fn step(&mut self, report: &StepReport, trainer: &Trainer) {
+        let mse = self.mse.map_or(report.mse, |mean| 0.95 * mean + 0.05 * report.mse);
+        self.mse = Some(mse);
+        let rate = (report.step - self.first_step) as f64 / self.started.elapsed().as_secs_f64().max(1e-9);
+        let held_out = self.held_out.map_or(String::new(), |p| format!(" held-out {p:.2} dB"));
+        let message = format!(
+            "{} loss {:.4} psnr {:.2} dB{held_out} {} splats {rate:.1} steps/s",
+            self.stage,
+            report.loss,
+            -10.0 * mse.log10(),
+            report.splats
+        );
+        match &self.bar {
+            Some(bar) => {
+                bar.set_length(trainer.total_steps());
+                bar.set_position(report.step);
+                bar.set_message(message);
+            }
+            None if self.last_line.0.elapsed() >= LINE_EVERY => {
+                let left = (trainer.total_steps() - report.step) as f64 / rate;
+                eprintln!(
+                    "step {}/{} {message} eta {left:.0} s",
+                    report.step,
+                    trainer.total_steps()
+                );
+                self.last_line = (Instant::now(), report.step);
+            }
+            None => {}
+        }
+    }
+}
+
+impl Observer for Progress {
+    fn on_event(&mut self, event: &Event, trainer: &Trainer) -> Signal {
+        match event {
+            Event::Started {
+                recipe,
+                step,
+                total_steps,
+                splats,
+                views,
+            } => {
+                self.first_step = *step;
+                self.stage = trainer.stage_name().to_owned();
+                self.say(&format!(
+                    "{recipe}: {splats} splats, {views} views, {total_steps} steps"
+                ));
+            }
+            Event::StageEntered { stage, .. } => self.stage.clone_from(stage),
+            Event::Step(report) => self.step(report, trainer),
+            Event::Evaluated { psnr, .. } => self.held_out = Some(*psnr),
+            Event::Warned { message } => self.say(&format!("warning: {message}")),
+            Event::Finished { step, seconds, reason } => {
+                if let Some(bar) = self.bar.take() {
+                    bar.finish_and_clear();
+                }
+                self.say(&format!("{reason} after {step} steps, {seconds:.1} s of training"));
+            }
+            Event::Densified { .. } | Event::Saved { .. } => {}
+        }
+        if self.stop.load(Ordering::Relaxed) {
+            Signal::Stop
+        } else {
+            Signal::Continue
+        }
+    }
+}

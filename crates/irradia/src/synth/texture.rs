@@ -1,0 +1,192 @@
+//! Procedural colour, linear RGB. Detail is kept to a few pixels of the default views: what is finer than a pixel would
+//! be noise that no scene can hold.
+
+use glam::{Vec2, Vec3};
+use std::f32::consts::{FRAC_PI_4, TAU};
+
+/// What colours a surface.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Texture {
+    /// One colour.
+    Plain(Vec3),
+    /// Squares of a given size along the object's own axes.
+    Checker {
+        /// The two colours.
+        colors: [Vec3; 2],
+        /// Edge of a square, world units.
+        size: f32,
+    },
+    /// Bands along the object's upright.
+    Stripes {
+        /// The two colours.
+        colors: [Vec3; 2],
+        /// Height of a band, world units.
+        size: f32,
+    },
+    /// The table's top: a compass rose in stone, a ring of inlay, staves of wood.
+    TableTop {
+        /// Radius of the top, world units.
+        radius: f32,
+    },
+    /// Wood with its grain along the object's upright.
+    Wood(Vec3),
+    /// Flagstones about the table, then meadow.
+    Meadow,
+    /// Sky, clouds and hills on the backdrop; gives off its own light.
+    Sky,
+}
+
+impl Texture {
+    /// Albedo (for [`Texture::Sky`] radiance) at a point of the object's own frame.
+    pub fn color(&self, local: Vec3) -> Vec3 {
+        match *self {
+            Texture::Plain(color) => color,
+            Texture::Checker { colors, size } => {
+                // A quarter of a square off: no edge of the pattern may coincide with a face, where rounding would choose.
+                let cell = (local / size + 0.25).floor();
+                colors[((cell.x + cell.y + cell.z) as i32).rem_euclid(2) as usize]
+            }
+            Texture::Stripes { colors, size } => {
+                colors[((local.z / size + 0.25).floor() as i32).rem_euclid(2) as usize]
+            }
+            Texture::TableTop { radius } => table_top(local.truncate(), radius),
+            Texture::Wood(color) => {
+                let grain = fbm(Vec2::new(local.x + 1.7 * local.y, 0.25 * local.z) * 14.0, 2);
+                color * (0.75 + 0.5 * grain)
+            }
+            Texture::Meadow => meadow(local.truncate()),
+            Texture::Sky => super::sky::radiance(local.normalize()),
+        }
+    }
+}
+
+const STONE: Vec3 = Vec3::new(0.66, 0.60, 0.50);
+const INK: Vec3 = Vec3::new(0.055, 0.09, 0.14);
+const RUST: Vec3 = Vec3::new(0.45, 0.12, 0.05);
+const BRASS: Vec3 = Vec3::new(0.62, 0.42, 0.14);
+const WALNUT: Vec3 = Vec3::new(0.23, 0.105, 0.05);
+
+fn table_top(p: Vec2, radius: f32) -> Vec3 {
+    let r = p.length() / radius;
+    let angle = p.y.atan2(p.x);
+    let veins = || fbm(p * 2.6 + fbm(p * 1.5, 2) * 2.0, 3);
+    if r < 0.52 {
+        let veins = veins();
+        let stone = STONE * (0.72 + 0.55 * veins);
+        // Long points first, then the short ones behind them, each half light and half dark as on a map.
+        for (turn, tip, colors) in [(0.0, 0.49, [INK, BRASS]), (FRAC_PI_4, 0.35, [RUST, STONE * 1.15])] {
+            let folded = (angle - turn + FRAC_PI_4).rem_euclid(2.0 * FRAC_PI_4) - FRAC_PI_4;
+            let (x, y) = (r * folded.cos(), r * folded.sin());
+            // The point is the triangle from (tip, 0) to its foot at 45 degrees on the inner circle.
+            let foot = 0.15 * FRAC_PI_4.cos();
+            if y.abs() * (tip - foot) < foot * (tip - x) {
+                return colors[usize::from(y > 0.0)] * (0.85 + 0.3 * veins);
+            }
+        }
+        return stone;
+    }
+    let inlay = |from: f32, to: f32| r >= from && r < to;
+    if inlay(0.52, 0.545) || inlay(0.655, 0.68) || r > 0.965 {
+        return INK * (0.8 + 0.5 * veins());
+    }
+    if r < 0.655 {
+        let turns = angle / TAU * 20.0;
+        let across = (r - 0.545) / 0.11;
+        let saw = 2.0 * (turns.rem_euclid(1.0) - 0.5).abs();
+        return if saw < across {
+            RUST * (0.9 + 0.3 * veins())
+        } else {
+            STONE * (0.75 + 0.5 * veins())
+        };
+    }
+    let stave = (angle / TAU * 20.0).floor();
+    let tone = 0.62 + 0.85 * lattice(stave as i32, 7);
+    // Grain runs outwards: fine across the stave, slow along it.
+    let grain = fbm(Vec2::new(angle * 9.0 + 3.0 * stave, p.length() * 1.4), 3);
+    let seam = (angle / TAU * 20.0).rem_euclid(1.0);
+    let dark = if seam.min(1.0 - seam) * r < 0.012 { 0.45 } else { 1.0 };
+    WALNUT * (tone * (0.55 + 0.95 * grain) * dark)
+}
+
+fn meadow(p: Vec2) -> Vec3 {
+    let r = p.length();
+    let patches = fbm(p * 0.5, 2);
+    let grass = Vec3::new(0.085, 0.15, 0.035).lerp(Vec3::new(0.26, 0.24, 0.07), smooth(0.3, 0.75, patches));
+    let blades = 0.88 + 0.24 * fbm(p * 1.4 + 31.0, 2);
+    let row = (r / 0.75).floor();
+    let count = (row * 7.0).max(1.0);
+    let stone_number = ((p.y.atan2(p.x) / TAU + 0.137 * row) * count).floor().rem_euclid(count);
+    let slab = Vec3::new(0.36, 0.335, 0.30) * (0.7 + 0.5 * lattice(stone_number as i32, row as i32 + 50));
+    slab.lerp(grass * blades, smooth(3.5, 4.3, r + 0.9 * (patches - 0.5)))
+}
+
+/// 0 below `from`, 1 above `to`, smooth between.
+pub fn smooth(from: f32, to: f32, x: f32) -> f32 {
+    let t = ((x - from) / (to - from)).clamp(0.0, 1.0);
+    t * t * (3.0 - 2.0 * t)
+}
+
+/// A fixed random number in \[0, 1) for each point of the integer lattice.
+pub fn lattice(x: i32, y: i32) -> f32 {
+    let mut h = (x as u32).wrapping_mul(0x9e37_79b1) ^ (y as u32).wrapping_mul(0x85eb_ca77);
+    h = (h ^ (h >> 15)).wrapping_mul(0x2c1b_3c6d);
+    h = (h ^ (h >> 12)).wrapping_mul(0x297a_2d39);
+    ((h ^ (h >> 15)) >> 8) as f32 / 16_777_216.0
+}
+
+/// Value noise: lattice values, smoothly joined, in \[0, 1\].
+pub fn noise(p: Vec2) -> f32 {
+    let cell = p.floor();
+    let f = p - cell;
+    let f = f * f * (3.0 - 2.0 * f);
+    let (x, y) = (cell.x as i32, cell.y as i32);
+    let low = lattice(x, y) + (lattice(x + 1, y) - lattice(x, y)) * f.x;
+    let high = lattice(x, y + 1) + (lattice(x + 1, y + 1) - lattice(x, y + 1)) * f.x;
+    low + (high - low) * f.y
+}
+
+/// Octaves of [`noise`], each twice as fine and half as strong, in \[0, 1\].
+pub fn fbm(p: Vec2, octaves: u32) -> f32 {
+    let (mut sum, mut total, mut weight, mut q) = (0.0, 0.0, 1.0, p);
+    for _ in 0..octaves {
+        sum += weight * noise(q);
+        total += weight;
+        weight *= 0.5;
+        // Turned a little, so that the octaves' lattices do not line up.
+        q = Vec2::new(1.6 * q.x - 1.2 * q.y, 1.2 * q.x + 1.6 * q.y) + 17.3;
+    }
+    sum / total
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn noise_stays_in_range_and_is_continuous_over_cell_borders() {
+        for i in 0..1000 {
+            let p = Vec2::new(0.37 * i as f32 - 150.0, -0.11 * i as f32);
+            assert!((0.0..=1.0).contains(&noise(p)) && (0.0..=1.0).contains(&fbm(p, 4)));
+        }
+        for x in -3..3 {
+            let border = Vec2::new(x as f32, 0.3);
+            assert!((noise(border - Vec2::X * 1e-4) - noise(border + Vec2::X * 1e-4)).abs() < 1e-3);
+        }
+    }
+
+    #[test]
+    fn a_checker_alternates_and_the_rose_has_two_halves() {
+        let checker = Texture::Checker {
+            colors: [Vec3::ZERO, Vec3::ONE],
+            size: 1.0,
+        };
+        let at = |x: f32| checker.color(Vec3::new(x, 0.1, 0.1));
+        assert!(at(0.3) != at(1.3) && at(0.3) == at(2.3));
+        let top = Texture::TableTop { radius: 2.0 };
+        let (left, right) = (
+            top.color(Vec3::new(0.5, 0.02, 0.0)),
+            top.color(Vec3::new(0.5, -0.02, 0.0)),
+        );
+        assert!((left - right).length() > 0.2, "{left} {right}");
+    }
+}

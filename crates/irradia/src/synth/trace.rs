@@ -1,0 +1,314 @@
+//! From a camera to a picture: a ray a sample, a ray to the sun, and one in the mirror's direction where the surface
+//! shines. The light of the sky is worked out without rays (`ambient`): sampled, it would be the noise of the picture.
+
+use super::ambient;
+use super::scene::{Hit, SynthScene};
+use super::shape::Ray;
+use super::sky;
+use super::texture::Texture;
+use glam::{Vec2, Vec3};
+use irradia_scene::{Camera, Image, Rng};
+use rayon::prelude::*;
+use std::f32::consts::TAU;
+
+/// How far a secondary ray starts off the surface, world units.
+const LIFT: f32 = 1e-3;
+/// Brightest linear value a sample may have: a highlight must not turn one sample into a white pixel.
+const BRIGHTEST: f32 = 4.0;
+/// Samples of a pixel that lie this close together in sRGB show one plain surface.
+const PLAIN: f32 = 0.05;
+/// Half the width of the pixel's tent-shaped filter, pixels. Its variance, 0.24, is about that of a lens with its sensor,
+/// and of the low-pass filter that splats are rendered with (0.3): edges of one pixel would be beyond them.
+const FILTER: f32 = 1.2;
+/// Linear value to film: chosen so that sunlit stone stays below white.
+const EXPOSURE: f32 = 0.46;
+
+/// One traced view.
+#[derive(Clone, Debug, PartialEq)]
+pub struct SynthFrame {
+    /// `[H, W, 3]` sRGB in \[0, 1\].
+    pub color: Image,
+    /// `[H, W]` distance along the camera's +Z of what the ray through the pixel's centre meets, world units.
+    pub depth: Image,
+    /// `[H, W, 3]` world, unit, towards the camera, at the same point.
+    pub normals: Image,
+}
+
+impl SynthScene {
+    /// Traces the scene with up to `samples` samples a pixel (rounded up to a square number).
+    ///
+    /// The same scene, camera and number give the same bits on any number of threads.
+    pub fn trace(&self, camera: &Camera, samples: u32) -> SynthFrame {
+        let (width, height) = (camera.intrinsics.width, camera.intrinsics.height);
+        let side = (1..).find(|n| n * n >= samples).expect("some square is large enough");
+        let mut frame = SynthFrame {
+            color: Image::zeros(width, height, 3),
+            depth: Image::zeros(width, height, 1),
+            normals: Image::zeros(width, height, 3),
+        };
+        let row = width as usize;
+        let forward = camera.pose.rotation * Vec3::Z;
+        let rows = frame
+            .color
+            .data
+            .par_chunks_mut(3 * row)
+            .zip(frame.depth.data.par_chunks_mut(row));
+        rows.zip(frame.normals.data.par_chunks_mut(3 * row))
+            .enumerate()
+            .for_each(|(y, ((color, depth), normals))| {
+                for x in 0..row {
+                    let mut rng = Rng::new(self.seed, (y * row + x) as u64);
+                    let corner = Vec2::new(x as f32, y as f32);
+                    color[3 * x..3 * x + 3].copy_from_slice(&self.pixel(camera, corner, side, &mut rng).to_array());
+                    let ray = pixel_ray(camera, corner + 0.5);
+                    if let Some(hit) = self.hit(&ray, camera.near) {
+                        depth[x] = hit.t * ray.direction.dot(forward);
+                        normals[3 * x..3 * x + 3].copy_from_slice(&hit.normal.to_array());
+                    }
+                }
+            });
+        frame
+    }
+
+    /// sRGB colour of the pixel whose upper left corner is given, from at most `side^2` samples.
+    fn pixel(&self, camera: &Camera, corner: Vec2, side: u32, rng: &mut Rng) -> Vec3 {
+        // Most pixels are plain: four samples that agree are enough, and the time goes where there is an edge.
+        if side > 3 {
+            let (mean, spread) = self.sampled(camera, corner, 3, rng);
+            if spread < PLAIN {
+                return mean;
+            }
+        }
+        self.sampled(camera, corner, side, rng).0
+    }
+
+    /// sRGB colour from `side^2` samples, and how far apart they lie.
+    fn sampled(&self, camera: &Camera, corner: Vec2, side: u32, rng: &mut Rng) -> (Vec3, f32) {
+        let count = side * side;
+        // Each of the three planes a sample draws from (pixel, sun, mirror) is stratified alike; strata of different
+        // planes are paired at random.
+        let mut strata: [Vec<u32>; 2] = std::array::from_fn(|_| (0..count).collect());
+        strata.iter_mut().for_each(|order| rng.shuffle(order));
+        let (mut sum, mut low, mut high) = (Vec3::ZERO, Vec3::INFINITY, Vec3::NEG_INFINITY);
+        for sample in 0..count {
+            let mut within = |stratum: u32| {
+                let cell = Vec2::new((stratum % side) as f32, (stratum / side) as f32);
+                (cell + Vec2::new(rng.uniform(), rng.uniform())) / side as f32
+            };
+            let ray = pixel_ray(camera, corner + 0.5 + within(sample).map(tent) * FILTER);
+            let [sun, mirror] = std::array::from_fn(|plane| within(strata[plane][sample as usize]));
+            let radiance = match self.hit(&ray, camera.near) {
+                Some(hit) => self.shade(&ray, &hit, sun, mirror),
+                None => sky::radiance(ray.direction),
+            };
+            let radiance = radiance.min(Vec3::splat(BRIGHTEST));
+            sum += radiance;
+            (low, high) = (low.min(radiance), high.max(radiance));
+        }
+        (
+            develop(sum / count as f32),
+            (develop(high) - develop(low)).max_element(),
+        )
+    }
+
+    /// Radiance towards the ray's origin; `sun` and `mirror` are uniform in the unit square.
+    fn shade(&self, ray: &Ray, hit: &Hit, sun: Vec2, mirror: Vec2) -> Vec3 {
+        let material = &hit.object.material;
+        let color = material.texture.color(hit.object.shape.local(hit.point));
+        if material.texture == Texture::Sky {
+            return color;
+        }
+        let start = hit.point + hit.normal * LIFT;
+        let toward_sun = around(sky::SUN, disc(sun) * sky::SUN_SPREAD);
+        let facing = hit.normal.dot(toward_sun);
+        let lit = facing > 0.0
+            && !self.is_blocked(
+                &Ray {
+                    origin: start,
+                    direction: toward_sun,
+                },
+                LIFT,
+            );
+        let sunlight = if lit { sky::SUN_LIGHT * facing } else { Vec3::ZERO };
+
+        let mut radiance = Vec3::ZERO;
+        if !material.metal {
+            radiance += color * (sunlight + ambient::shaded(self, hit));
+        }
+        let reflectance = if material.metal {
+            color
+        } else {
+            Vec3::splat(material.coat)
+        };
+        if reflectance.max_element() > 0.0 {
+            let cosine = (-ray.direction.dot(hit.normal)).clamp(0.0, 1.0);
+            // Schlick's approximation (1994); a rough surface gains less towards grazing.
+            let grazing = (1.0 - cosine).powi(5) * (1.0 - 2.0 * material.roughness).max(0.0);
+            let fresnel = reflectance + (Vec3::ONE - reflectance) * grazing;
+            let exact = ray.direction - 2.0 * ray.direction.dot(hit.normal) * hit.normal;
+            // All that a metal shows is its reflection: four rays a quarter turn apart, for the sake of noise.
+            let rays = if material.metal { 4 } else { 1 };
+            let mut reflected = Vec3::ZERO;
+            for turn in 0..rays {
+                let lobe = disc(mirror + Vec2::Y * (turn as f32 / rays as f32)) * material.roughness;
+                let mut direction = around(exact, lobe);
+                // A rough lobe may dip below the surface at the edge: lift it back.
+                let below = direction.dot(hit.normal);
+                if below < 0.02 {
+                    direction = (direction + hit.normal * (0.02 - below)).normalize();
+                }
+                reflected += self.incoming(start, direction) / rays as f32;
+            }
+            if lit {
+                // The sun's image, spread over the lobe: a Gaussian of the lobe's width about the mirror's direction.
+                let off = 2.0 * (1.0 - exact.dot(sky::SUN)).max(0.0);
+                let width = 0.5 * material.roughness * material.roughness + sky::SUN_SPREAD * sky::SUN_SPREAD;
+                reflected += sky::SUN_LIGHT * ((-off / width).exp() * 0.05 / width);
+            }
+            radiance += fresnel * reflected;
+        }
+        radiance
+    }
+
+    /// What arrives at a point from a direction: the sky, or a surface lit plainly.
+    fn incoming(&self, origin: Vec3, direction: Vec3) -> Vec3 {
+        let ray = Ray { origin, direction };
+        let Some(hit) = self.hit(&ray, LIFT) else {
+            return sky::radiance(direction);
+        };
+        let texture = hit.object.material.texture;
+        let color = texture.color(hit.object.shape.local(hit.point));
+        if texture == Texture::Sky {
+            return color;
+        }
+        // No ray to the sun from here: 0.7 stands for the part of surfaces that is not in shadow.
+        let sunlit = 0.7 * hit.normal.dot(sky::SUN).max(0.0);
+        color * (sky::SUN_LIGHT * sunlit + ambient::open(&hit))
+    }
+}
+
+/// The ray through pixel coordinates.
+fn pixel_ray(camera: &Camera, pixel: Vec2) -> Ray {
+    Ray {
+        origin: camera.pose.position,
+        direction: camera.ray_direction(pixel),
+    }
+}
+
+/// The unit square onto the unit disc, areas kept (Shirley and Chiu 1997 in spirit; polar, which is enough here).
+fn disc(square: Vec2) -> Vec2 {
+    Vec2::from_angle(TAU * square.y) * square.x.sqrt()
+}
+
+/// From a uniform number to one in \[-1, 1\] distributed as a tent.
+fn tent(u: f32) -> f32 {
+    if u < 0.5 {
+        (2.0 * u).sqrt() - 1.0
+    } else {
+        1.0 - (2.0 - 2.0 * u).sqrt()
+    }
+}
+
+/// `axis` tilted by an offset on the plane at distance 1.
+fn around(axis: Vec3, offset: Vec2) -> Vec3 {
+    let (s, t) = axis.any_orthonormal_pair();
+    (axis + s * offset.x + t * offset.y).normalize()
+}
+
+/// Linear radiance to sRGB: Narkowicz's fit (2015) of the ACES film curve, then the sRGB transfer (IEC 61966-2-1).
+fn develop(linear: Vec3) -> Vec3 {
+    let x = linear * EXPOSURE;
+    let film = (x * (2.51 * x + 0.03)) / (x * (2.43 * x + 0.59) + 0.14);
+    Vec3::from_array(film.to_array().map(|v| {
+        let v = v.clamp(0.0, 1.0);
+        if v <= 0.003_130_8 {
+            12.92 * v
+        } else {
+            1.055 * v.powf(1.0 / 2.4) - 0.055
+        }
+    }))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::scene::scene;
+    use super::*;
+    use irradia_scene::{Intrinsics, Pose};
+
+    fn camera(size: u32) -> Camera {
+        Camera::new(
+            Pose::look_at(Vec3::new(3.2, -2.4, 1.9), Vec3::new(0.0, 0.0, 0.3), Vec3::Z),
+            Intrinsics::from_fov_x(size, size, 0.85),
+        )
+    }
+
+    #[test]
+    fn looking_straight_down_the_table_is_at_its_depth() {
+        let camera = Camera::new(
+            Pose::look_at(Vec3::new(0.1, 0.0, 4.0), Vec3::new(0.1, 0.0, 0.0), Vec3::Y),
+            Intrinsics::from_fov_x(33, 33, 0.05),
+        );
+        let frame = scene().trace(&camera, 1);
+        assert!(frame.depth.data.iter().all(|depth| (depth - 4.0).abs() < 1e-4));
+        assert!((Vec3::from_slice(frame.normals.pixel(16, 16)) - Vec3::Z).length() < 1e-5);
+    }
+
+    #[test]
+    fn depth_unprojects_to_the_point_that_was_hit_and_normals_face_the_camera() {
+        let (scene, camera) = (scene(), camera(48));
+        let frame = scene.trace(&camera, 1);
+        for y in 0..48 {
+            for x in 0..48 {
+                let pixel = Vec2::new(x as f32 + 0.5, y as f32 + 0.5);
+                let ray = pixel_ray(&camera, pixel);
+                let hit = scene.hit(&ray, camera.near).expect("the backdrop closes the scene");
+                let (at, depth) = camera.project(hit.point).expect("in front");
+                assert!((at - pixel).length() < 1e-2, "{x} {y}");
+                assert!((frame.depth.pixel(x, y)[0] - depth).abs() < 1e-4 * depth, "{x} {y}");
+                let normal = Vec3::from_slice(frame.normals.pixel(x, y));
+                assert!((normal.length() - 1.0).abs() < 1e-3 && normal.dot(ray.direction) <= 0.0);
+            }
+        }
+    }
+
+    #[test]
+    fn the_ball_has_the_depth_of_a_sphere() {
+        let center = Vec3::new(-0.42, -0.38, 0.46);
+        let eye = Vec3::new(-2.5, -3.0, 1.6);
+        let camera = Camera::new(Pose::look_at(eye, center, Vec3::Z), Intrinsics::from_fov_x(31, 31, 0.1));
+        let frame = scene().trace(&camera, 1);
+        let expected = (eye - center).length() - 0.46;
+        assert!((frame.depth.pixel(15, 15)[0] - expected).abs() < 1e-4);
+    }
+
+    #[test]
+    fn equal_seeds_give_equal_bits_on_any_number_of_threads_and_unequal_ones_do_not() {
+        let mut scene = scene();
+        let one = rayon::ThreadPoolBuilder::new().num_threads(1).build().expect("pool");
+        let first = one.install(|| scene.trace(&camera(24), 4));
+        assert_eq!(first, scene.trace(&camera(24), 4));
+        assert!(first.color.data.iter().all(|v| (0.0..=1.0).contains(v)));
+        scene.seed = 1;
+        let second = scene.trace(&camera(24), 4);
+        assert!(first.color != second.color && first.depth == second.depth);
+    }
+
+    #[test]
+    fn the_ball_changes_its_colour_with_the_viewpoint_and_the_ground_does_not() {
+        let scene = scene();
+        let seen = |target: Vec3, offset: Vec3| {
+            let pose = Pose::look_at(target + offset, target, Vec3::Z);
+            let frame = scene.trace(&Camera::new(pose, Intrinsics::from_fov_x(1, 1, 0.01)), 1024);
+            Vec3::from_slice(frame.color.pixel(0, 0))
+        };
+        let difference = |target: Vec3| {
+            // From high up one sees the sky in the ball, from low down the hills.
+            let [high, low] =
+                [Vec3::new(-1.0, -1.6, 3.0), Vec3::new(-3.0, -1.5, 0.5)].map(|offset| seen(target, offset));
+            (high - low).length()
+        };
+        let on_the_ball = Vec3::new(-0.42, -0.38, 0.46) + Vec3::new(-0.6, -0.8, 0.0) * 0.46;
+        assert!(difference(on_the_ball) > 0.15);
+        assert!(difference(Vec3::new(6.0, -4.0, -1.45)) < 0.02);
+    }
+}

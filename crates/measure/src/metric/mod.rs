@@ -1,0 +1,64 @@
+//! Metrics for reports: PSNR, SSIM and LPIPS of a render against its photograph.
+
+mod lpips;
+mod psnr;
+mod ssim;
+
+pub use lpips::{Lpips, LpipsError};
+pub use psnr::{psnr, psnr_masked};
+pub use ssim::{ssim, ssim_masked};
+
+use irradia_scene::Image;
+
+/// The metrics of one view.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Evaluation {
+    /// Peak signal-to-noise ratio, dB; infinite where the images are equal.
+    pub psnr: f64,
+    /// Mean structural similarity, at most 1.
+    pub ssim: f64,
+    /// Learned perceptual distance, 0 for equal images; `None` without weights or for images below [`Lpips::MIN_SIDE`].
+    pub lpips: Option<f64>,
+}
+
+/// All metrics of `render` against `truth`, both `[H, W, 3]`, both rounded to 8 bits first, as published numbers are.
+///
+/// `mask [H, W]` leaves out the pixels that are 0: PSNR and SSIM do not count them and the render is given the truth's
+/// colours there, so that SSIM's windows and LPIPS see no difference. LPIPS stays a mean over the whole image.
+///
+/// # Panics
+/// When sizes differ: that is a bug of the caller.
+pub fn evaluate(render: &Image, truth: &Image, mask: Option<&[u8]>, lpips: Option<&Lpips>) -> Evaluation {
+    assert_same_size(render, truth, mask);
+    let (mut render, truth) = (render.rounded_to_8_bits(), truth.rounded_to_8_bits());
+    if let Some(mask) = mask {
+        render = with_truth_where_masked(&render, &truth, mask);
+    }
+    Evaluation {
+        psnr: psnr_masked(&render, &truth, mask),
+        ssim: ssim_masked(&render, &truth, mask),
+        lpips: lpips.and_then(|net| net.distance(&render, &truth).ok()),
+    }
+}
+
+fn with_truth_where_masked(render: &Image, truth: &Image, mask: &[u8]) -> Image {
+    let mut out = render.clone();
+    let channels = out.channels as usize;
+    let pixels = out
+        .data
+        .chunks_exact_mut(channels)
+        .zip(truth.data.chunks_exact(channels));
+    for ((pixel, truth), _) in pixels.zip(mask).filter(|(_, m)| **m == 0) {
+        pixel.copy_from_slice(truth);
+    }
+    out
+}
+
+fn assert_same_size(render: &Image, truth: &Image, mask: Option<&[u8]>) {
+    let size = |image: &Image| (image.width, image.height, image.channels);
+    assert_eq!(size(render), size(truth), "render and truth have one size");
+    if let Some(mask) = mask {
+        let pixels = truth.width as usize * truth.height as usize;
+        assert_eq!(mask.len(), pixels, "the mask has one value a pixel");
+    }
+}

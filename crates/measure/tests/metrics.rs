@@ -1,0 +1,147 @@
+//! Metrics against golden values (an independent implementation) and LPIPS against its published check values.
+
+mod shared;
+
+use irradia_measure::{Lpips, LpipsError, evaluate, psnr, ssim};
+use irradia_scene::Image;
+use safetensors::SafeTensors;
+use safetensors::tensor::TensorView;
+use shared::{read_image, shared, tensor_image};
+use std::fs;
+
+const WEIGHTS: &str = "data/lpips/lpips_squeeze.safetensors";
+
+#[test]
+fn psnr_and_ssim_have_the_golden_values() {
+    let (Some(values), Some(tensors)) = (
+        shared("golden/metrics/metrics.json"),
+        shared("golden/metrics/metrics.safetensors"),
+    ) else {
+        return;
+    };
+    let values: serde_json::Value = serde_json::from_slice(&fs::read(values).unwrap()).unwrap();
+    let bytes = fs::read(tensors).unwrap();
+    let tensors = SafeTensors::deserialize(&bytes).unwrap();
+    for (case, expected) in values.as_object().unwrap() {
+        let render = tensor_image(&tensors, &format!("{case}/img1"));
+        let truth = tensor_image(&tensors, &format!("{case}/img2"));
+        // Both sides compute in double precision from the same floats: only the order of sums differs.
+        for (name, got) in [
+            ("psnr", psnr(&render, &truth)),
+            ("ssim_inria_same", ssim(&render, &truth)),
+        ] {
+            let want = expected[name].as_f64().unwrap();
+            assert!((got - want).abs() < 1e-9, "{case} {name}: {got} and not {want}");
+        }
+    }
+}
+
+#[test]
+fn lpips_has_the_published_check_values() {
+    let Some(weights) = shared(WEIGHTS) else { return };
+    let net = Lpips::load(weights).unwrap();
+    let [reference, p0, p1] = ["ref", "p0", "p1"].map(|name| {
+        let path = shared(&format!("data/lpips/ex_{name}.png")).unwrap();
+        read_image(path)
+    });
+    // Published to four digits.
+    for (other, want) in [(&p0, 0.7110), (&p1, 0.1479)] {
+        let got = net.distance(&reference, other).unwrap();
+        println!("LPIPS {got:.6}, published {want}");
+        assert!((got - want).abs() < 6e-5, "{got} and not {want}");
+    }
+    assert_eq!(net.distance(&p0, &p0).unwrap(), 0.0);
+    let back = net.distance(&p0, &reference).unwrap();
+    assert!((back - 0.7110).abs() < 6e-5, "a distance is symmetric: {back}");
+}
+
+#[test]
+fn lpips_takes_images_down_to_its_smallest_and_refuses_smaller_ones() {
+    let Some(weights) = shared(WEIGHTS) else { return };
+    let net = Lpips::load(weights).unwrap();
+    let side = Lpips::MIN_SIDE;
+    for (w, h) in [(side, side), (side, 64), (18, 19), (31, 33)] {
+        let mut render = Image::zeros(w, h, 3);
+        render.data[0] = 1.0;
+        let distance = net.distance(&render, &Image::zeros(w, h, 3)).unwrap();
+        assert!(distance > 0.0 && distance < 2.0, "{w}x{h}: {distance}");
+    }
+    let small = Image::zeros(100, side - 1, 3);
+    let error = net.distance(&small, &small).unwrap_err().to_string();
+    assert_eq!(
+        error,
+        "an image of 100x16 is too small for LPIPS; use sides of at least 17 pixels"
+    );
+    assert_eq!(evaluate(&small, &small, None, Some(&net)).lpips, None);
+}
+
+#[test]
+fn the_real_pair_is_evaluated_whole() {
+    let (Some(render), Some(truth), Some(weights)) = (
+        shared("golden/metrics/real_render.png"),
+        shared("golden/metrics/real_gt.png"),
+        shared(WEIGHTS),
+    ) else {
+        return;
+    };
+    let (render, truth) = (read_image(render), read_image(truth));
+    let net = Lpips::load(weights).unwrap();
+    let values = evaluate(&render, &truth, None, Some(&net));
+    println!("{values:?}");
+    // metrics.json, real_fox_pair: the tensors there are these files.
+    assert!((values.psnr - 24.646_030).abs() < 1e-3, "{values:?}");
+    assert!((values.ssim - 0.753_807_5).abs() < 1e-4, "{values:?}");
+    assert!(values.lpips.is_some_and(|v| (0.05..0.5).contains(&v)), "{values:?}");
+
+    // Where the mask is 0 the render does not matter at all.
+    let mut mask = vec![255u8; render.width as usize * render.height as usize];
+    let mut poisoned = render.clone();
+    for i in 0..mask.len() / 2 {
+        mask[i] = 0;
+        poisoned.data[3 * i..3 * i + 3].fill(0.9);
+    }
+    let masked = evaluate(&render, &truth, Some(&mask), Some(&net));
+    assert_eq!(evaluate(&poisoned, &truth, Some(&mask), Some(&net)), masked);
+    // The upper half is now the truth's own.
+    assert!(masked.lpips < values.lpips.map(|v| 0.7 * v), "{masked:?}");
+}
+
+#[test]
+fn weights_that_are_broken_are_refused_in_one_line() {
+    let folder = tempfile::tempdir().unwrap();
+    let refused = |bytes: &[u8], part: &str| {
+        let path = folder.path().join("broken.safetensors");
+        fs::write(&path, bytes).unwrap();
+        let error = Lpips::load(&path).err().expect("must be refused");
+        let line = error.to_string();
+        assert!(matches!(error, LpipsError::Weights { .. }), "{line}");
+        assert!(
+            line.contains("broken.safetensors") && line.contains(part) && !line.contains('\n'),
+            "{line}"
+        );
+    };
+    refused(b"", "no whole safetensors file");
+    refused(b"not a file of tensors at all", "no whole safetensors file");
+    refused(&u64::MAX.to_le_bytes(), "no whole safetensors file");
+    let bias = [0u8; 256];
+    let whole = |name: &str, shape: Vec<usize>, data: &[u8]| {
+        let view = TensorView::new(safetensors::Dtype::F32, shape, data).unwrap();
+        safetensors::serialize([(name, view)], None).unwrap()
+    };
+    refused(&whole("something", vec![64], &bias), "features.0.weight is missing");
+    refused(
+        &whole("features.0.weight", vec![64], &bias),
+        "[64] and not F32 [64, 3, 3, 3]",
+    );
+    let nan = f32::NAN.to_le_bytes().repeat(64 * 27);
+    refused(&whole("features.0.weight", vec![64, 3, 3, 3], &nan), "not finite");
+    let missing = Lpips::load(folder.path().join("absent"))
+        .err()
+        .expect("absent")
+        .to_string();
+    assert!(missing.starts_with("cannot read the LPIPS weights"), "{missing}");
+
+    let Some(weights) = shared(WEIGHTS) else { return };
+    let bytes = fs::read(weights).unwrap();
+    refused(&bytes[..bytes.len() / 2], "no whole safetensors file");
+}

@@ -196,7 +196,7 @@ mod tests {
         let target = Vec3::new(1.0, 2.0, 0.5);
         let cameras: Vec<Camera> = (0..12)
             .map(|i| {
-                let angle = i as f32 * 0.5236;
+                let angle = i as f32 * std::f32::consts::FRAC_PI_6;
                 let eye = target + Vec3::new(4.0 * angle.cos(), 4.0 * angle.sin(), 2.0);
                 Camera::new(Pose::look_at(eye, target, Vec3::Z), Intrinsics::from_fov_x(64, 64, 0.7))
             })

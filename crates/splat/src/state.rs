@@ -216,15 +216,8 @@ mod tests {
 
     #[test]
     fn morton_order_groups_octants() {
-        let corners: Vec<f32> = (0..64)
-            .flat_map(|i| {
-                [
-                    (i * 37 % 64 & 1) as f32,
-                    (i * 37 % 64 >> 1 & 1) as f32,
-                    (i * 37 % 64 >> 2 & 1) as f32,
-                ]
-            })
-            .collect();
+        let bit = |i: usize, axis: usize| (((i * 37) % 64) >> axis & 1) as f32;
+        let corners: Vec<f32> = (0..64).flat_map(|i| [bit(i, 0), bit(i, 1), bit(i, 2)]).collect();
         let means = Planes::from_interleaved(3, &corners);
         let order = morton_order(&means);
         let runs = order

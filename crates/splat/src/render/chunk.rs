@@ -2,14 +2,13 @@
 //! the arithmetic of [`super::project`] and [`super::sh`].
 
 use super::blend::{Footprint2d, SUMS};
-use super::project::{Footprint, FootprintGradient, Geometry, project, project_vjp};
+use super::project::{Footprint, Geometry, footprint_gradient, project, project_vjp, quadratic};
 use super::sh::{MAX_COEFFICIENTS, basis, basis_vjp, direction, direction_vjp};
 use super::{RenderOptions, Renderer, ViewParams};
 use crate::Splats;
 use irradia_compute::each;
 use irradia_compute::simd::{Kernel, Lanes, Mask, Simd};
 use irradia_scene::sh::coefficients;
-use std::f64::consts::{LN_2, LOG2_E};
 use std::sync::atomic::Ordering::Relaxed;
 
 #[inline(always)]
@@ -65,14 +64,14 @@ impl Kernel for ProjectChunk<'_> {
                 opacity,
                 extent,
             } = footprint;
-            let half = simd.splat(-0.5 * LOG2_E);
+            let [a, b, c] = quadratic(conic);
             let log2_opacity = opacity.map(f32::log2);
             let values = [
                 xy[0],
                 xy[1],
-                conic[0] * half,
-                conic[1] * (half + half),
-                conic[2] * half,
+                a,
+                b,
+                c,
                 log2_opacity,
                 color[0],
                 color[1],
@@ -184,21 +183,9 @@ impl Kernel for ProjectChunkVjp<'_, '_> {
                 continue;
             }
             let [s0, sx, sy, sxx, sxy, syy, red, green, blue, v_depth] = each!(i in 10 => simd.load(&sums[i]));
-            // The blend's moments are of v_p / ln 2.
-            let ln_2 = simd.splat(LN_2);
-            let [s0, sx, sy, sxx, sxy, syy] = [s0 * ln_2, sx * ln_2, sy * ln_2, sxx * ln_2, sxy * ln_2, syy * ln_2];
             let [a, b, c, log2_opacity, shown_red, shown_green, shown_blue] = each!(i in 7 => simd.load(&image[i]));
-
-            // p = a dx^2 + b dx dy + c dy^2 + log2 opacity, dx = pixel - centre.
-            let two = simd.splat(2.0);
-            let v_xy = [-(two * a * sx + b * sy), -(b * sx + two * c * sy)];
-            let half = simd.splat(-0.5 * LOG2_E);
-            let v_footprint = FootprintGradient {
-                xy: v_xy,
-                depth: v_depth,
-                conic: [half * sxx, (half + half) * sxy, half * syy],
-                opacity: s0 * simd.splat(LOG2_E) * (-log2_opacity).exp2(),
-            };
+            let moments = [s0, sx, sy, sxx, sxy, syy];
+            let v_footprint = footprint_gradient([a, b, c], log2_opacity, moments, v_depth);
             let geometry = load_geometry(simd, self.splats, first);
             let mut v = project_vjp(&view, &geometry, antialias, &v_footprint);
 
@@ -233,7 +220,7 @@ impl Kernel for ProjectChunkVjp<'_, '_> {
             let active = shown.and(finite);
             chunk.non_finite += shown.and_not(finite).bits().count_ones() as usize;
             visible.zero_where_not(active).store(&mut chunk.active[at..]);
-            for (value, to) in v_xy.iter().zip(&mut chunk.screen) {
+            for (value, to) in v_footprint.xy.iter().zip(&mut chunk.screen) {
                 value.store(&mut to[at..]);
             }
             let [means, quats, log_scales, opacity_logits, sh] = &mut chunk.columns;

@@ -1,1 +1,295 @@
+//! Finite differences in double precision, through the very code that trains: projection, harmonics and fragments are
+//! generic over lanes, and here a lane is one `f64`. Only the loops around them are written again, plainly.
 
+use super::blend::{ALPHA_MAX, LOG2_ALPHA_MIN, TRANSMITTANCE_MIN, fragment, fragment_vjp};
+use super::project::{Geometry, footprint_gradient, project, project_vjp, quadratic};
+use super::sh::{MAX_COEFFICIENTS, basis, basis_vjp, direction, direction_vjp};
+use super::view::ViewParams;
+use irradia_compute::simd::Double;
+use irradia_scene::{Rng, sh::coefficients};
+
+/// A splat as plain numbers: mean, quaternion, ln scales, opacity logit, then SH `[k, channel]`.
+type Flat = Vec<f64>;
+const GEOMETRY: usize = 11;
+
+struct Scene {
+    view: ViewParams,
+    antialias: bool,
+    degree: u32,
+    background: [f64; 3],
+    /// Weights of each pixel's red, green, blue, alpha and depth in the loss.
+    weights: Vec<[f64; 5]>,
+}
+
+/// A projected splat.
+struct Shown {
+    index: usize,
+    xy: [f64; 2],
+    quadratic: [f64; 3],
+    log2_opacity: f64,
+    depth: f64,
+    color: [f64; 3],
+}
+
+fn geometry(flat: &[f64]) -> Geometry<f64> {
+    Geometry {
+        mean: [flat[0], flat[1], flat[2]],
+        quat: [flat[3], flat[4], flat[5], flat[6]],
+        log_scale: [flat[7], flat[8], flat[9]],
+        opacity_logit: flat[10],
+    }
+}
+
+impl Scene {
+    fn show(&self, splats: &[Flat]) -> Vec<Shown> {
+        let view = self.view.lanes(Double);
+        let mut shown: Vec<Shown> = splats
+            .iter()
+            .enumerate()
+            .filter_map(|(index, flat)| {
+                let g = geometry(flat);
+                let (footprint, visible) = project(&view, &g, self.antialias);
+                let (d, _) = direction(g.mean, view.center);
+                let b = basis(self.degree, d);
+                let color = std::array::from_fn(|c| {
+                    let sum: f64 = (0..coefficients(self.degree))
+                        .map(|k| b[k] * flat[GEOMETRY + 3 * k + c])
+                        .sum();
+                    (sum + 0.5).max(0.0)
+                });
+                visible.then(|| Shown {
+                    index,
+                    xy: footprint.xy,
+                    quadratic: quadratic(footprint.conic),
+                    log2_opacity: footprint.opacity.log2(),
+                    depth: footprint.depth,
+                    color,
+                })
+            })
+            .collect();
+        shown.sort_by(|a, b| a.depth.total_cmp(&b.depth));
+        shown
+    }
+
+    /// Calls `visit(pixel, [x, y])` for every pixel.
+    fn pixels(&self, mut visit: impl FnMut(usize, [f64; 2])) {
+        for y in 0..self.view.height {
+            for x in 0..self.view.width {
+                visit(
+                    (y * self.view.width + x) as usize,
+                    [f64::from(x) + 0.5, f64::from(y) + 0.5],
+                );
+            }
+        }
+    }
+
+    /// A pixel's red, green, blue, alpha and depth.
+    fn pixel(&self, shown: &[Shown], at: [f64; 2]) -> [f64; 5] {
+        let mut out = [0.0; 5];
+        let mut t = 1.0f64;
+        for s in shown {
+            let f = fragment(s.p(at).0, t);
+            if f.ends {
+                break;
+            }
+            if f.drawn {
+                for c in 0..3 {
+                    out[c] += f.weight * s.color[c];
+                }
+                out[4] += f.weight * s.depth;
+                t = f.behind;
+            }
+        }
+        for c in 0..3 {
+            out[c] += t * self.background[c];
+        }
+        out[3] = 1.0 - t;
+        out
+    }
+
+    fn loss(&self, splats: &[Flat]) -> f64 {
+        let shown = self.show(splats);
+        let mut loss = 0.0;
+        self.pixels(|i, at| {
+            let out = self.pixel(&shown, at);
+            loss += out.iter().zip(&self.weights[i]).map(|(v, w)| v * w).sum::<f64>();
+        });
+        loss
+    }
+
+    fn gradient(&self, splats: &[Flat]) -> Vec<Flat> {
+        let shown = self.show(splats);
+        // Moments of v_p, then colour and depth, for each shown splat.
+        let mut sums = vec![[0.0; 10]; shown.len()];
+        self.pixels(|i, at| {
+            let w = self.weights[i];
+            let out = self.pixel(&shown, at);
+            let mut rest = (0..3).map(|c| out[c] * w[c]).sum::<f64>() + out[4] * w[4] - (1.0 - out[3]) * w[3];
+            let mut t = 1.0;
+            for (s, sum) in shown.iter().zip(&mut sums) {
+                let (p, [dx, dy]) = s.p(at);
+                let f = fragment(p, t);
+                if f.ends {
+                    break;
+                }
+                if !f.drawn {
+                    continue;
+                }
+                let g = (0..3).map(|c| s.color[c] * w[c]).sum::<f64>() + s.depth * w[4];
+                rest -= f.weight * g;
+                let v_p = fragment_vjp(&f, t, g, rest);
+                let parts = [1.0, dx, dy, dx * dx, dx * dy, dy * dy].map(|m| m * v_p);
+                let colors = [w[0], w[1], w[2], w[4]].map(|v| v * f.weight);
+                for (sum, part) in sum.iter_mut().zip(parts.into_iter().chain(colors)) {
+                    *sum += part;
+                }
+                t = f.behind;
+            }
+        });
+        let view = self.view.lanes(Double);
+        let mut gradients: Vec<Flat> = splats.iter().map(|s| vec![0.0; s.len()]).collect();
+        for (s, sum) in shown.iter().zip(&sums) {
+            let flat = &splats[s.index];
+            let g = geometry(flat);
+            let moments = [sum[0], sum[1], sum[2], sum[3], sum[4], sum[5]];
+            let v_footprint = footprint_gradient(s.quadratic, s.log2_opacity, moments, sum[9]);
+            let v = project_vjp(&view, &g, self.antialias, &v_footprint);
+            let v_color: [f64; 3] = std::array::from_fn(|c| if s.color[c] > 0.0 { sum[6 + c] } else { 0.0 });
+            let (d, inverse) = direction(g.mean, view.center);
+            let b = basis(self.degree, d);
+            let mut v_basis = [0.0; MAX_COEFFICIENTS];
+            let out = &mut gradients[s.index];
+            for k in 0..coefficients(self.degree) {
+                for c in 0..3 {
+                    v_basis[k] += flat[GEOMETRY + 3 * k + c] * v_color[c];
+                    out[GEOMETRY + 3 * k + c] = b[k] * v_color[c];
+                }
+            }
+            let v_mean = direction_vjp(d, inverse, basis_vjp(self.degree, d, &v_basis));
+            for i in 0..3 {
+                out[i] = v.mean[i] + v_mean[i];
+                out[7 + i] = v.log_scale[i];
+            }
+            out[3..7].copy_from_slice(&v.quat);
+            out[10] = v.opacity_logit;
+        }
+        gradients
+    }
+
+    /// Smallest relative distance of any fragment from one of the hard decisions: a finite difference across one is void.
+    fn margin(&self, splats: &[Flat]) -> f64 {
+        let shown = self.show(splats);
+        let mut margin = f64::MAX;
+        self.pixels(|_, at| {
+            let mut t = 1.0;
+            for s in &shown {
+                let p = s.p(at).0;
+                margin = margin.min((p - LOG2_ALPHA_MIN).abs()).min((p - ALPHA_MAX.log2()).abs());
+                let f = fragment(p, t);
+                if p >= LOG2_ALPHA_MIN {
+                    margin = margin.min((f.behind / TRANSMITTANCE_MIN - 1.0).abs());
+                }
+                if f.ends {
+                    break;
+                }
+                if f.drawn {
+                    t = f.behind;
+                }
+            }
+        });
+        margin
+    }
+}
+
+impl Shown {
+    fn p(&self, at: [f64; 2]) -> (f64, [f64; 2]) {
+        let [dx, dy] = [at[0] - self.xy[0], at[1] - self.xy[1]];
+        let [a, b, c] = self.quadratic;
+        (a * dx * dx + b * dx * dy + c * dy * dy + self.log2_opacity, [dx, dy])
+    }
+}
+
+/// The kinds of splat that break renderers, and ordinary ones.
+fn splats(rng: &mut Rng, degree: u32) -> Vec<Flat> {
+    let mut make = |x: [f64; 3], log_scale: [f64; 3], logit: f64| {
+        let mut uniform = |low: f32, high: f32| f64::from(rng.range(low, high));
+        let quat: Vec<f64> = (0..4).map(|_| uniform(-1.0, 1.0)).collect();
+        let sh: Vec<f64> = (0..3 * coefficients(degree)).map(|_| uniform(-0.4, 0.6)).collect();
+        let jitter: Vec<f64> = (0..3).map(|_| uniform(-0.3, 0.3)).collect();
+        let mean = [x[0] + jitter[0], x[1] + jitter[1], x[2] + jitter[2]];
+        [&mean[..], &quat, &log_scale, &[logit], &sh].concat()
+    };
+    vec![
+        make([0.0, 0.0, 3.0], [-1.5, -1.2, -1.8], 0.5),
+        make([0.3, -0.2, 4.0], [-1.0, -2.0, -1.4], 1.5),
+        make([-0.4, 0.3, 3.5], [-2.0, -1.5, -1.1], -1.0),
+        make([0.0, 0.0, -2.0], [-1.0, -1.0, -1.0], 1.0), // behind the camera
+        make([9.0, 0.0, 3.0], [-2.0, -2.0, -2.0], 1.0),  // off the image
+        make([2.6, 0.5, 1.4], [-0.3, -0.6, -0.5], 0.5),  // off-axis: the clamp of J acts
+        make([0.5, 0.5, 6.0], [0.9, 1.1, 1.0], -0.5),    // huge
+        make([-0.2, 0.1, 2.5], [-1.0, -6.0, -6.5], 2.0), // needle
+        make([0.1, 0.2, 2.8], [-1.0, -1.3, -1.2], -4.8), // nearly transparent
+        make([0.0, -0.1, 5.0], [-0.5, -0.7, -0.6], 6.5), // opaque: the cap of alpha acts
+        make([0.2, 0.1, 5.5], [-0.5, -0.4, -0.6], 3.0),
+    ]
+}
+
+#[test]
+fn finite_differences_hold_every_gradient() {
+    let mut compared = 0;
+    for (seed, antialias, degree) in [(1, false, 3), (2, true, 2), (3, false, 1), (4, true, 3), (5, false, 0)] {
+        let mut rng = Rng::new(seed, 77);
+        let scene = Scene {
+            view: ViewParams {
+                // A turned camera, off its own axis, with pixels that are not square.
+                rotation: rotation(0.2, -0.1, 0.3),
+                translation: [0.1, -0.2, 0.05],
+                focal: [19.0, 23.0],
+                principal: [11.3, 8.1],
+                width: 21,
+                height: 18,
+                near: 0.2,
+            },
+            antialias,
+            degree,
+            background: [0.2, 0.5, 0.9],
+            weights: (0..21 * 18)
+                .map(|_| std::array::from_fn(|_| f64::from(rng.range(-1.0, 1.0))))
+                .collect(),
+        };
+        let splats = splats(&mut rng, degree);
+        assert!(scene.show(&splats).len() >= 7, "most are seen");
+        assert!(
+            scene.margin(&splats) > 1e-5,
+            "seed {seed} lies on a hard decision: choose another"
+        );
+        let gradient = scene.gradient(&splats);
+        let largest = gradient.iter().flatten().fold(0.0f64, |m, v| m.max(v.abs()));
+        for (i, splat) in splats.iter().enumerate() {
+            for j in 0..splat.len() {
+                // Errors: truncation h^2 f''' and rounding 1e-16 f / h; both are far below the tolerance at this step.
+                let h = 1e-6;
+                let mut moved = splats.clone();
+                moved[i][j] = splat[j] + h;
+                let above = scene.loss(&moved);
+                moved[i][j] = splat[j] - h;
+                let below = scene.loss(&moved);
+                let want = (above - below) / (2.0 * h);
+                let got = gradient[i][j];
+                assert!(
+                    (got - want).abs() <= 1e-6 * want.abs() + 1e-8 * largest,
+                    "seed {seed} splat {i} parameter {j}: {got} and not {want}"
+                );
+                compared += 1;
+            }
+        }
+    }
+    assert!(compared > 1000);
+}
+
+/// Rotation matrix of Euler angles.
+fn rotation(x: f64, y: f64, z: f64) -> [[f64; 3]; 3] {
+    let q = glam::DQuat::from_euler(glam::EulerRot::XYZ, x, y, z);
+    let m = glam::DMat3::from_quat(q).to_cols_array_2d();
+    std::array::from_fn(|i| std::array::from_fn(|j| m[j][i]))
+}

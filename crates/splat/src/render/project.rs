@@ -8,6 +8,7 @@
 use super::view::ViewLanes;
 use irradia_compute::each;
 use irradia_compute::simd::{Lanes, Mask, Scalar};
+use std::f64::consts::{LN_2, LOG2_E};
 
 /// Pixels squared added to the diagonal of the 2D covariance (Inria code, "low-pass filter").
 pub const DILATION: f64 = 0.3;
@@ -79,7 +80,7 @@ pub(super) fn dot<F: Lanes>(a: [F; 3], b: [F; 3]) -> F {
 /// e^x through 2^x; safe for any finite x.
 #[inline(always)]
 pub(super) fn exp<F: Lanes>(x: F) -> F {
-    (x * x.splat(std::f64::consts::LOG2_E)).min(x.splat(126.0)).exp2()
+    (x * x.splat(LOG2_E)).min(x.splat(126.0)).exp2()
 }
 
 #[inline(always)]
@@ -182,6 +183,36 @@ pub(super) fn project<F: Lanes>(view: &ViewLanes<F>, g: &Geometry<F>, antialias:
         },
         visible,
     )
+}
+
+/// `[a, b, c]` of `log2 alpha = a dx^2 + b dx dy + c dy^2 + log2 opacity`, from the conic.
+#[inline(always)]
+pub(super) fn quadratic<F: Lanes>(conic: [F; 3]) -> [F; 3] {
+    let half = conic[0].splat(-0.5 * LOG2_E);
+    [conic[0] * half, conic[1] * (half + half), conic[2] * half]
+}
+
+/// The gradient of a footprint from what blending sums up: the moments 1, dx, dy, dx^2, dx dy, dy^2 of v_p / ln 2, where
+/// dx = pixel - centre.
+#[inline(always)]
+pub(super) fn footprint_gradient<F: Lanes>(
+    [a, b, c]: [F; 3],
+    log2_opacity: F,
+    moments: [F; 6],
+    v_depth: F,
+) -> FootprintGradient<F> {
+    let ln_2 = a.splat(LN_2);
+    let [s, sx, sy, sxx, sxy, syy] = moments;
+    let [sx, sy] = [sx * ln_2, sy * ln_2];
+    let two = a.splat(2.0);
+    // ln 2 of the moments and log2(e) of the quadratic cancel in the conic and in the opacity.
+    let half = a.splat(-0.5);
+    FootprintGradient {
+        xy: [-(two * a * sx + b * sy), -(b * sx + two * c * sy)],
+        depth: v_depth,
+        conic: [half * sxx, -sxy, half * syy],
+        opacity: s * (-log2_opacity).exp2(),
+    }
 }
 
 /// The vector-Jacobian product of [`project`].

@@ -4,8 +4,10 @@
 mod command;
 mod run_folder;
 mod synth;
+mod terminal;
 
 use clap::{Parser, Subcommand};
+use irradia_formats::FormatError;
 use std::process::ExitCode;
 
 #[derive(Parser)]
@@ -58,8 +60,17 @@ fn main() -> ExitCode {
     match result {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
-            eprintln!("error: {error:#}");
-            ExitCode::from(if error.is::<Usage>() { 2 } else { 1 })
+            terminal::note(format_args!("error: {}", terminal::one_line(&error)));
+            ExitCode::from(if is_usage(&error) { 2 } else { 1 })
         }
     }
+}
+
+/// Whether the command line is what must be changed.
+fn is_usage(error: &anyhow::Error) -> bool {
+    let of_a_file = matches!(
+        error.downcast_ref(),
+        Some(FormatError::Option(_) | FormatError::UnknownSplatFormat { .. })
+    );
+    error.is::<Usage>() || of_a_file
 }

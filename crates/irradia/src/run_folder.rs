@@ -9,6 +9,19 @@ use serde::{Deserialize, Serialize};
 use std::fs;
 use std::path::{Path, PathBuf};
 
+/// What a run may leave in its folder.
+const FILES: [&str; 7] = [
+    "run.json",
+    "recipe.toml",
+    "cameras.json",
+    "events.jsonl",
+    "scene.ply",
+    "report.json",
+    "report.html",
+];
+/// The folders in it.
+const FOLDERS: [&str; 2] = ["eval", "checkpoints"];
+
 /// A run's place on disk.
 #[derive(Clone, Debug)]
 pub struct RunFolder(PathBuf);
@@ -28,6 +41,12 @@ pub struct RunConfig {
     pub until_psnr: Option<f64>,
     /// `--budget`, seconds.
     pub budget: Option<f64>,
+    /// `--seed`.
+    pub seed: u64,
+    /// `--steps`.
+    pub steps: Option<u64>,
+    /// Whether the recipe was followed to its end and everything was written.
+    pub complete: bool,
 }
 
 /// A camera as `cameras.json` holds it: enough to orbit the scene later without its photographs.
@@ -47,51 +66,46 @@ struct CameraRecord {
 }
 
 impl RunFolder {
-    /// Makes the folder for a new run.
+    /// Whether a new run may be made at `path`; asked before any work is done for it.
     ///
     /// # Errors
-    /// When it already holds a run and `overwrite` is not set, or cannot be made.
-    pub fn create(path: &Path, overwrite: bool) -> Result<Self> {
-        let run = Self(path.to_owned());
-        let holds_a_run = ["events.jsonl", "recipe.toml", "report.json", "scene.ply"]
-            .iter()
-            .any(|f| path.join(f).exists());
-        if holds_a_run && !overwrite {
+    /// When it already holds a run and `overwrite` is not set, or is a file.
+    pub fn check_free(path: &Path, overwrite: bool) -> Result<()> {
+        if path.exists() && !path.is_dir() {
+            return Err(Usage(format!("{} is a file: --out takes a folder", path.display())).into());
+        }
+        if !overwrite && FILES.iter().any(|file| path.join(file).exists()) {
             let message = format!(
                 "{} already holds a run: give another --out, --overwrite to replace it, or --resume {0} to go on with it",
                 path.display()
             );
             return Err(Usage(message).into());
         }
-        if path.exists() && !path.is_dir() {
-            return Err(Usage(format!("{} is a file: --out takes a folder", path.display())).into());
-        }
-        if holds_a_run {
-            for folder in ["eval", "checkpoints"] {
-                if path.join(folder).exists() {
-                    fs::remove_dir_all(path.join(folder))
-                        .with_context(|| format!("cannot clear {}", path.join(folder).display()))?;
+        Ok(())
+    }
+
+    /// Makes the folder for a new run; what an earlier run left there is removed.
+    ///
+    /// # Errors
+    /// When it cannot be made or cleared.
+    pub fn create(path: &Path) -> Result<Self> {
+        if FILES.iter().any(|file| path.join(file).exists()) {
+            for folder in FOLDERS.map(|folder| path.join(folder)) {
+                if folder.exists() {
+                    fs::remove_dir_all(&folder).with_context(|| format!("cannot clear {}", folder.display()))?;
                 }
             }
-            for file in [
-                "events.jsonl",
-                "report.json",
-                "report.html",
-                "scene.ply",
-                "run.json",
-                "cameras.json",
-            ] {
-                if path.join(file).exists() {
-                    fs::remove_file(path.join(file))
-                        .with_context(|| format!("cannot clear {}", path.join(file).display()))?;
+            for file in FILES.map(|file| path.join(file)) {
+                if file.exists() {
+                    fs::remove_file(&file).with_context(|| format!("cannot clear {}", file.display()))?;
                 }
             }
         }
-        for folder in ["eval", "checkpoints"] {
-            fs::create_dir_all(path.join(folder))
-                .with_context(|| format!("cannot make {}", path.join(folder).display()))?;
+        for folder in FOLDERS.map(|folder| path.join(folder)) {
+            fs::create_dir_all(&folder)
+                .with_context(|| format!("cannot make {}; give another --out", folder.display()))?;
         }
-        Ok(run)
+        Ok(Self(path.to_owned()))
     }
 
     /// Opens the folder of an earlier run.
@@ -108,7 +122,28 @@ impl RunFolder {
             )
         })?;
         let config = serde_json::from_str(&text).with_context(|| format!("{} is damaged", file.display()))?;
-        Ok((Self(path.to_owned()), config))
+        let run = Self(path.to_owned());
+        run.remove_leftovers()?;
+        Ok((run, config))
+    }
+
+    /// Removes the temporary files that a killed process could not remove.
+    fn remove_leftovers(&self) -> Result<()> {
+        for folder in FOLDERS.map(|folder| self.file(folder)).iter().chain([&self.0]) {
+            let entries = fs::read_dir(folder).with_context(|| format!("cannot read {}", folder.display()))?;
+            for path in entries.filter_map(|entry| Some(entry.ok()?.path())) {
+                let name = path.file_name().unwrap_or_default().to_string_lossy();
+                if name.starts_with('.') && name.ends_with(".tmp") {
+                    fs::remove_file(&path).with_context(|| format!("cannot remove {}", path.display()))?;
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// The folder itself.
+    pub fn path(&self) -> &Path {
+        &self.0
     }
 
     /// A file in it.
@@ -152,16 +187,12 @@ impl RunFolder {
         self.write("cameras.json", &serde_json::to_vec_pretty(&records)?)
     }
 
-    /// The newest checkpoint.
+    /// The newest checkpoint, if there is one.
     ///
     /// # Errors
-    /// When there is none, or the folder cannot be read.
-    pub fn newest_checkpoint(&self) -> Result<PathBuf> {
-        let folder = self.file("checkpoints");
-        self.checkpoints()?
-            .pop()
-            .map(|(_, path)| path)
-            .with_context(|| format!("{} holds no checkpoint: start anew with --overwrite", folder.display()))
+    /// When the folder cannot be read.
+    pub fn newest_checkpoint(&self) -> Result<Option<PathBuf>> {
+        Ok(self.checkpoints()?.pop().map(|(_, path)| path))
     }
 
     /// Steps and paths of the checkpoints, oldest first.
@@ -194,6 +225,12 @@ impl RunFolder {
         }
         Ok(name)
     }
+}
+
+/// The scene's file where `path` is a run, `path` itself elsewhere.
+pub fn scene_of(path: &Path) -> PathBuf {
+    let scene = path.join("scene.ply");
+    if scene.is_file() { scene } else { path.to_owned() }
 }
 
 /// The cameras of the run that `scene` lies in, if it lies in one.

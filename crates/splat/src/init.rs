@@ -69,17 +69,20 @@ fn neighbour_distances(positions: &[[f32; 3]]) -> Vec<f32> {
         .collect()
 }
 
-/// `count` points in the space that the cameras see, for scenes that come without any. `depth_bounds[i]` says how near
-/// and far view i's scene lies, where that is known; otherwise it is taken around the point that the cameras look at.
+/// At most `count` points in the space that the cameras see, for scenes that come without any. `depth_bounds[i]` says how
+/// near and far view i's scene lies, where that is known; otherwise it is taken around the point that the cameras look at.
 ///
 /// Points are drawn along random pixels' rays, uniformly in inverse depth, and kept with a probability that grows with
-/// the share of cameras that see them, so that they gather where views overlap. `color(view, pixel)` gives the colour.
+/// the share of cameras that see them, so that they gather where views overlap. `look(view, pixel)` gives the colour
+/// there, `None` where the photograph is transparent: a point that any camera sees through is outside the visual hull of
+/// what is shown (Laurentini 1994) and is not kept. A point's colour is the mean over the cameras that see it: right
+/// where it lies on a surface, and never so dark elsewhere that the clamp of negative colours keeps it from learning.
 pub fn random_points(
     cameras: &[Camera],
     depth_bounds: &[Option<[f32; 2]>],
     count: usize,
     rng: &mut Rng,
-    color: impl Fn(usize, Vec2) -> [u8; 3],
+    look: impl Fn(usize, Vec2) -> Option<[u8; 3]>,
 ) -> PointCloud {
     let mut cloud = PointCloud::default();
     let focus = focus_point(cameras);
@@ -98,21 +101,41 @@ pub fn random_points(
         let inverse = rng.range(1.0 / far, 1.0 / near);
         let ray = camera.pose.rotation * Vec3::new((pixel.x - k.cx) / k.fx, (pixel.y - k.cy) / k.fy, 1.0);
         let point = camera.pose.position + ray / inverse;
-        let seen = cameras.iter().filter(|c| sees(c, point)).count() as f32 / cameras.len() as f32;
+        let chance = rng.uniform();
+        let Some((seen, color)) = mean_color(cameras, point, &look) else {
+            continue;
+        };
         // Late attempts take what comes: a scene whose cameras share little must still get its points.
-        if rng.uniform() < seen || attempt > count * 15 {
+        if chance < seen as f32 / cameras.len() as f32 || attempt > count * 15 {
             cloud.positions.push(point);
-            cloud.colors.push(color(view, pixel));
+            cloud.colors.push(color);
         }
     }
     cloud
 }
 
-fn sees(camera: &Camera, point: Vec3) -> bool {
+/// How many cameras see `point`, and its mean colour in them; `None` where one of them sees nothing there.
+fn mean_color(
+    cameras: &[Camera],
+    point: Vec3,
+    look: &impl Fn(usize, Vec2) -> Option<[u8; 3]>,
+) -> Option<(u32, [u8; 3])> {
+    let (mut seen, mut sum) = (0u32, [0u32; 3]);
+    for (view, camera) in cameras.iter().enumerate() {
+        if let Some(pixel) = sees(camera, point) {
+            let color = look(view, pixel)?;
+            seen += 1;
+            (0..3).for_each(|c| sum[c] += u32::from(color[c]));
+        }
+    }
+    Some((seen, sum.map(|s| (s / seen.max(1)) as u8)))
+}
+
+/// The pixel in which `camera` sees `point`.
+fn sees(camera: &Camera, point: Vec3) -> Option<Vec2> {
     let k = &camera.intrinsics;
-    camera
-        .project(point)
-        .is_some_and(|(p, _)| p.x >= 0.0 && p.y >= 0.0 && p.x < k.width as f32 && p.y < k.height as f32)
+    let (p, _) = camera.project(point)?;
+    (p.x >= 0.0 && p.y >= 0.0 && p.x < k.width as f32 && p.y < k.height as f32).then_some(p)
 }
 
 /// The point nearest to all optical axes, in the least-squares sense, pulled in front of the cameras when they look in
@@ -202,10 +225,10 @@ mod tests {
             })
             .collect();
         assert!(focus_point(&cameras).distance(target) < 0.02);
-        let cloud = random_points(&cameras, &[], 500, &mut Rng::new(1, 0), |view, _| [view as u8; 3]);
+        let cloud = random_points(&cameras, &[], 500, &mut Rng::new(1, 0), |view, _| Some([view as u8; 3]));
         assert_eq!(cloud.len(), 500);
         let mean = cloud.positions.iter().sum::<Vec3>() / 500.0;
         assert!(mean.distance(target) < 0.5, "{mean}");
-        assert!(random_points(&[], &[], 10, &mut Rng::new(1, 0), |_, _| [0; 3]).is_empty());
+        assert!(random_points(&[], &[], 10, &mut Rng::new(1, 0), |_, _| Some([0; 3])).is_empty());
     }
 }

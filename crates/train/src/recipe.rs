@@ -156,6 +156,12 @@ impl Param {
         Param::RateShRest,
     ];
 
+    /// As recipes write it.
+    fn name(self) -> String {
+        let name = toml::Value::try_from(self).expect("a name is plain text");
+        name.as_str().unwrap_or_default().to_owned()
+    }
+
     /// The value where no recipe says anything.
     pub fn default_value(self) -> f64 {
         match self {
@@ -308,7 +314,9 @@ impl Recipe {
             origin: origin.to_owned(),
             message,
         };
-        let table: toml::Table = text.parse().map_err(|e: toml::de::Error| invalid(one_line(&e)))?;
+        let table: toml::Table = text
+            .parse()
+            .map_err(|e: toml::de::Error| invalid(format!("{}{}", one_line(&e), place(&e))))?;
         let mut root = toml::Value::Table(table);
         for assignment in overrides {
             apply(&mut root, assignment).map_err(|message| RecipeError::Override {
@@ -317,10 +325,11 @@ impl Recipe {
             })?;
         }
         let recipe = Self::deserialize(root).map_err(|e| {
-            let message = suggest(&one_line(&e));
-            match overrides.last() {
-                Some(last) => invalid(format!("{message} (with --set {last})")),
-                None => invalid(message),
+            let message = format!("{}{}", suggest(&one_line(&e)), place(&e));
+            let given: Vec<String> = overrides.iter().map(|o| format!("--set {o}")).collect();
+            match &given[..] {
+                [] => invalid(message),
+                _ => invalid(format!("{message} (with {})", given.join(", "))),
             }
         })?;
         recipe.validate().map_err(invalid)?;
@@ -375,7 +384,7 @@ impl Recipe {
             .map(|s| (format!("stage.{}.params", s.name), &s.params));
         for (place, params) in everywhere.chain(stages) {
             for (param, knob) in params {
-                check_knob(*param, knob).map_err(|why| format!("{place}: {param:?}: {why}"))?;
+                check_knob(*param, knob).map_err(|why| format!("{place}.{}: {why}", param.name()))?;
             }
         }
         Ok(())
@@ -453,6 +462,18 @@ fn apply(root: &mut toml::Value, assignment: &str) -> Result<(), String> {
 
 fn one_line(error: &toml::de::Error) -> String {
     error.message().lines().collect::<Vec<_>>().join(" ")
+}
+
+/// Where an error lies: the place in the text, or the key. Only the error's long form knows it.
+fn place(error: &toml::de::Error) -> String {
+    let long = error.to_string();
+    let in_text = long.lines().next().and_then(|line| line.split_once(" at line "));
+    let in_key = long.lines().find_map(|line| line.strip_prefix("in "));
+    match (in_text, in_key) {
+        (Some((_, position)), _) => format!(", at line {position}"),
+        (None, Some(key)) => format!(", in {key}"),
+        (None, None) => String::new(),
+    }
 }
 
 /// Adds the nearest known key to serde's "unknown field `x`, expected one of `a`, `b`".
@@ -547,11 +568,11 @@ mod tests {
     fn senseless_values_are_refused_by_name() {
         for (bad, part) in [
             ("stage.grow.steps=0", "stage.grow.steps"),
-            ("params.ssim_weight=1.5", "SsimWeight"),
+            ("params.ssim_weight=1.5", "params.ssim_weight: 1.5"),
             ("params.rate_means={ to = 0.0, shape = 'log' }", "log ramp"),
             ("params.sh_degree={ steps = [[5, 1]] }", "start at 0"),
             ("params.sh_degree={ steps = [[0, 1]], to = 3 }", "a knob is"),
-            ("params.sh_degree=true", "a knob is"),
+            ("params.sh_degree=true", "in `params.sh_degree`"),
             ("init.opacity=1", "init.opacity"),
             ("nonsense", "key=value"),
             ("name.deeper=3", "inside a string"),

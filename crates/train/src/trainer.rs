@@ -149,8 +149,9 @@ impl Trainer {
                 let mut rng = Rng::new(self.options.seed, STREAM_INIT);
                 let points = init::random_points(&cameras, &bounds, knobs.random_points, &mut rng, |view, pixel| {
                     let photo = photos[view].as_ref().expect("loaded above");
-                    let at = (pixel.y as usize * photo.width as usize + pixel.x as usize) * 3;
-                    [photo.rgb[at], photo.rgb[at + 1], photo.rgb[at + 2]]
+                    let at = pixel.y as usize * photo.width as usize + pixel.x as usize;
+                    let empty = photo.alpha.as_ref().is_some_and(|alpha| alpha[at] == 0);
+                    (!empty).then(|| [0, 1, 2].map(|c| photo.rgb[3 * at + c]))
                 });
                 init::from_points(&points, &options)
             }

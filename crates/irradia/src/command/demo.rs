@@ -1,8 +1,9 @@
 //! `irradia demo` and `irradia synth`
 
 use super::render::parse_size;
-use super::{DataArgs, train};
+use super::{DataArgs, thread_count, train, use_threads};
 use crate::synth::{SynthOptions, write_dataset};
+use crate::terminal::{note, say};
 use anyhow::Result;
 use std::path::PathBuf;
 use std::time::Instant;
@@ -12,11 +13,17 @@ pub struct Args {
     /// Folder for the data and the run
     #[arg(long, default_value = "demo")]
     pub out: PathBuf,
+    /// Training views; one more in eight is held out
+    #[arg(long, value_name = "N", default_value_t = SynthOptions::default().views)]
+    pub views: u32,
+    /// Size of the images
+    #[arg(long, value_name = "WxH", value_parser = parse_size, default_value = "256x256")]
+    pub size: (u32, u32),
     /// Steps of training
-    #[arg(long, default_value_t = 2000)]
+    #[arg(long, default_value_t = 2000, value_parser = clap::value_parser!(u64).range(1..))]
     pub steps: u64,
     /// Threads; all cores when absent
-    #[arg(long)]
+    #[arg(long, value_parser = thread_count())]
     pub threads: Option<usize>,
 }
 
@@ -36,16 +43,23 @@ pub struct SynthArgs {
 }
 
 pub fn run(args: &Args) -> Result<()> {
+    use_threads(args.threads)?;
     let (data, out) = (args.out.join("data"), args.out.join("run"));
     let start = Instant::now();
-    eprintln!("ray tracing the demo scene ..");
-    let summary = write_dataset(&data, &SynthOptions::default())?;
-    eprintln!(
+    note("ray tracing the demo scene ..");
+    let options = SynthOptions {
+        views: args.views,
+        width: args.size.0,
+        height: args.size.1,
+        ..SynthOptions::default()
+    };
+    let summary = write_dataset(&data, &options)?;
+    note(format_args!(
         "{summary}, in {:.1} s: {}",
         start.elapsed().as_secs_f64(),
         data.display()
-    );
-    train::run(&train::Args {
+    ));
+    train::train(&train::Args {
         data: Some(data),
         out: Some(out.clone()),
         recipe: "classic".into(),
@@ -65,11 +79,11 @@ pub fn run(args: &Args) -> Result<()> {
             format: None,
         },
     })?;
-    println!(
-        "the scene is {}; go round it with: irradia render {0} --orbit 60 --out frames",
-        out.join("scene.ply").display()
-    );
-    Ok(())
+    say(format_args!(
+        "the scene is {}; go round it with: irradia render {} --orbit 60 --out frames",
+        out.join("scene.ply").display(),
+        out.display()
+    ))
 }
 
 pub fn synth(args: &SynthArgs) -> Result<()> {
@@ -80,6 +94,5 @@ pub fn synth(args: &SynthArgs) -> Result<()> {
         seed: args.seed,
     };
     let summary = write_dataset(&args.out, &options)?;
-    println!("{}: {summary}", args.out.display());
-    Ok(())
+    say(format_args!("{}: {summary}", args.out.display()))
 }

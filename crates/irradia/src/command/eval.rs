@@ -1,8 +1,9 @@
 //! `irradia eval`
 
-use super::{DataArgs, Split, file_stem, lpips, use_threads};
+use super::{DataArgs, Split, file_stem, lpips, thread_count, use_threads};
 use crate::Usage;
-use crate::run_folder::render_knobs_beside;
+use crate::run_folder::{render_knobs_beside, scene_of};
+use crate::terminal::say;
 use anyhow::Result;
 use irradia_formats::{read_splats, write_atomic, write_png};
 use irradia_splat::{RenderOptions, Splats};
@@ -12,7 +13,7 @@ use std::path::PathBuf;
 
 #[derive(clap::Args)]
 pub struct Args {
-    /// The scene, such as RUN/scene.ply; background and filters are taken from the run it lies in
+    /// The scene: RUN, or a file; background and filters are taken from the run it lies in
     pub scene: PathBuf,
     /// The photographs
     #[arg(long)]
@@ -30,7 +31,7 @@ pub struct Args {
     #[arg(long, value_name = "FILE")]
     pub lpips: Option<PathBuf>,
     /// Threads; all cores when absent
-    #[arg(long)]
+    #[arg(long, value_parser = thread_count())]
     pub threads: Option<usize>,
     #[command(flatten)]
     pub reading: DataArgs,
@@ -38,14 +39,15 @@ pub struct Args {
 
 pub fn run(args: &Args) -> Result<()> {
     use_threads(args.threads)?;
-    let cloud = read_splats(&args.scene)?;
+    let scene = scene_of(&args.scene);
+    let cloud = read_splats(&scene)?;
     let dataset = args.reading.read(&args.data)?;
     let indices = args.split.of(&dataset);
     if indices.is_empty() {
         return Err(Usage(format!("{} has no such views: try --split all", args.data.display())).into());
     }
     let lpips = lpips(args.lpips.as_ref())?;
-    let knobs = render_knobs_beside(&args.scene);
+    let knobs = render_knobs_beside(&scene);
     let options = RenderOptions {
         background: knobs.background,
         antialias: knobs.antialias || cloud.antialiased,
@@ -62,7 +64,10 @@ pub fn run(args: &Args) -> Result<()> {
         |view| {
             let m = view.metrics;
             let tail = m.lpips.map_or(String::new(), |l| format!("  LPIPS {l:.4}"));
-            println!("{:<40} PSNR {:6.2} dB  SSIM {:.4}{tail}", view.name, m.psnr, m.ssim);
+            let line = format!("{:<40} PSNR {:6.2} dB  SSIM {:.4}{tail}", view.name, m.psnr, m.ssim);
+            if let Err(error) = say(line) {
+                outcome = Err(error);
+            }
             rows.push(json!({ "name": view.name, "psnr": m.psnr, "ssim": m.ssim, "lpips": m.lpips }));
             metrics.push(m);
             if let Some(folder) = &args.save_images {
@@ -80,15 +85,15 @@ pub fn run(args: &Args) -> Result<()> {
     outcome?;
     let mean = mean(&metrics);
     let tail = mean.lpips.map_or(String::new(), |l| format!("  LPIPS {l:.4}"));
-    println!(
+    say(format_args!(
         "{:<40} PSNR {:6.2} dB  SSIM {:.4}{tail}",
         format!("mean of {}", metrics.len()),
         mean.psnr,
         mean.ssim
-    );
+    ))?;
     if let Some(path) = &args.json {
         let figures = json!({
-            "scene": args.scene, "data": args.data, "splats": splats.len(),
+            "scene": scene, "data": args.data, "splats": splats.len(),
             "psnr": mean.psnr, "ssim": mean.ssim, "lpips": mean.lpips, "views": rows,
         });
         let bytes = serde_json::to_vec_pretty(&figures)?;

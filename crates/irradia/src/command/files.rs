@@ -1,12 +1,14 @@
 //! `irradia info` and `irradia convert`
 
+use crate::run_folder::scene_of;
+use crate::terminal::say;
 use anyhow::Result;
-use irradia_formats::{describe, read_splats, write_splats};
+use irradia_formats::{SplatFormat, describe, read_splats, write_splats};
 use std::path::PathBuf;
 
 #[derive(clap::Args)]
 pub struct InfoArgs {
-    /// A splat file, a point cloud or a dataset's folder
+    /// A splat file, a run, a point cloud or a dataset's folder
     pub path: PathBuf,
 }
 
@@ -19,13 +21,13 @@ pub struct ConvertArgs {
 }
 
 pub fn info(args: &InfoArgs) -> Result<()> {
-    println!("{}", describe(&args.path)?);
-    Ok(())
+    say(describe(&scene_of(&args.path))?)
 }
 
 pub fn convert(args: &ConvertArgs) -> Result<()> {
-    let cloud = read_splats(&args.input)?;
+    // Reading may take a while: what cannot be written is said first.
+    SplatFormat::of(&args.output)?;
+    let cloud = read_splats(&scene_of(&args.input))?;
     write_splats(&args.output, &cloud)?;
-    println!("{}: {} splats", args.output.display(), cloud.len());
-    Ok(())
+    say(format_args!("{}: {} splats", args.output.display(), cloud.len()))
 }

@@ -1,6 +1,7 @@
 //! What a run writes while it goes: `events.jsonl`, checkpoints, and the curves for its report.
 
 use crate::run_folder::RunFolder;
+use crate::terminal::note;
 use anyhow::{Context, Result};
 use irradia_train::event::{Event, Observer, Signal};
 use irradia_train::report::{CurvePoint, StageReport};
@@ -84,6 +85,7 @@ impl Journal {
                 event["psnr"].as_f64(),
                 event["splats"].as_u64().unwrap_or(0),
             ),
+            Some("warned") => self.warnings.extend(event["message"].as_str().map(str::to_owned)),
             Some("stage_entered") => self.stage(event["stage"].as_str().unwrap_or("").to_owned(), step, seconds),
             _ => {}
         }
@@ -131,7 +133,7 @@ impl Journal {
                 "cannot write {}: {error}; training goes on",
                 self.folder.file("events.jsonl").display()
             );
-            eprintln!("warning: {message}");
+            note(format_args!("warning: {message}"));
             self.warnings.push(message);
         }
     }

@@ -9,7 +9,9 @@ pub mod render;
 pub mod train;
 
 use crate::Usage;
+use crate::terminal::note;
 use anyhow::{Context, Result};
+use clap::builder::RangedU64ValueParser;
 use irradia_formats::{DatasetFormat, DatasetOptions, read_dataset};
 use irradia_measure::Lpips;
 use irradia_scene::Dataset;
@@ -44,7 +46,7 @@ pub struct DataArgs {
     #[arg(long, value_name = "F", default_value_t = 1.0)]
     pub downscale: f32,
     /// Shrink images until the longer side has at most so many pixels
-    #[arg(long, value_name = "PX", conflicts_with = "downscale")]
+    #[arg(long, value_name = "PX", conflicts_with = "downscale", value_parser = clap::value_parser!(u32).range(1..))]
     pub max_side: Option<u32>,
     /// colmap, nerfstudio, blender or llff; recognised from the folder when absent
     #[arg(long)]
@@ -68,7 +70,7 @@ impl DataArgs {
         };
         let dataset = read_dataset(path, &options)?;
         for warning in &dataset.warnings {
-            eprintln!("warning: {warning}");
+            note(format_args!("warning: {warning}"));
         }
         Ok(dataset)
     }
@@ -88,11 +90,13 @@ pub fn lpips(given: Option<&PathBuf>) -> Result<Option<Lpips>> {
     }
 }
 
+/// What `--threads` takes.
+pub fn thread_count() -> RangedU64ValueParser<usize> {
+    RangedU64ValueParser::new().range(1..=1024)
+}
+
 /// Uses `threads` threads, all cores when `None`.
 pub fn use_threads(threads: Option<usize>) -> Result<()> {
-    if threads == Some(0) {
-        return Err(Usage("--threads 0: give 1 or more".into()).into());
-    }
     rayon::ThreadPoolBuilder::new()
         .num_threads(threads.unwrap_or(0))
         .build_global()

@@ -1,5 +1,6 @@
 //! What a run shows on the terminal: a bar, or plain lines where there is no terminal.
 
+use crate::terminal::note;
 use indicatif::{ProgressBar, ProgressStyle};
 use irradia_train::Trainer;
 use irradia_train::event::{Event, Observer, Signal, StepReport};
@@ -15,8 +16,8 @@ pub struct Progress {
     /// Moving mean of the training views' squared error.
     mse: Option<f64>,
     held_out: Option<f64>,
-    /// When the last plain line was printed and the steps made then.
-    last_line: (Instant, u64),
+    /// When the last plain line was printed.
+    last_line: Instant,
     started: Instant,
     first_step: u64,
     stage: String,
@@ -30,13 +31,13 @@ impl Progress {
     pub fn new(stop: Arc<AtomicBool>) -> Self {
         Self {
             bar: std::io::stderr().is_terminal().then(|| {
-                let style = "{bar:30} {pos}/{len} {msg} eta {eta}";
+                let style = "{bar:16} {pos}/{len} eta {eta} {wide_msg}";
                 ProgressBar::new(0).with_style(ProgressStyle::with_template(style).expect("a valid template"))
             }),
             stop,
             mse: None,
             held_out: None,
-            last_line: (Instant::now(), 0),
+            last_line: Instant::now(),
             started: Instant::now(),
             first_step: 0,
             stage: String::new(),
@@ -45,8 +46,8 @@ impl Progress {
 
     fn say(&self, line: &str) {
         match &self.bar {
-            Some(bar) => bar.suspend(|| eprintln!("{line}")),
-            None => eprintln!("{line}"),
+            Some(bar) => bar.suspend(|| note(line)),
+            None => note(line),
         }
     }
 
@@ -56,11 +57,11 @@ impl Progress {
         let rate = (report.step - self.first_step) as f64 / self.started.elapsed().as_secs_f64().max(1e-9);
         let held_out = self.held_out.map_or(String::new(), |p| format!(" held-out {p:.2} dB"));
         let message = format!(
-            "{} loss {:.4} psnr {:.2} dB{held_out} {} splats {rate:.1} steps/s",
-            self.stage,
+            "loss {:.4} psnr {:.2} dB{held_out} {} splats {rate:.1} steps/s {}",
             report.loss,
             -10.0 * mse.log10(),
-            report.splats
+            report.splats,
+            self.stage
         );
         match &self.bar {
             Some(bar) => {
@@ -68,14 +69,14 @@ impl Progress {
                 bar.set_position(report.step);
                 bar.set_message(message);
             }
-            None if self.last_line.0.elapsed() >= LINE_EVERY => {
+            None if self.last_line.elapsed() >= LINE_EVERY => {
                 let left = (trainer.total_steps() - report.step) as f64 / rate;
-                eprintln!(
+                note(format_args!(
                     "step {}/{} {message} eta {left:.0} s",
                     report.step,
                     trainer.total_steps()
-                );
-                self.last_line = (Instant::now(), report.step);
+                ));
+                self.last_line = Instant::now();
             }
             None => {}
         }
@@ -94,6 +95,12 @@ impl Observer for Progress {
             } => {
                 self.first_step = *step;
                 self.stage = trainer.stage_name().to_owned();
+                if let Some(bar) = &self.bar {
+                    // What an earlier session did must not count as done in no time.
+                    bar.set_length(*total_steps);
+                    bar.set_position(*step);
+                    bar.reset_eta();
+                }
                 self.say(&format!(
                     "{recipe}: {splats} splats, {views} views, {total_steps} steps"
                 ));

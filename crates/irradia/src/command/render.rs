@@ -1,8 +1,9 @@
 //! `irradia render`
 
-use super::{DataArgs, Split, file_stem, use_threads};
+use super::{DataArgs, Split, file_stem, thread_count, use_threads};
 use crate::Usage;
-use crate::run_folder::{cameras_beside, render_knobs_beside};
+use crate::run_folder::{cameras_beside, render_knobs_beside, scene_of};
+use crate::terminal::say;
 use anyhow::{Context, Result};
 use glam::Vec3;
 use irradia_formats::{read_splats, write_png};
@@ -12,20 +13,21 @@ use irradia_train::eval::render_image;
 use std::path::PathBuf;
 
 #[derive(clap::Args)]
+#[command(group(clap::ArgGroup::new("cameras").required(true).args(["data", "orbit"])))]
 pub struct Args {
-    /// The scene, such as RUN/scene.ply
+    /// The scene: RUN, or a file; background and filters are taken from the run it lies in
     pub scene: PathBuf,
     /// Render the views of this dataset
-    #[arg(long, conflicts_with = "orbit", required_unless_present = "orbit")]
+    #[arg(long)]
     pub data: Option<PathBuf>,
     /// Which of its views
     #[arg(long, value_enum, default_value_t = Split::Test)]
     pub split: Split,
     /// Render so many frames of a circle around the scene instead
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=100_000))]
     pub orbit: Option<u32>,
     /// Size of the orbit's frames; that of the training images, or 1280x720, when absent
-    #[arg(long, value_name = "WxH", value_parser = parse_size)]
+    #[arg(long, value_name = "WxH", value_parser = parse_size, conflicts_with = "data")]
     pub size: Option<(u32, u32)>,
     /// Folder for the frames
     #[arg(long)]
@@ -37,7 +39,7 @@ pub struct Args {
     #[arg(long)]
     pub alpha: bool,
     /// Threads; all cores when absent
-    #[arg(long)]
+    #[arg(long, value_parser = thread_count())]
     pub threads: Option<usize>,
     #[command(flatten)]
     pub reading: DataArgs,
@@ -53,7 +55,8 @@ pub fn parse_size(text: &str) -> Result<(u32, u32), String> {
 
 pub fn run(args: &Args) -> Result<()> {
     use_threads(args.threads)?;
-    let cloud = read_splats(&args.scene)?;
+    let scene = scene_of(&args.scene);
+    let cloud = read_splats(&scene)?;
     let cameras: Vec<(String, Camera)> = match (&args.data, args.orbit) {
         (Some(data), _) => {
             let dataset = args.reading.read(data)?;
@@ -64,7 +67,7 @@ pub fn run(args: &Args) -> Result<()> {
                 .collect()
         }
         (None, Some(frames)) => {
-            let cameras = orbit(&cloud, cameras_beside(&args.scene), frames, args.size);
+            let cameras = orbit(&cloud, cameras_beside(&scene), frames, args.size);
             cameras
                 .into_iter()
                 .enumerate()
@@ -77,7 +80,7 @@ pub fn run(args: &Args) -> Result<()> {
         return Err(Usage("nothing to render: no such views".into()).into());
     }
     std::fs::create_dir_all(&args.out).with_context(|| format!("cannot make {}", args.out.display()))?;
-    let knobs = render_knobs_beside(&args.scene);
+    let knobs = render_knobs_beside(&scene);
     let options = RenderOptions {
         background: knobs.background,
         antialias: knobs.antialias || cloud.antialiased,
@@ -113,8 +116,7 @@ pub fn run(args: &Args) -> Result<()> {
         }
         write(name, ".depth", &image)?;
     }
-    println!("{} frames in {}", cameras.len(), args.out.display());
-    Ok(())
+    say(format_args!("{} frames in {}", cameras.len(), args.out.display()))
 }
 
 /// A circle around what the training cameras looked at, at their mean distance and height; for a scene without them,

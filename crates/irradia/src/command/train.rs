@@ -2,15 +2,18 @@
 
 use super::journal::Journal;
 use super::progress::Progress;
-use super::{DataArgs, file_stem, lpips, use_threads};
+use super::{DataArgs, file_stem, lpips, thread_count, use_threads};
 use crate::Usage;
 use crate::run_folder::{RunConfig, RunFolder};
-use anyhow::{Context, Result};
+use crate::terminal::{note, one_line, say};
+use anyhow::{Context, Result, anyhow};
+use clap::builder::RangedU64ValueParser;
 use irradia_compute::Level;
 use irradia_formats::{write_png, write_splats};
-use irradia_measure::Evaluation;
+use irradia_measure::{Evaluation, Lpips};
 use irradia_scene::{Image, sh};
 use irradia_train::eval::{EvaluatedView, Metrics, evaluate_views, mean};
+use irradia_train::event::Observer;
 use irradia_train::report::{Report, ViewReport, machine, peak_rss_bytes, to_html};
 use irradia_train::{Recipe, RunLimits, TrainOptions, Trainer, checkpoint};
 use std::path::{Path, PathBuf};
@@ -33,16 +36,16 @@ pub struct Args {
     #[arg(long, value_name = "KEY=VALUE", conflicts_with = "resume")]
     pub set: Vec<String>,
     /// Fit the recipe into so many steps
-    #[arg(long, conflicts_with_all = ["resume", "budget"])]
+    #[arg(long, value_name = "N", conflicts_with_all = ["resume", "budget"], value_parser = clap::value_parser!(u64).range(1..))]
     pub steps: Option<u64>,
     /// Never more splats than this
-    #[arg(long, conflicts_with = "resume")]
+    #[arg(long, value_name = "N", conflicts_with = "resume", value_parser = RangedU64ValueParser::<usize>::new().range(1..))]
     pub max_splats: Option<usize>,
     /// Everything random follows from it
-    #[arg(long, default_value_t = 0, conflicts_with = "resume")]
+    #[arg(long, value_name = "N", default_value_t = 0, conflicts_with = "resume")]
     pub seed: u64,
     /// Threads; all cores when absent. The result does not depend on it
-    #[arg(long)]
+    #[arg(long, value_name = "N", value_parser = thread_count())]
     pub threads: Option<usize>,
     /// Stop when the held-out views reach this
     #[arg(long, value_name = "DB")]
@@ -50,8 +53,8 @@ pub struct Args {
     /// Fit the recipe into a time of training, such as 90s or 5m
     #[arg(long, value_name = "TIME", value_parser = parse_seconds)]
     pub budget: Option<f64>,
-    /// Go on with an interrupted run
-    #[arg(long, value_name = "RUN", conflicts_with_all = ["out", "overwrite"])]
+    /// Go on with an interrupted run, from its newest checkpoint; the result is that of an unbroken run
+    #[arg(long, value_name = "RUN", conflicts_with_all = ["out", "overwrite", "downscale", "max_side", "format"])]
     pub resume: Option<PathBuf>,
     /// Replace the run that --out holds
     #[arg(long)]
@@ -78,13 +81,33 @@ fn parse_seconds(text: &str) -> Result<f64, String> {
 }
 
 pub fn run(args: &Args) -> Result<()> {
-    let started = Instant::now();
     use_threads(args.threads)?;
+    train(args)
+}
+
+/// Trains on the threads that there are.
+pub fn train(args: &Args) -> Result<()> {
+    let started = Instant::now();
+    let lpips = lpips(args.lpips.as_ref())?;
     let (folder, config, trainer) = match &args.resume {
-        Some(run) => resume(run, args)?,
+        Some(run) => {
+            let (folder, config) = RunFolder::open(run)?;
+            if config.complete {
+                return say(format_args!(
+                    "{} is complete: look at {}",
+                    run.display(),
+                    folder.file("report.html").display()
+                ));
+            }
+            resume(folder, config, args)?
+        }
         None => begin(args)?,
     };
-    finish(folder, &config, trainer, args.lpips.as_ref(), started).map(|_| ())
+    let hint = format!(
+        "; when that is put right, go on with: irradia train --resume {}",
+        folder.path().display()
+    );
+    finish(folder, config, trainer, lpips.as_ref(), started).map_err(|error| anyhow!("{}{hint}", one_line(&error)))
 }
 
 /// The recipe of `--recipe`, `--set` and `--max-splats`.
@@ -112,9 +135,7 @@ fn begin(args: &Args) -> Result<(RunFolder, RunConfig, Trainer)> {
         args.out.as_ref().expect("clap asks for it"),
     );
     let recipe = resolve_recipe(args)?;
-    if args.steps == Some(0) {
-        return Err(Usage("--steps 0: give 1 or more".into()).into());
-    }
+    RunFolder::check_free(out, args.overwrite)?;
     let dataset = args.reading.read(data)?;
     let options = TrainOptions {
         seed: args.seed,
@@ -122,7 +143,7 @@ fn begin(args: &Args) -> Result<(RunFolder, RunConfig, Trainer)> {
         ..TrainOptions::default()
     };
     let trainer = Trainer::new(Arc::new(dataset), recipe, options)?;
-    let folder = RunFolder::create(out, args.overwrite)?;
+    let folder = RunFolder::create(out)?;
     let config = RunConfig {
         data: std::path::absolute(data).unwrap_or_else(|_| data.clone()),
         format: args.reading.format.clone(),
@@ -130,6 +151,9 @@ fn begin(args: &Args) -> Result<(RunFolder, RunConfig, Trainer)> {
         max_side: args.reading.max_side,
         until_psnr: args.until_psnr,
         budget: args.budget,
+        seed: args.seed,
+        steps: args.steps,
+        complete: false,
     };
     folder.write_config(&config)?;
     folder.write("recipe.toml", trainer.recipe.to_toml().as_bytes())?;
@@ -137,8 +161,7 @@ fn begin(args: &Args) -> Result<(RunFolder, RunConfig, Trainer)> {
     Ok((folder, config, trainer))
 }
 
-fn resume(run: &Path, args: &Args) -> Result<(RunFolder, RunConfig, Trainer)> {
-    let (folder, mut config) = RunFolder::open(run)?;
+fn resume(folder: RunFolder, mut config: RunConfig, args: &Args) -> Result<(RunFolder, RunConfig, Trainer)> {
     if let Some(data) = &args.data {
         config.data = std::path::absolute(data).unwrap_or_else(|_| data.clone());
     }
@@ -150,23 +173,37 @@ fn resume(run: &Path, args: &Args) -> Result<(RunFolder, RunConfig, Trainer)> {
         format: config.format.clone(),
     };
     let dataset = reading.read(&config.data)?;
-    let path = folder.newest_checkpoint()?;
-    let bytes = std::fs::read(&path).with_context(|| format!("cannot read {}", path.display()))?;
-    let trainer = checkpoint::from_bytes(&bytes, Arc::new(dataset), TrainOptions::default())
-        .with_context(|| path.display().to_string())?;
-    eprintln!("resuming at step {}", trainer.clock.step);
+    let dataset = Arc::new(dataset);
+    let read = |path: &Path| std::fs::read(path).with_context(|| format!("cannot read {}", path.display()));
+    let options = TrainOptions {
+        seed: config.seed,
+        steps: config.steps,
+        ..TrainOptions::default()
+    };
+    let trainer = match folder.newest_checkpoint()? {
+        Some(path) => {
+            checkpoint::from_bytes(&read(&path)?, dataset, options).with_context(|| path.display().to_string())
+        }
+        None => {
+            // Interrupted before its first checkpoint.
+            let path = folder.file("recipe.toml");
+            let text = String::from_utf8_lossy(&read(&path)?).into_owned();
+            let recipe = Recipe::parse(&path.display().to_string(), &text, &[])?;
+            Trainer::new(dataset, recipe, options).map_err(Into::into)
+        }
+    }?;
+    note(format_args!("resuming at step {}", trainer.clock.step));
     Ok((folder, config, trainer))
 }
 
 /// Trains, writes the scene, evaluates and reports.
-pub fn finish(
+fn finish(
     folder: RunFolder,
-    config: &RunConfig,
+    mut config: RunConfig,
     mut trainer: Trainer,
-    lpips_file: Option<&PathBuf>,
+    lpips: Option<&Lpips>,
     started: Instant,
-) -> Result<Report> {
-    let lpips = lpips(lpips_file)?;
+) -> Result<()> {
     let stop = Arc::new(AtomicBool::new(false));
     let asked = stop.clone();
     // The second Ctrl-C does not wait. A handler that is already set (by a test, say) is no reason not to train.
@@ -182,15 +219,20 @@ pub fn finish(
         until_psnr: config.until_psnr,
         budget: config.budget,
     };
-    irradia_train::run(&mut trainer, &limits, &mut [&mut progress, &mut journal])?;
-    if !trainer.finished() {
-        irradia_train::event::Observer::save(&mut journal, &trainer).map_err(anyhow::Error::msg)?;
-    }
+    let ran = irradia_train::run(&mut trainer, &limits, &mut [&mut progress, &mut journal]);
+    // Whatever ended it early, the steps made are kept; a first error is not hidden by a second.
+    let saved = if trainer.finished() || trainer.clock.step == 0 {
+        Ok(None)
+    } else {
+        journal.save(&trainer)
+    };
+    ran?;
     journal.finish();
 
     let mut cloud = trainer.state.splats.to_cloud();
     cloud.antialiased = trainer.recipe.render.antialias;
     write_splats(&folder.file("scene.ply"), &cloud)?;
+    saved.map_err(anyhow::Error::msg)?;
 
     let mut views = Vec::new();
     let mut metrics: Vec<Evaluation> = Vec::new();
@@ -201,7 +243,7 @@ pub fn finish(
         &trainer.dataset,
         &trainer.dataset.test,
         &options,
-        Metrics::All(lpips.as_ref()),
+        Metrics::All(lpips),
         |view| {
             let report = write_view(&folder, &view);
             match report {
@@ -242,16 +284,23 @@ pub fn finish(
     };
     folder.write("report.json", &serde_json::to_vec_pretty(&report)?)?;
     folder.write("report.html", to_html(&report).as_bytes())?;
-    println!(
+    config.complete = trainer.finished();
+    folder.write_config(&config)?;
+    say(format_args!(
         "held-out PSNR {:.2} dB, SSIM {:.4}{}; {} splats, {:.1} s of training",
         report.psnr,
         report.ssim,
         report.lpips.map_or(String::new(), |l| format!(", LPIPS {l:.4}")),
         report.splats,
         report.seconds
-    );
-    println!("look at {}", folder.file("report.html").display());
-    Ok(report)
+    ))?;
+    if !config.complete {
+        say(format_args!(
+            "go on with: irradia train --resume {}",
+            folder.path().display()
+        ))?;
+    }
+    say(format_args!("look at {}", folder.file("report.html").display()))
 }
 
 /// Writes truth, render and error of a held-out view under `eval/`.

@@ -12,6 +12,7 @@
 use super::cameras::{self, FOV_X, Part};
 use super::scene::scene;
 use super::trace::SynthFrame;
+use crate::Usage;
 use anyhow::{Context, Result, ensure};
 use glam::{Mat4, Vec2, Vec3};
 use image::{ExtendedColorType, ImageEncoder, codecs::png::PngEncoder};
@@ -94,11 +95,14 @@ pub fn write_dataset(out: &Path, options: &SynthOptions) -> Result<SynthSummary>
         height,
         seed,
     } = *options;
-    ensure!((3..=1000).contains(&views), "{views} views: give between 3 and 1000");
+    ensure!(
+        (3..=1000).contains(&views),
+        Usage(format!("{views} views: give between 3 and 1000"))
+    );
     let size = 8..=4096;
     ensure!(
         size.contains(&width) && size.contains(&height),
-        "size {width}x{height}: give between 8 and 4096 pixels a side"
+        Usage(format!("size {width}x{height}: give between 8 and 4096 pixels a side"))
     );
     let mut scene = scene();
     let parts = [

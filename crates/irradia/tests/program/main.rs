@@ -1,0 +1,7 @@
+//! The program `irradia` as its users meet it: a process with arguments, folders, an exit code and two streams.
+
+mod bad_input;
+mod outputs;
+mod process;
+mod real_data;
+mod reproducible;

@@ -1,0 +1,167 @@
+//! Runs the program, and makes what most tests start from once: a small dataset and a short run on it.
+
+use serde_json::Value;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output, Stdio};
+use std::sync::OnceLock;
+use tempfile::TempDir;
+
+/// Density control within the few steps that a test can wait for.
+pub const LIVELY: [&str; 4] = [
+    "--set",
+    "stage.grow.density.every=10",
+    "--set",
+    "stage.grow.density.reset_every=40",
+];
+
+/// How the program ended and what it said.
+#[derive(Debug)]
+pub struct Ended {
+    pub code: Option<i32>,
+    pub stdout: String,
+    pub stderr: String,
+}
+
+impl From<Output> for Ended {
+    fn from(output: Output) -> Self {
+        Self {
+            code: output.status.code(),
+            stdout: String::from_utf8_lossy(&output.stdout).into_owned(),
+            stderr: String::from_utf8_lossy(&output.stderr).into_owned(),
+        }
+    }
+}
+
+impl Ended {
+    /// It did what was asked.
+    pub fn well(self) -> Self {
+        assert_eq!(self.code, Some(0), "{self:#?}");
+        self
+    }
+
+    /// It refused with `code` and exactly one line of error that has all of `words`.
+    pub fn refused(self, code: i32, words: &[&str]) -> Self {
+        assert_eq!(self.code, Some(code), "{self:#?}");
+        assert!(!self.stderr.contains("panicked"), "{self:#?}");
+        let errors: Vec<&str> = self.stderr.lines().filter(|line| line.starts_with("error:")).collect();
+        assert_eq!(errors.len(), 1, "{self:#?}");
+        for word in words {
+            let times = errors[0].matches(word).count();
+            assert!(times > 0, "the error does not say {word:?}: {}", errors[0]);
+        }
+        self
+    }
+}
+
+/// The program, to be run in `folder`, where no weights of LPIPS are found.
+pub fn program(folder: &Path) -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_irradia"));
+    command.current_dir(folder).env_remove("IRRADIA_LPIPS");
+    command
+        .stdin(Stdio::null())
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped());
+    command
+}
+
+/// Runs the program in `folder`; words of `line` are its arguments.
+pub fn irradia(folder: &Path, line: &str) -> Ended {
+    irradia_with(folder, line, &[])
+}
+
+/// Likewise with `more` arguments, which may hold spaces.
+pub fn irradia_with(folder: &Path, line: &str, more: &[&str]) -> Ended {
+    let mut command = program(folder);
+    command.args(line.split_whitespace()).args(more);
+    command.output().expect("the program starts").into()
+}
+
+/// A fresh folder in which `data` is a copy of the small dataset: 8 views to train on, 2 held out, 48 x 48.
+pub fn with_data() -> TempDir {
+    static MADE: OnceLock<PathBuf> = OnceLock::new();
+    copied(MADE.get_or_init(|| {
+        let folder = emptied("with_data");
+        irradia(&folder, "synth data --views 8 --size 48x48").well();
+        folder
+    }))
+}
+
+/// A fresh folder with the small dataset and, in `run`, 60 steps on it.
+pub fn with_run() -> TempDir {
+    static MADE: OnceLock<PathBuf> = OnceLock::new();
+    copied(MADE.get_or_init(|| {
+        let folder = emptied("with_run");
+        copy(with_data().path(), &folder);
+        irradia_with(&folder, "train data --out run --steps 60 --seed 7", &LIVELY).well();
+        folder
+    }))
+}
+
+/// A folder that outlives the tests (nothing drops what is static) and that the next ones make anew.
+fn emptied(name: &str) -> PathBuf {
+    let folder = Path::new(env!("CARGO_TARGET_TMPDIR")).join(name);
+    let _ = fs::remove_dir_all(&folder);
+    fs::create_dir_all(&folder).expect("a folder");
+    folder
+}
+
+fn copied(from: &Path) -> TempDir {
+    let folder = tempfile::tempdir_in(env!("CARGO_TARGET_TMPDIR")).expect("a folder");
+    copy(from, folder.path());
+    folder
+}
+
+fn copy(from: &Path, to: &Path) {
+    for entry in fs::read_dir(from).expect("a folder") {
+        let source = entry.expect("an entry").path();
+        let target = to.join(source.file_name().expect("a name"));
+        if source.is_dir() {
+            fs::create_dir_all(&target).expect("a folder");
+            copy(&source, &target);
+        } else {
+            fs::copy(&source, &target).expect("a copy");
+        }
+    }
+}
+
+/// All files under `folder`, by path.
+pub fn files_under(folder: &Path) -> Vec<PathBuf> {
+    let mut files = Vec::new();
+    for entry in fs::read_dir(folder).expect("a folder") {
+        let path = entry.expect("an entry").path();
+        if path.is_dir() {
+            files.extend(files_under(&path));
+        } else {
+            files.push(path);
+        }
+    }
+    files.sort();
+    files
+}
+
+/// Nothing that was being written when something went wrong stayed under `folder`.
+pub fn assert_no_leftovers(folder: &Path) {
+    for file in files_under(folder) {
+        assert!(!file.to_string_lossy().ends_with(".tmp"), "{}", file.display());
+    }
+}
+
+/// A JSON file.
+pub fn json(path: &Path) -> Value {
+    let text = fs::read_to_string(path).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
+    serde_json::from_str(&text).unwrap_or_else(|error| panic!("{}: {error}", path.display()))
+}
+
+/// The events of a run, every line of which must be JSON.
+pub fn events(run: &Path) -> Vec<Value> {
+    let text = fs::read_to_string(run.join("events.jsonl")).expect("events");
+    text.lines()
+        .map(|line| serde_json::from_str(line).unwrap_or_else(|error| panic!("{error}: {line}")))
+        .collect()
+}
+
+/// The bytes of a run's scene.
+pub fn scene(run: &Path) -> Vec<u8> {
+    fs::read(run.join("scene.ply")).expect("a scene")
+}

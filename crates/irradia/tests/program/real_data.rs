@@ -1,0 +1,74 @@
+//! The real scenes of `../shared/data`: each trains with no flags but those that make it small, and stays small itself.
+
+use crate::process::*;
+use std::path::PathBuf;
+
+/// The shared data; `None`, said loudly, where it is absent.
+fn shared() -> Option<PathBuf> {
+    let path = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../../../shared/data");
+    if path.is_dir() {
+        return Some(path.canonicalize().expect("it is there"));
+    }
+    assert!(
+        std::env::var_os("IRRADIA_REQUIRE_SHARED").is_none(),
+        "{} is missing",
+        path.display()
+    );
+    eprintln!("SKIPPED (no ../shared): {}", module_path!());
+    None
+}
+
+#[test]
+fn every_scene_trains() {
+    let Some(shared) = shared() else { return };
+    // Scene, warnings, and the held-out PSNR that 150 steps on small pictures must reach, about 1.5 dB below what they do.
+    let cases = [
+        ("fox", 1, 18.4),
+        ("fox_colmap", 0, 18.5),
+        ("chair", 0, 21.9),
+        ("fern", 1, 21.1),
+        ("lund_door", 0, 21.5),
+        ("maryRose", 1, 16.8),
+    ];
+    let folder = tempfile::tempdir().expect("a folder");
+    for (scene, warnings, at_least) in cases {
+        let data = shared.join(scene).display().to_string();
+        let line = format!("--out {scene} --steps 150 --max-side 120");
+        let ended = irradia_with(folder.path(), &format!("train {line}"), &[&data]).well();
+        let told = ended.stderr.lines().filter(|line| line.starts_with("warning:")).count();
+        assert_eq!(told, warnings, "{scene}: {}", ended.stderr);
+        let psnr = json(&folder.path().join(scene).join("report.json"))["psnr"]
+            .as_f64()
+            .expect("a number");
+        eprintln!("{scene}: {psnr:.2} dB");
+        assert!(psnr > at_least, "{scene}: {psnr}");
+    }
+}
+
+#[test]
+fn fox_takes_less_than_400_megabytes_and_lpips_finds_its_weights() {
+    let Some(shared) = shared() else { return };
+    let folder = tempfile::tempdir().expect("a folder");
+    let (data, weights) = (
+        shared.join("fox_colmap"),
+        shared.join("lpips/lpips_squeeze.safetensors"),
+    );
+    let more = [&data, &weights].map(|path| path.display().to_string());
+    irradia_with(
+        folder.path(),
+        "train --out run --steps 60 --lpips",
+        &[&more[1], &more[0]],
+    )
+    .well();
+    let report = json(&folder.path().join("run/report.json"));
+    assert!(
+        report["peak_rss_bytes"].as_u64() < Some(400_000_000),
+        "{}",
+        report["peak_rss_bytes"]
+    );
+    assert!(
+        report["lpips"].as_f64().is_some_and(|l| l > 0.0 && l < 1.0),
+        "{}",
+        report["lpips"]
+    );
+}

@@ -135,10 +135,12 @@ pub trait Lanes:
     fn recip(self) -> Self;
     /// Sum of the lanes, in a fixed order.
     fn sum(self) -> Self::Scalar;
-    /// Sums of several vectors at once.
+    /// Writes the sums of several vectors; N must be a multiple of four.
     #[inline(always)]
-    fn sums<const N: usize>(vectors: [Self; N]) -> [Self::Scalar; N] {
-        vectors.map(Self::sum)
+    fn sums<const N: usize>(vectors: [Self; N], to: &mut [Self::Scalar; N]) {
+        for i in 0..N {
+            to[i] = vectors[i].sum();
+        }
     }
     /// `f` of every lane, one at a time: for functions that are not worth a vector version.
     #[inline(always)]
@@ -335,8 +337,10 @@ mod tests {
             assert!(a.lt(simd.splat(-100.0)).or(a.lt(simd.splat(-200.0))).none());
             let n = S::LANES as f32;
             assert_eq!(a.sum(), n * (n - 1.0) / 2.0 - 3.5 * n);
-            let many = [a, b, a, b, b, b, b, a, b, a, b];
-            assert_eq!(S::F::sums(many), many.map(S::F::sum));
+            let many = [a, b, a, b, b, b, b, a];
+            let mut sums = [0.0; 8];
+            S::F::sums(many, &mut sums);
+            assert_eq!(sums, many.map(S::F::sum));
             let nan = simd.splat(f64::NAN);
             assert!(nan.lt(b).none() && nan.le(b).none());
             assert_eq!(simd.splat(-1000.0).exp2().sum(), simd.splat(-126.0).exp2().sum());

@@ -174,8 +174,8 @@ macro_rules! float_lanes {
                 unsafe { $sum }
             }
             #[inline(always)]
-            fn sums<const N: usize>(vectors: [Self; N]) -> [f32; N] {
-                $sums(vectors)
+            fn sums<const N: usize>(vectors: [Self; N], to: &mut [f32; N]) {
+                $sums(vectors, to)
             }
         }
 
@@ -315,51 +315,38 @@ unsafe fn sums_of_four_quads(a: __m128, b: __m128, c: __m128, d: __m128) -> __m1
     }
 }
 
-#[inline(always)]
-fn sums_in_fours<const N: usize>(quad: impl Fn(usize) -> __m128) -> [f32; N] {
-    let mut out = [0.0; N];
-    let mut i = 0;
-    while i < N {
-        let last = N - 1;
-        let mut four = [0.0f32; 4];
-        // SAFETY: SSE is part of x86-64; `four` is as long as the store.
-        unsafe {
-            let s = sums_of_four_quads(
-                quad(i),
-                quad((i + 1).min(last)),
-                quad((i + 2).min(last)),
-                quad((i + 3).min(last)),
-            );
-            _mm_storeu_ps(four.as_mut_ptr(), s);
+/// A macro and not a function with a closure, which would not inherit the instruction set (see `each!`).
+macro_rules! sums_in_fours {
+    ($vectors:ident, $to:ident, |$v:ident| $quad:expr) => {{
+        let (chunks, rest) = $to.as_chunks_mut::<4>();
+        assert!(rest.is_empty(), "a multiple of four");
+        for (i, to) in chunks.iter_mut().enumerate() {
+            // SAFETY: a vector proves the instruction set; `to` is as long as the store.
+            unsafe {
+                let [a, b, c, d] = $crate::each!(k in 4 => {
+                    let $v = $vectors[4 * i + k].0;
+                    $quad
+                });
+                _mm_storeu_ps(to.as_mut_ptr(), sums_of_four_quads(a, b, c, d));
+            }
         }
-        let count = (N - i).min(4);
-        out[i..i + count].copy_from_slice(&four[..count]);
-        i += 4;
-    }
-    out
+    }};
 }
 
 #[inline(always)]
-fn sums_of_8<const N: usize>(vectors: [F32x8; N]) -> [f32; N] {
-    // SAFETY: a vector proves the instruction set.
-    sums_in_fours(|i| unsafe {
-        _mm_add_ps(
-            _mm256_castps256_ps128(vectors[i].0),
-            _mm256_extractf128_ps::<1>(vectors[i].0),
-        )
-    })
+fn sums_of_8<const N: usize>(vectors: [F32x8; N], to: &mut [f32; N]) {
+    sums_in_fours!(vectors, to, |v| _mm_add_ps(
+        _mm256_castps256_ps128(v),
+        _mm256_extractf128_ps::<1>(v)
+    ));
 }
 
 #[inline(always)]
-fn sums_of_16<const N: usize>(vectors: [F32x16; N]) -> [f32; N] {
-    // SAFETY: a vector proves the instruction set.
-    sums_in_fours(|i| unsafe {
-        let half = _mm256_add_ps(
-            _mm512_castps512_ps256(vectors[i].0),
-            _mm512_extractf32x8_ps::<1>(vectors[i].0),
-        );
+fn sums_of_16<const N: usize>(vectors: [F32x16; N], to: &mut [f32; N]) {
+    sums_in_fours!(vectors, to, |v| {
+        let half = _mm256_add_ps(_mm512_castps512_ps256(v), _mm512_extractf32x8_ps::<1>(v));
         _mm_add_ps(_mm256_castps256_ps128(half), _mm256_extractf128_ps::<1>(half))
-    })
+    });
 }
 
 impl Mask for Mask16 {

@@ -40,8 +40,8 @@ pub(super) const TILE_PIXELS: usize = TILE * TILE;
 /// Channels a tile's forward state has: red, green, blue, depth, transmittance; `[channel, block, pixel]`.
 pub(super) const CHANNELS: usize = 5;
 /// Sums a splat collects in each tile, in this order: the moments 1, dx, dy, dx^2, dx dy, dy^2 of v_p / ln 2, then the
-/// gradients of red, green, blue and depth.
-pub(super) const SUMS: usize = 10;
+/// gradients of red, green, blue and depth; two more fill up whole vectors.
+pub(super) const SUMS: usize = 12;
 
 /// What happens to one vector of pixels when a splat passes over it.
 pub(super) struct Fragment<F: Lanes> {
@@ -87,17 +87,17 @@ pub(super) fn fragment_vjp<F: Lanes>(at: &Fragment<F>, transmittance: F, g: F, r
 }
 
 /// Blends one tile front to back into `out [CHANNELS, blocks, BLOCK]`.
-pub(super) struct BlendTile<'a> {
+pub(super) struct BlendTile<'a, I> {
     pub footprints: &'a [Footprint2d],
     /// The tile's splats, front to back.
-    pub entries: &'a [Entry],
+    pub entries: I,
     /// Pixel coordinates of the tile's corner.
     pub corner: [f32; 2],
     pub with_depth: bool,
     pub out: &'a mut [f32; CHANNELS * TILE_PIXELS],
 }
 
-impl Kernel for BlendTile<'_> {
+impl<I: Iterator<Item = Entry>> Kernel for BlendTile<'_, I> {
     type Output = ();
 
     #[inline(always)]
@@ -113,7 +113,7 @@ impl Kernel for BlendTile<'_> {
     }
 }
 
-impl BlendTile<'_> {
+impl<I: Iterator<Item = Entry>> BlendTile<'_, I> {
     #[inline(always)]
     fn blend<S: Simd, const DEPTH: bool>(self, simd: S)
     where
@@ -126,9 +126,9 @@ impl BlendTile<'_> {
         let (green, colors) = colors.split_at_mut(TILE_PIXELS);
         let (blue, depths) = colors.split_at_mut(TILE_PIXELS);
         // Bit b: some pixel of block b has not ended.
-        let mut live = u32::from(u16::MAX);
+        let mut live = u64::MAX;
         for entry in self.entries {
-            let blocks = u32::from(entry.blocks) & live;
+            let blocks = entry.blocks & live;
             if blocks == 0 {
                 if live == 0 {
                     return;
@@ -177,15 +177,15 @@ impl BlendTile<'_> {
 
 /// The bits of `blocks` that lie in `band`, from bit 0.
 #[inline(always)]
-fn band_blocks(blocks: u32, band: usize) -> u32 {
-    blocks >> (band * BAND_BLOCKS) & ((1 << BAND_BLOCKS) - 1)
+fn band_blocks(blocks: u64, band: usize) -> u32 {
+    (blocks >> (band * BAND_BLOCKS)) as u32 & ((1 << BAND_BLOCKS) - 1)
 }
 
 /// The bit of `block` if all its pixels have ended, else 0.
 #[inline(always)]
-fn ended_block(transmittances: &[f32], block: usize) -> u32 {
+fn ended_block(transmittances: &[f32], block: usize) -> u64 {
     let all = transmittances[block * BLOCK..][..BLOCK].iter().all(|t| *t < 0.0);
-    u32::from(all) << block
+    u64::from(all) << block
 }
 
 /// `p` over a band of a tile, with all that does not depend on the row worked out.
@@ -246,25 +246,28 @@ const PIXEL_Y: [f32; BLOCK] = [
     0.5, 0.5, 0.5, 0.5, 0.5, 0.5, 0.5, 0.5, 1.5, 1.5, 1.5, 1.5, 1.5, 1.5, 1.5, 1.5,
 ];
 /// Top edges of a band's blocks.
-const BLOCK_TOP: [f32; BAND_BLOCKS] = [0.0, 2.0, 4.0, 6.0, 8.0, 10.0, 12.0, 14.0];
+const BLOCK_TOP: [f32; BAND_BLOCKS] = [
+    0.0, 2.0, 4.0, 6.0, 8.0, 10.0, 12.0, 14.0, 16.0, 18.0, 20.0, 22.0, 24.0, 26.0, 28.0, 30.0,
+];
 
-/// Walks one tile front to back again and gives every entry's [`SUMS`] to `emit`.
+/// Walks one tile front to back again and writes every entry's [`SUMS`].
 ///
 /// Front to back, as forward: every test then has the very operands it had there. What lies behind is known because the
 /// whole pixel is: `rest` starts at the pixel's total and loses each splat's part.
-pub(super) struct BlendTileVjp<'a, E: Fn(&Entry, [f32; SUMS])> {
+pub(super) struct BlendTileVjp<'a, I> {
     pub footprints: &'a [Footprint2d],
-    pub entries: &'a [Entry],
+    pub entries: I,
     pub corner: [f32; 2],
     /// Gradients of red, green, blue and depth over the tile, `[4, blocks, BLOCK]`; zero outside the image.
     pub v_out: &'a [f32; (CHANNELS - 1) * TILE_PIXELS],
     /// `color . v_color + depth v_depth - T v_alpha`, background included, `[blocks, BLOCK]`; overwritten.
     pub rest: &'a mut [f32; TILE_PIXELS],
     pub with_depth: bool,
-    pub emit: E,
+    /// The entries' sums, in their order.
+    pub sums: &'a mut [[f32; SUMS]],
 }
 
-impl<E: Fn(&Entry, [f32; SUMS])> Kernel for BlendTileVjp<'_, E> {
+impl<I: Iterator<Item = Entry>> Kernel for BlendTileVjp<'_, I> {
     type Output = ();
 
     #[inline(always)]
@@ -280,7 +283,7 @@ impl<E: Fn(&Entry, [f32; SUMS])> Kernel for BlendTileVjp<'_, E> {
     }
 }
 
-impl<E: Fn(&Entry, [f32; SUMS])> BlendTileVjp<'_, E> {
+impl<I: Iterator<Item = Entry>> BlendTileVjp<'_, I> {
     #[inline(always)]
     fn backward<S: Simd, const DEPTH: bool>(self, simd: S)
     where
@@ -289,11 +292,11 @@ impl<E: Fn(&Entry, [f32; SUMS])> BlendTileVjp<'_, E> {
         let mut transmittances = [1.0f32; TILE_PIXELS];
         let [v_red, v_green, v_blue, v_depth] = std::array::from_fn(|c| &self.v_out[c * TILE_PIXELS..][..TILE_PIXELS]);
         let zero = simd.splat(0.0);
-        let mut live = u32::from(u16::MAX);
-        for entry in self.entries {
-            let blocks = u32::from(entry.blocks) & live;
+        let mut live = u64::MAX;
+        for (entry, out) in self.entries.zip(self.sums) {
+            let blocks = entry.blocks & live;
             if blocks == 0 {
-                (self.emit)(entry, [0.0; SUMS]);
+                *out = [0.0; SUMS];
                 continue;
             }
             let s = &self.footprints[entry.splat as usize];
@@ -365,7 +368,7 @@ impl<E: Fn(&Entry, [f32; SUMS])> BlendTileVjp<'_, E> {
             }
             let [s0, s1, s2, s3, s4, s5] = sums;
             let [c0, c1, c2, c3] = v_color;
-            (self.emit)(entry, S::F::sums([s0, s1, s2, s3, s4, s5, c0, c1, c2, c3]));
+            S::F::sums([s0, s1, s2, s3, s4, s5, c0, c1, c2, c3, zero, zero], out);
         }
     }
 }

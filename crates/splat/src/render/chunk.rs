@@ -9,7 +9,6 @@ use crate::Splats;
 use irradia_compute::each;
 use irradia_compute::simd::{Kernel, Lanes, Mask, Simd};
 use irradia_scene::sh::coefficients;
-use std::sync::atomic::Ordering::Relaxed;
 
 #[inline(always)]
 fn load_geometry<S: Simd>(simd: S, splats: &Splats, at: usize) -> Geometry<S::F>
@@ -147,7 +146,7 @@ impl Kernel for ProjectChunkVjp<'_, '_> {
         let antialias = renderer.options.antialias;
         for at in (0..chunk.active.len()).step_by(S::LANES) {
             let first = self.first + at;
-            // Sum each visible splat's slots, in their order; [sum, lane]. What invisible lanes hold is masked below.
+            // Sum each visible splat's entries, in their order; [sum, lane]. What invisible lanes hold is masked below.
             let mut sums = [[0.0f32; 16]; SUMS];
             let mut image = [[1.0f32; 16]; 7];
             let mut visible = [0.0f32; 16];
@@ -157,10 +156,9 @@ impl Kernel for ProjectChunkVjp<'_, '_> {
                 }
                 visible[lane] = 1.0;
                 let mut total = [0.0f32; SUMS];
-                for slot in renderer.bins.slots(first + lane) {
-                    let from = &renderer.sums[slot * SUMS..][..SUMS];
-                    for (total, from) in total.iter_mut().zip(from) {
-                        *total += f32::from_bits(from.load(Relaxed));
+                for position in renderer.bins.positions(first + lane) {
+                    for (total, from) in total.iter_mut().zip(&renderer.sums[position]) {
+                        *total += from;
                     }
                 }
                 for (to, total) in sums.iter_mut().zip(total) {

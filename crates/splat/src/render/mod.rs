@@ -24,8 +24,6 @@ use chunk::{GradientChunk, ProjectChunk, ProjectChunkVjp};
 use irradia_compute::Planes;
 use irradia_compute::simd::Level;
 use rayon::prelude::*;
-use std::cell::RefCell;
-use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
 
 /// How a frame is rendered.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -92,8 +90,8 @@ pub struct Renderer {
     color: Vec<f32>,
     alpha: Vec<f32>,
     depth: Vec<f32>,
-    /// `[slots, SUMS]` as bits: tiles write them in any order, each to its own place.
-    sums: Vec<AtomicU32>,
+    /// Gradients of each entry, tile by tile.
+    sums: Vec<[f32; SUMS]>,
 }
 
 impl Default for Renderer {
@@ -158,15 +156,9 @@ impl Renderer {
 
     /// Splat-pixel pairs that the last frame's blending visited (whole blocks of 16), for benchmarks.
     pub fn pairs(&self) -> u64 {
-        let mut entries = Vec::new();
         (0..self.bins.tile_count())
-            .map(|tile| {
-                self.bins.tile_entries(tile, &mut entries);
-                entries
-                    .iter()
-                    .map(|e| u64::from(e.blocks.count_ones()) * BLOCK as u64)
-                    .sum::<u64>()
-            })
+            .flat_map(|tile| self.bins.tile(tile))
+            .map(|entry| u64::from(entry.blocks.count_ones()) * BLOCK as u64)
             .sum()
     }
 
@@ -212,14 +204,12 @@ impl Renderer {
             .par_iter_mut()
             .enumerate()
             .for_each(|(tile, out)| {
-                with_entries(bins, tile, |entries| {
-                    level.run(BlendTile {
-                        footprints,
-                        entries,
-                        corner: corner(bins, tile),
-                        with_depth: options.depth,
-                        out,
-                    });
+                level.run(BlendTile {
+                    footprints,
+                    entries: bins.tile(tile),
+                    corner: corner(bins, tile),
+                    with_depth: options.depth,
+                    out,
                 });
             });
 
@@ -283,18 +273,24 @@ impl Renderer {
 
     fn blend_vjp(&mut self, view: &ViewParams, v_out: &OutputGradient) {
         let (width, height) = (view.width as usize, view.height as usize);
-        let needed = self.bins.entry_count() * SUMS;
-        if self.sums.len() < needed {
-            self.sums.resize_with(needed, AtomicU32::default);
-        }
-        let (level, bins, footprints, sums) = (self.level, &self.bins, &self.footprints, &self.sums);
+        self.sums.resize(self.bins.entry_count(), [0.0; SUMS]);
+        let (level, bins, footprints) = (self.level, &self.bins, &self.footprints);
+        let mut rest_of_sums = &mut self.sums[..];
+        let sums: Vec<&mut [[f32; SUMS]]> = (0..bins.tile_count())
+            .map(|tile| {
+                rest_of_sums
+                    .split_off_mut(..bins.tile_range(tile).len())
+                    .expect("as many as entries")
+            })
+            .collect();
         let background = self.options.background;
         self.tiles
             .as_chunks::<{ CHANNELS * TILE_PIXELS }>()
             .0
             .par_iter()
+            .zip(sums)
             .enumerate()
-            .for_each(|(tile, state)| {
+            .for_each(|(tile, (state, sums))| {
                 let mut v_tile = [0.0f32; (CHANNELS - 1) * TILE_PIXELS];
                 let mut rest = [0.0f32; TILE_PIXELS];
                 let (x0, y0) = ((tile % bins.tiles_x) * TILE, (tile / bins.tiles_x) * TILE);
@@ -326,21 +322,14 @@ impl Renderer {
                         }
                     }
                 }
-                with_entries(bins, tile, |entries| {
-                    level.run(BlendTileVjp {
-                        footprints,
-                        entries,
-                        corner: corner(bins, tile),
-                        v_out: &v_tile,
-                        rest: &mut rest,
-                        with_depth: v_out.depth.is_some(),
-                        emit: |entry: &bin::Entry, values: [f32; SUMS]| {
-                            let to = &sums[entry.slot as usize * SUMS..][..SUMS];
-                            for (to, value) in to.iter().zip(values) {
-                                to.store(value.to_bits(), Relaxed);
-                            }
-                        },
-                    });
+                level.run(BlendTileVjp {
+                    footprints,
+                    entries: bins.tile(tile),
+                    corner: corner(bins, tile),
+                    v_out: &v_tile,
+                    rest: &mut rest,
+                    with_depth: v_out.depth.is_some(),
+                    sums,
                 });
             });
     }
@@ -404,15 +393,4 @@ fn corner(bins: &Bins, tile: usize) -> [f32; 2] {
         ((tile % bins.tiles_x) * TILE) as f32,
         ((tile / bins.tiles_x) * TILE) as f32,
     ]
-}
-
-/// Lists a tile's entries in a buffer that each thread keeps.
-fn with_entries(bins: &Bins, tile: usize, work: impl FnOnce(&[bin::Entry])) {
-    thread_local! {
-        static ENTRIES: RefCell<Vec<bin::Entry>> = const { RefCell::new(Vec::new()) };
-    }
-    ENTRIES.with_borrow_mut(|entries| {
-        bins.tile_entries(tile, entries);
-        work(entries);
-    });
 }

@@ -1,83 +1,262 @@
-//! The committed benchmark: `cargo run --release -p irradia --example speed -- DATA [steps]`.
+//! The committed benchmark.
 //!
-//! Trains with the `classic` recipe for the given steps (500) without density control, at full resolution, and prints the
-//! CPU time a step with its parts; then rates of the blend's inner loop.
+//! ```text
+//! cargo run --release -p irradia --example speed -- steps DATA [STEPS]   a training step and its parts
+//! cargo run --release -p irradia --example speed -- blend                the blend's inner loop
+//! cargo run --release -p irradia --example speed -- frame SCENE.ply      a frame of a million splats, and how cost grows
+//! ```
+//!
+//! CPU time stands beside wall time: on a shared machine it is the steadier of the two.
 
-use anyhow::{Context, Result};
+use anyhow::{Context, Result, bail};
 use cpu_time::ProcessTime;
-use irradia_formats::{DatasetOptions, read_dataset};
-use irradia_splat::{OutputGradient, RenderOptions, Renderer, SplatGradients, ViewParams};
+use glam::Vec3;
+use irradia_formats::{DatasetOptions, read_dataset, read_splats};
+use irradia_scene::{Camera, GaussianCloud, Intrinsics, Pose, Rng};
+use irradia_splat::{OutputGradient, RenderOptions, Renderer, SplatGradients, SplatState, Splats, ViewParams};
 use irradia_train::{Recipe, TrainOptions, Trainer};
 use std::sync::Arc;
 use std::time::Instant;
 
 fn main() -> Result<()> {
-    let mut args = std::env::args().skip(1);
-    let data = args.next().context("give a dataset's folder")?;
-    let steps: u64 = args.next().map_or(Ok(500), |s| s.parse())?;
+    let args: Vec<String> = std::env::args().skip(1).collect();
+    match args.iter().map(String::as_str).collect::<Vec<_>>()[..] {
+        ["steps", data] => steps(data, 500),
+        ["steps", data, count] => steps(data, count.parse()?),
+        ["blend"] => blend(),
+        ["frame", scene] => frame(scene),
+        _ => bail!("say: steps DATA [STEPS], blend, or frame SCENE.ply"),
+    }
+}
+
+/// Wall and CPU milliseconds of one call, the mean of `repeats` after one to warm up.
+fn time(repeats: u32, mut work: impl FnMut()) -> (f64, f64) {
+    work();
+    let (wall, cpu) = (Instant::now(), ProcessTime::now());
+    for _ in 0..repeats {
+        work();
+    }
+    let each = |seconds: f64| 1e3 * seconds / f64::from(repeats);
+    (each(wall.elapsed().as_secs_f64()), each(cpu.elapsed().as_secs_f64()))
+}
+
+/// The `classic` recipe's first steps at full resolution without density control; then forward and backward alone.
+fn steps(data: &str, steps: u64) -> Result<()> {
     let dataset = Arc::new(read_dataset(data.as_ref(), &DatasetOptions::default())?);
-    let recipe = Recipe::parse("classic", Recipe::built_in("classic")?, &["eval_every=1000000".into()])?;
-    let mut fixed = recipe.clone();
-    for stage in &mut fixed.stage {
+    let mut recipe = Recipe::parse("classic", Recipe::built_in("classic")?, &[])?;
+    for stage in &mut recipe.stage {
         stage.density = None;
     }
-    let mut trainer = Trainer::new(dataset.clone(), fixed, TrainOptions::default())?;
-    let started = Instant::now();
-    let mut mse = 0.0;
+    let mut trainer = Trainer::new(dataset.clone(), recipe, TrainOptions::default())?;
     for _ in 0..steps {
-        mse = trainer.step(&mut Vec::new())?.mse;
+        trainer.step(&mut Vec::new())?;
     }
     println!(
-        "{steps} steps, {} splats: {:.2} ms wall, {:.2} ms CPU a step ({:.1} s with loading), last training PSNR {:.2} dB",
+        "{steps} steps, {} splats: {:.2} ms wall, {:.2} ms CPU a step",
         trainer.state.len(),
         1e3 * trainer.seconds / steps as f64,
         1e3 * trainer.cpu_seconds / steps as f64,
-        started.elapsed().as_secs_f64(),
-        -10.0 * mse.log10()
     );
-
-    // The parts, over a few views, with what was trained.
-    let mut renderer = Renderer::new();
+    let views: Vec<ViewParams> = dataset
+        .train
+        .iter()
+        .take(10)
+        .map(|i| ViewParams::new(&dataset.views[*i].camera))
+        .collect();
     let options = RenderOptions {
         sh_degree: 0,
         ..RenderOptions::default()
     };
+    report_parts(&trainer.state.splats, &views, &options);
+    Ok(())
+}
+
+/// Forward and backward over `views`.
+fn report_parts(splats: &Splats, views: &[ViewParams], options: &RenderOptions) {
+    let mut renderer = Renderer::new();
     let mut gradients = SplatGradients::default();
-    let (mut forward, mut backward, mut pairs, mut entries) = (0.0, 0.0, 0, 0);
-    let views = &dataset.train[..10.min(dataset.train.len())];
-    for repeat in 0..4 {
-        for view in views {
-            let view = ViewParams::new(&dataset.views[*view].camera);
-            let v_color = vec![1e-6; 3 * (view.width * view.height) as usize];
-            let start = ProcessTime::now();
-            renderer.render(&trainer.state.splats, &view, &options);
-            let middle = ProcessTime::now();
-            renderer.backward(
-                &trainer.state.splats,
-                &OutputGradient {
-                    color: &v_color,
-                    alpha: None,
-                    depth: None,
-                },
-                &mut gradients,
-            );
-            if repeat > 0 {
-                forward += middle.duration_since(start).as_secs_f64();
-                backward += middle.elapsed().as_secs_f64();
-                pairs += renderer.pairs();
-                entries += renderer.tile_entries();
-            }
-        }
+    let n = views.len() as f64;
+    let (mut pairs, mut entries) = (0, 0);
+    for view in views {
+        renderer.render(splats, view, options);
+        pairs += renderer.pairs();
+        entries += renderer.tile_entries();
     }
-    let n = 3.0 * views.len() as f64;
+    let forward = time(3, || {
+        views.iter().for_each(|view| renderer.render(splats, view, options))
+    });
+    let both = time(3, || {
+        for view in views {
+            renderer.render(splats, view, options);
+            let v_color = vec![1e-6; renderer.color().len()];
+            let v_out = OutputGradient {
+                color: &v_color,
+                alpha: None,
+                depth: None,
+            };
+            renderer.backward(splats, &v_out, &mut gradients);
+        }
+    });
     println!(
-        "forward {:.2} ms, backward {:.2} ms CPU a frame; {:.2} M pairs, {:.1} k tile entries; {:.2} G pairs/s forward, {:.2} backward, all included",
-        1e3 * forward / n,
-        1e3 * backward / n,
+        "a frame: forward {:.2} ms CPU, backward {:.2}; {:.2} M pairs, {:.1} k tile entries",
+        forward.1 / n,
+        (both.1 - forward.1) / n,
         pairs as f64 / n / 1e6,
         entries as f64 / n / 1e3,
-        pairs as f64 / forward / 1e9,
-        pairs as f64 / backward / 1e9
+    );
+}
+
+/// 1,000 faint splats, each larger than the image: every pair is visited, and nothing but the inner loop counts.
+fn blend() -> Result<()> {
+    let n = 1000;
+    let mut cloud = GaussianCloud {
+        sh_degree: 0,
+        ..Default::default()
+    };
+    for i in 0..n {
+        cloud.means.push([0.0, 0.0, 5.0 + 1e-3 * i as f32]);
+        cloud.quats.push([1.0, 0.0, 0.0, 0.0]);
+        cloud.log_scales.push([2.0, 2.1, 2.0]);
+        cloud.opacity_logits.push(-4.8); // Alpha 0.008: the pixels do not end.
+        cloud.sh.extend([0.1, 0.2, 0.3]);
+    }
+    let splats = Splats::from_cloud(&cloud);
+    let camera = Camera::new(
+        Pose {
+            rotation: glam::Quat::IDENTITY,
+            position: Vec3::ZERO,
+        },
+        Intrinsics::from_fov_x(512, 512, 0.5),
+    );
+    let view = ViewParams::new(&camera);
+    let options = RenderOptions {
+        sh_degree: 0,
+        ..RenderOptions::default()
+    };
+    let mut renderer = Renderer::new();
+    renderer.render(&splats, &view, &options);
+    let pairs = renderer.pairs() as f64;
+    let mut gradients = SplatGradients::default();
+    let v_color = vec![1e-6; renderer.color().len()];
+    let forward = time(5, || renderer.render(&splats, &view, &options));
+    let both = time(5, || {
+        renderer.render(&splats, &view, &options);
+        renderer.backward(
+            &splats,
+            &OutputGradient {
+                color: &v_color,
+                alpha: None,
+                depth: None,
+            },
+            &mut gradients,
+        );
+    });
+    println!(
+        "{} on {} threads: forward {:.2} G pairs a CPU second, backward {:.2}",
+        renderer.level.name(),
+        rayon::current_num_threads(),
+        pairs / forward.1 / 1e6,
+        pairs / (both.1 - forward.1) / 1e6,
     );
     Ok(())
+}
+
+/// A trained scene copied with jitter to a million splats, seen whole at 1280x720, SH degree 3.
+fn frame(scene: &str) -> Result<()> {
+    let cloud = read_splats(scene.as_ref())?;
+    let cameras = cameras(scene).context("the scene must lie in its run, beside cameras.json")?;
+    let original = Splats::from_cloud(&cloud);
+    // Back along the first camera's axis until the whole scene, but for what lies far out, is in sight.
+    let sees_most = |camera: &Camera| {
+        let (k, n) = (&camera.intrinsics, cloud.means.len());
+        let inside = |m: &&[f32; 3]| {
+            let seen = camera.project(Vec3::from_array(**m));
+            seen.is_some_and(|(p, _)| p.x > 0.0 && p.y > 0.0 && p.x < k.width as f32 && p.y < k.height as f32)
+        };
+        cloud.means.iter().filter(inside).count() * 20 > 19 * n
+    };
+    let mut whole = cameras[0];
+    whole.intrinsics = Intrinsics::from_fov_x(1280, 720, 0.9);
+    for _ in 0..40 {
+        if sees_most(&whole) {
+            break;
+        }
+        let back = 0.1
+            * cameras[0]
+                .pose
+                .position
+                .distance(irradia_splat::init::focus_point(&cameras));
+        whole.pose.position -= whole.pose.rotation * Vec3::Z * back;
+    }
+    let camera = |width: u32, height: u32| {
+        ViewParams::new(&Camera {
+            intrinsics: whole.intrinsics.resized(width, height),
+            ..whole
+        })
+    };
+    let options = RenderOptions::default();
+    let mut renderer = Renderer::new();
+    let mut measure = |splats: &Splats, view: &ViewParams| {
+        let (wall, cpu) = time(5, || renderer.render(splats, view, &options));
+        println!(
+            "{:>8} splats ({} visible) at {}x{}: {wall:.1} ms wall, {cpu:.1} ms CPU; {:.1} M pairs, {:.0} k tile entries",
+            splats.len(),
+            renderer.visible(),
+            view.width,
+            view.height,
+            renderer.pairs() as f64 / 1e6,
+            renderer.tile_entries() as f64 / 1e3,
+        );
+    };
+    let view = camera(1280, 720);
+    let full = multiplied(&original, 1_000_000);
+    let half = multiplied(&original, 500_000);
+    measure(&half, &view);
+    measure(&full, &view);
+    measure(&full, &camera(905, 509));
+    Ok(())
+}
+
+/// `original` repeated to `count` splats; copies are moved by a standard deviation and shrunk so that together they
+/// cover what one did.
+fn multiplied(original: &Splats, count: usize) -> Splats {
+    let indices: Vec<u32> = (0..count).map(|i| (i % original.len()) as u32).collect();
+    let mut splats = original.gather(&indices);
+    let mut rng = Rng::new(1, 1);
+    let shrink = (count as f32 / original.len() as f32).ln() / 2.0;
+    for i in 0..count {
+        let size = (0..3)
+            .map(|c| splats.log_scales.get(c, i))
+            .fold(f32::MIN, f32::max)
+            .exp();
+        for c in 0..3 {
+            splats.means.set(c, i, splats.means.get(c, i) + size * rng.normal());
+            splats.log_scales.set(c, i, splats.log_scales.get(c, i) - shrink);
+        }
+    }
+    SplatState::new(splats).splats
+}
+
+/// The training cameras, from the run's `cameras.json`.
+fn cameras(scene: &str) -> Option<Vec<Camera>> {
+    let text = std::fs::read_to_string(std::path::Path::new(scene).parent()?.join("cameras.json")).ok()?;
+    let records: Vec<serde_json::Value> = serde_json::from_str(&text).ok()?;
+    let number = |v: &serde_json::Value| v.as_f64().map(|v| v as f32);
+    records
+        .iter()
+        .map(|r| {
+            let p: Vec<f32> = r["position"].as_array()?.iter().filter_map(number).collect();
+            let q: Vec<f32> = r["rotation"].as_array()?.iter().filter_map(number).collect();
+            let (&[x, y, z], &[w, i, j, k]) = (&p[..], &q[..]) else {
+                return None;
+            };
+            let mut intrinsics = Intrinsics::from_fov_x(r["width"].as_u64()? as u32, r["height"].as_u64()? as u32, 1.0);
+            (intrinsics.fx, intrinsics.fy) = (number(&r["fx"])?, number(&r["fy"])?);
+            let pose = Pose {
+                rotation: glam::Quat::from_xyzw(i, j, k, w),
+                position: Vec3::new(x, y, z),
+            };
+            Some(Camera::new(pose, intrinsics))
+        })
+        .collect()
 }

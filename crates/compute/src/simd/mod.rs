@@ -137,7 +137,7 @@ pub trait Lanes:
     fn sum(self) -> Self::Scalar;
     /// Writes the sums of several vectors; N must be a multiple of four.
     #[inline(always)]
-    fn sums<const N: usize>(vectors: [Self; N], to: &mut [Self::Scalar; N]) {
+    fn sums<const N: usize>(vectors: &[Self; N], to: &mut [Self::Scalar; N]) {
         for i in 0..N {
             to[i] = vectors[i].sum();
         }
@@ -339,7 +339,7 @@ mod tests {
             assert_eq!(a.sum(), n * (n - 1.0) / 2.0 - 3.5 * n);
             let many = [a, b, a, b, b, b, b, a];
             let mut sums = [0.0; 8];
-            S::F::sums(many, &mut sums);
+            S::F::sums(&many, &mut sums);
             assert_eq!(sums, many.map(S::F::sum));
             let nan = simd.splat(f64::NAN);
             assert!(nan.lt(b).none() && nan.le(b).none());

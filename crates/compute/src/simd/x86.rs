@@ -174,7 +174,7 @@ macro_rules! float_lanes {
                 unsafe { $sum }
             }
             #[inline(always)]
-            fn sums<const N: usize>(vectors: [Self; N], to: &mut [f32; N]) {
+            fn sums<const N: usize>(vectors: &[Self; N], to: &mut [f32; N]) {
                 $sums(vectors, to)
             }
         }
@@ -334,7 +334,7 @@ macro_rules! sums_in_fours {
 }
 
 #[inline(always)]
-fn sums_of_8<const N: usize>(vectors: [F32x8; N], to: &mut [f32; N]) {
+fn sums_of_8<const N: usize>(vectors: &[F32x8; N], to: &mut [f32; N]) {
     sums_in_fours!(vectors, to, |v| _mm_add_ps(
         _mm256_castps256_ps128(v),
         _mm256_extractf128_ps::<1>(v)
@@ -342,7 +342,7 @@ fn sums_of_8<const N: usize>(vectors: [F32x8; N], to: &mut [f32; N]) {
 }
 
 #[inline(always)]
-fn sums_of_16<const N: usize>(vectors: [F32x16; N], to: &mut [f32; N]) {
+fn sums_of_16<const N: usize>(vectors: &[F32x16; N], to: &mut [f32; N]) {
     sums_in_fours!(vectors, to, |v| {
         let half = _mm256_add_ps(_mm512_castps512_ps256(v), _mm512_extractf32x8_ps::<1>(v));
         _mm_add_ps(_mm256_castps256_ps128(half), _mm256_extractf128_ps::<1>(half))

@@ -368,7 +368,7 @@ impl<I: Iterator<Item = Entry>> BlendTileVjp<'_, I> {
             }
             let [s0, s1, s2, s3, s4, s5] = sums;
             let [c0, c1, c2, c3] = v_color;
-            S::F::sums([s0, s1, s2, s3, s4, s5, c0, c1, c2, c3, zero, zero], out);
+            S::F::sums(&[s0, s1, s2, s3, s4, s5, c0, c1, c2, c3, zero, zero], out);
         }
     }
 }

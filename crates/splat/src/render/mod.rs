@@ -298,28 +298,37 @@ impl Renderer {
                 for row in 0..TILE.min(height - y0) {
                     let image = (y0 + row) * width + x0;
                     for column in (0..columns).step_by(BLOCK_WIDTH) {
-                        let run = BLOCK_WIDTH.min(columns - column);
                         let (at, from) = (pixel_in_tile(column, row), image + column);
+                        let v = |plane: &[f32], offset: usize| run_of(&plane[offset..], columns - column);
+                        let held = |channel: usize| -> &[f32; BLOCK_WIDTH] {
+                            state[channel * TILE_PIXELS + at..].first_chunk().expect("a run")
+                        };
+                        let t = held(CHANNELS - 1).map(f32::abs);
+                        let mut total = [0.0f32; BLOCK_WIDTH];
+                        let mut put = |channel: usize, v: [f32; BLOCK_WIDTH]| {
+                            v_tile[channel * TILE_PIXELS + at..][..BLOCK_WIDTH].copy_from_slice(&v);
+                        };
                         for c in 0..3 {
-                            let from = &v_out.color[c * width * height + from..][..run];
-                            v_tile[c * TILE_PIXELS + at..][..run].copy_from_slice(from);
+                            let (v, color) = (v(v_out.color, c * width * height + from), held(c));
+                            for i in 0..BLOCK_WIDTH {
+                                total[i] += (color[i] + t[i] * background[c]) * v[i];
+                            }
+                            put(c, v);
                         }
                         if let Some(v_depth) = v_out.depth {
-                            v_tile[3 * TILE_PIXELS + at..][..run].copy_from_slice(&v_depth[from..][..run]);
-                        }
-                        for i in 0..run {
-                            let pixel = at + i;
-                            let t = state[(CHANNELS - 1) * TILE_PIXELS + pixel].abs();
-                            let mut total = v_out.alpha.map_or(0.0, |v| -t * v[from + i]);
-                            for c in 0..3 {
-                                let color = state[c * TILE_PIXELS + pixel] + t * background[c];
-                                total += color * v_tile[c * TILE_PIXELS + pixel];
+                            let (v, depth) = (v(v_depth, from), held(3));
+                            for i in 0..BLOCK_WIDTH {
+                                total[i] += depth[i] * v[i];
                             }
-                            if v_out.depth.is_some() {
-                                total += state[3 * TILE_PIXELS + pixel] * v_tile[3 * TILE_PIXELS + pixel];
-                            }
-                            rest[pixel] = total;
+                            put(3, v);
                         }
+                        if let Some(v_alpha) = v_out.alpha {
+                            let v = v(v_alpha, from);
+                            for i in 0..BLOCK_WIDTH {
+                                total[i] -= t[i] * v[i];
+                            }
+                        }
+                        rest[at..at + BLOCK_WIDTH].copy_from_slice(&total);
                     }
                 }
                 level.run(BlendTileVjp {
@@ -378,6 +387,15 @@ impl Renderer {
             });
         });
         gradients.non_finite = chunks.iter().map(|chunk| chunk.non_finite).sum();
+    }
+}
+
+/// The first eight of `values`, zeros from the `len`-th on.
+#[inline(always)]
+fn run_of(values: &[f32], len: usize) -> [f32; BLOCK_WIDTH] {
+    match values.first_chunk() {
+        Some(whole) if len >= BLOCK_WIDTH => *whole,
+        _ => std::array::from_fn(|i| if i < len { values[i] } else { 0.0 }),
     }
 }
 

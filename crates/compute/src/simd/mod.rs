@@ -200,8 +200,8 @@ macro_rules! each {
     ($i:ident in 10 => $value:expr) => {
         $crate::each!(@ $i, $value, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9)
     };
-    ($i:ident in 12 => $value:expr) => {
-        $crate::each!(@ $i, $value, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11)
+    ($i:ident in 9 => $value:expr) => {
+        $crate::each!(@ $i, $value, 0, 1, 2, 3, 4, 5, 6, 7, 8)
     };
     (@ $i:ident, $value:expr, $($at:literal),*) => {
         [$({ let $i: usize = $at; $value }),*]

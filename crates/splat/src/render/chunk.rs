@@ -2,13 +2,12 @@
 //! the arithmetic of [`super::project`] and [`super::sh`].
 
 use super::blend::{Footprint2d, SUMS};
+use super::harmonics::{CHUNK, Harmonics};
 use super::project::{Footprint, Geometry, footprint_gradient, project, project_vjp, quadratic};
-use super::sh::{MAX_COEFFICIENTS, basis, basis_vjp, direction, direction_vjp};
 use super::{RenderOptions, Renderer, ViewParams};
 use crate::Splats;
 use irradia_compute::each;
 use irradia_compute::simd::{Kernel, Lanes, Mask, Simd};
-use irradia_scene::sh::coefficients;
 
 #[inline(always)]
 fn load_geometry<S: Simd>(simd: S, splats: &Splats, at: usize) -> Geometry<S::F>
@@ -43,6 +42,7 @@ impl Kernel for ProjectChunk<'_> {
         let view = self.view.lanes(simd);
         let degree = self.options.sh_degree.min(self.splats.sh_degree());
         let n = self.splats.len();
+        let mut harmonics = Harmonics::new(degree);
         for at in (0..self.footprints.len()).step_by(S::LANES) {
             let first = self.first + at;
             let geometry = load_geometry(simd, self.splats, first);
@@ -54,8 +54,8 @@ impl Kernel for ProjectChunk<'_> {
             if visible == 0 {
                 continue;
             }
-            let color = sh_color(self.splats, degree, first, geometry.mean, view.center);
-            let mut columns = [[0.0f32; 16]; 12];
+            harmonics.look(at, geometry.mean, view.center);
+            let mut columns = [[0.0f32; 16]; 9];
             let Footprint {
                 xy,
                 depth,
@@ -65,54 +65,37 @@ impl Kernel for ProjectChunk<'_> {
             } = footprint;
             let [a, b, c] = quadratic(conic);
             let log2_opacity = opacity.map(f32::log2);
-            let values = [
-                xy[0],
-                xy[1],
-                a,
-                b,
-                c,
-                log2_opacity,
-                color[0],
-                color[1],
-                color[2],
-                depth,
-                extent[0],
-                extent[1],
-            ];
+            let values = [xy[0], xy[1], a, b, c, log2_opacity, depth, extent[0], extent[1]];
             for (to, value) in columns.iter_mut().zip(values) {
                 value.store(to);
             }
             for lane in (0..S::LANES).filter(|lane| visible >> lane & 1 == 1) {
-                let v = each!(i in 12 => columns[i][lane]);
+                let v = each!(i in 9 => columns[i][lane]);
                 if v.iter().any(|v| !v.is_finite()) {
                     continue; // A poisoned splat is not drawn; the file reader and the optimiser are where it is told.
                 }
-                keys[lane] = v[9].to_bits();
+                keys[lane] = v[6].to_bits();
                 self.footprints[at + lane] = Footprint2d {
                     xy: [v[0], v[1]],
                     quadratic: [v[2], v[3], v[4]],
                     log2_opacity: v[5],
-                    color: [v[6], v[7], v[8]],
-                    depth: v[9],
-                    extent: [v[10], v[11]],
+                    color: [0.0; 3],
+                    depth: v[6],
+                    extent: [v[7], v[8]],
                 };
             }
         }
-    }
-}
-
-#[inline(always)]
-fn sh_color<F: Lanes<Scalar = f32>>(splats: &Splats, degree: u32, at: usize, mean: [F; 3], center: [F; 3]) -> [F; 3] {
-    let (d, _) = direction(mean, center);
-    let b = basis(degree, d);
-    let simd = mean[0].simd();
-    let mut color = [simd.splat(0.5); 3];
-    for k in 0..coefficients(degree) {
-        for (c, color) in color.iter_mut().enumerate() {
-            *color = b[k].mul_add(simd.load(&splats.sh.plane(3 * k + c)[at..]), *color);
+        let colors = harmonics.colors(simd, self.splats, self.first);
+        for at in harmonics.starts() {
+            for i in at..at + S::LANES {
+                let color = each!(c in 3 => colors[c][i]);
+                self.footprints[i].color = color;
+                if color.iter().any(|v| !v.is_finite()) {
+                    self.depth_keys[i] = u32::MAX;
+                }
+            }
         }
     }
-    each!(c in 3 => color[c].max(simd.splat(0.0)))
 }
 
 /// The columns of [`SplatGradients`] for one chunk of splats.
@@ -144,6 +127,9 @@ impl Kernel for ProjectChunkVjp<'_, '_> {
         let chunk = self.chunk;
         let renderer = self.renderer;
         let antialias = renderer.options.antialias;
+        let mut harmonics = Harmonics::new(self.degree);
+        let mut v_colors = [[0.0f32; CHUNK]; 3];
+        let mut magnitudes = [0.0f32; CHUNK];
         for at in (0..chunk.active.len()).step_by(S::LANES) {
             let first = self.first + at;
             // Sum each visible splat's entries, in their order; [sum, lane]. What invisible lanes hold is masked below.
@@ -185,7 +171,7 @@ impl Kernel for ProjectChunkVjp<'_, '_> {
             let moments = [s0, sx, sy, sxx, sxy, syy];
             let v_footprint = footprint_gradient([a, b, c], log2_opacity, moments, v_depth);
             let geometry = load_geometry(simd, self.splats, first);
-            let mut v = project_vjp(&view, &geometry, antialias, &v_footprint);
+            let v = project_vjp(&view, &geometry, antialias, &v_footprint);
 
             // Colour was clamped at 0 where it is not above.
             let v_color = [
@@ -193,20 +179,9 @@ impl Kernel for ProjectChunkVjp<'_, '_> {
                 green.zero_where_not(zero.lt(shown_green)),
                 blue.zero_where_not(zero.lt(shown_blue)),
             ];
-            let (d, inv_distance) = direction(geometry.mean, view.center);
-            let basis = basis(self.degree, d);
-            if self.degree > 0 {
-                let mut v_basis = [zero; MAX_COEFFICIENTS];
-                for k in 1..coefficients(self.degree) {
-                    for c in 0..3 {
-                        let coefficient = simd.load(&self.splats.sh.plane(3 * k + c)[first..]);
-                        v_basis[k] = coefficient.mul_add(v_color[c], v_basis[k]);
-                    }
-                }
-                let v_d = direction_vjp(d, inv_distance, basis_vjp(self.degree, d, &v_basis));
-                for i in 0..3 {
-                    v.mean[i] += v_d[i];
-                }
+            harmonics.look(at, geometry.mean, view.center);
+            for c in 0..3 {
+                v_color[c].store(&mut v_colors[c][at..]);
             }
 
             // A sum of magnitudes is finite exactly where all of them are.
@@ -214,14 +189,12 @@ impl Kernel for ProjectChunkVjp<'_, '_> {
             for value in v.mean.into_iter().chain(v.quat).chain(v.log_scale) {
                 magnitude += value.abs();
             }
-            let finite = magnitude.lt(simd.splat(f64::from(f32::MAX)));
-            let active = shown.and(finite);
-            chunk.non_finite += shown.and_not(finite).bits().count_ones() as usize;
-            visible.zero_where_not(active).store(&mut chunk.active[at..]);
+            magnitude.store(&mut magnitudes[at..]);
+            visible.store(&mut chunk.active[at..]);
             for (value, to) in v_footprint.xy.iter().zip(&mut chunk.screen) {
                 value.store(&mut to[at..]);
             }
-            let [means, quats, log_scales, opacity_logits, sh] = &mut chunk.columns;
+            let [means, quats, log_scales, opacity_logits, _] = &mut chunk.columns;
             for (value, to) in v.mean.iter().zip(means) {
                 value.store(&mut to[at..]);
             }
@@ -232,11 +205,24 @@ impl Kernel for ProjectChunkVjp<'_, '_> {
                 value.store(&mut to[at..]);
             }
             v.opacity_logit.store(&mut opacity_logits[0][at..]);
-            for k in 0..coefficients(self.degree) {
-                for c in 0..3 {
-                    (basis[k] * v_color[c]).store(&mut sh[3 * k + c][at..]);
+        }
+
+        harmonics.vjp(simd, self.splats, self.first, &v_colors, &mut chunk.columns[4]);
+        for at in harmonics.starts() {
+            let visible = simd.load(&chunk.active[at..]);
+            let shown = simd.splat(0.0).lt(visible);
+            let mut magnitude = simd.load(&magnitudes[at..]);
+            if self.degree > 0 {
+                let mean = load_geometry(simd, self.splats, self.first + at).mean;
+                let v_mean = harmonics.v_mean(at, mean, view.center);
+                for (v, to) in v_mean.iter().zip(&mut chunk.columns[0]) {
+                    (simd.load(&to[at..]) + *v).store(&mut to[at..]);
+                    magnitude += v.abs();
                 }
             }
+            let finite = magnitude.lt(simd.splat(f64::from(f32::MAX)));
+            chunk.non_finite += shown.and_not(finite).bits().count_ones() as usize;
+            visible.zero_where_not(shown.and(finite)).store(&mut chunk.active[at..]);
         }
     }
 }

@@ -6,6 +6,7 @@
 mod bin;
 mod blend;
 mod chunk;
+mod harmonics;
 mod project;
 mod sh;
 mod view;
@@ -21,6 +22,7 @@ use crate::Splats;
 use bin::{BAND_BLOCKS, BLOCK_HEIGHT, BLOCK_WIDTH, Bins, TILE};
 use blend::{BLOCK, BlendTile, BlendTileVjp, CHANNELS, Footprint2d, SUMS, TILE_PIXELS};
 use chunk::{GradientChunk, ProjectChunk, ProjectChunkVjp};
+use harmonics::CHUNK;
 use irradia_compute::Planes;
 use irradia_compute::simd::Level;
 use rayon::prelude::*;
@@ -72,9 +74,6 @@ pub struct SplatGradients {
     /// Splats left out because a gradient was not finite.
     pub non_finite: usize,
 }
-
-/// Splats a task projects: a multiple of every vector length.
-const CHUNK: usize = 1024;
 
 /// The renderer with its buffers, which are also the tape that [`Renderer::backward`] plays.
 pub struct Renderer {

@@ -57,22 +57,36 @@ fn steps(data: &str, steps: u64) -> Result<()> {
         1e3 * trainer.seconds / steps as f64,
         1e3 * trainer.cpu_seconds / steps as f64,
     );
-    let views: Vec<ViewParams> = dataset
-        .train
-        .iter()
-        .take(10)
-        .map(|i| ViewParams::new(&dataset.views[*i].camera))
-        .collect();
+    let views = |factor: f32| -> Vec<ViewParams> {
+        let mut cameras: Vec<Camera> = dataset
+            .train
+            .iter()
+            .take(10)
+            .map(|i| dataset.views[*i].camera)
+            .collect();
+        for camera in &mut cameras {
+            camera.intrinsics = camera.intrinsics.scaled(factor);
+        }
+        cameras.iter().map(ViewParams::new).collect()
+    };
     let options = RenderOptions {
         sh_degree: 0,
         ..RenderOptions::default()
     };
-    report_parts(&trainer.state.splats, &views, &options);
+    let splats = &trainer.state.splats;
+    report_parts("as trained", splats, &views(1.0), &options);
+    report_parts("twice the pixels", splats, &views(std::f32::consts::SQRT_2), &options);
+    report_parts(
+        "twice the splats",
+        &multiplied(splats, 2 * splats.len()),
+        &views(1.0),
+        &options,
+    );
     Ok(())
 }
 
 /// Forward and backward over `views`.
-fn report_parts(splats: &Splats, views: &[ViewParams], options: &RenderOptions) {
+fn report_parts(what: &str, splats: &Splats, views: &[ViewParams], options: &RenderOptions) {
     let mut renderer = Renderer::new();
     let mut gradients = SplatGradients::default();
     let n = views.len() as f64;
@@ -98,7 +112,7 @@ fn report_parts(splats: &Splats, views: &[ViewParams], options: &RenderOptions) 
         }
     });
     println!(
-        "a frame: forward {:.2} ms CPU, backward {:.2}; {:.2} M pairs, {:.1} k tile entries",
+        "a frame, {what}: forward {:.2} ms CPU, backward {:.2}; {:.2} M pairs, {:.1} k tile entries",
         forward.1 / n,
         (both.1 - forward.1) / n,
         pairs as f64 / n / 1e6,

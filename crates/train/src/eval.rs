@@ -16,6 +16,8 @@ pub struct EvaluatedView {
     pub truth: Image,
     /// What the scene shows there.
     pub render: Image,
+    /// `[H, W]`, 0 where the photograph does not count.
+    pub mask: Option<Vec<u8>>,
 }
 
 /// Renders `splats` from `view`, `[H, W, 3]`.
@@ -68,6 +70,7 @@ pub fn evaluate_views(
             metrics,
             truth,
             render,
+            mask: photo.mask,
         });
     }
     Ok(())

@@ -2,7 +2,7 @@
 
 use crate::eval::{Metrics, evaluate_views};
 use crate::event::{Event, Observer, Signal};
-use crate::schedule::plan;
+use crate::schedule::{is_due, plan};
 use crate::trainer::{TrainError, Trainer};
 
 /// When a run ends before its recipe does.
@@ -40,9 +40,6 @@ pub fn run(
             seconds: 0.0,
         });
     }
-    if limits.until_psnr.is_some() {
-        trainer.recipe.eval_every = trainer.recipe.eval_every.min(UNTIL_PSNR_EVERY);
-    }
     let mut pacer = limits.budget.map(Pacer::new);
     let mut signal = tell(trainer, &mut events, observers);
     let mut reason = None;
@@ -51,9 +48,10 @@ pub fn run(
             pacer.adjust(trainer);
         }
         let due = plan(&trainer.recipe, &trainer.clock);
+        let looks = due.evaluate || (limits.until_psnr.is_some() && is_due(&trainer.clock, UNTIL_PSNR_EVERY));
         let report = trainer.step(&mut events)?;
         events.insert(0, Event::Step(report));
-        if due.evaluate && !trainer.dataset.test.is_empty() {
+        if looks && !trainer.dataset.test.is_empty() {
             let (step, seconds, splats) = (trainer.clock.step, trainer.seconds, trainer.state.len());
             let psnr = held_out_psnr(trainer)?;
             events.push(Event::Evaluated {

@@ -133,18 +133,25 @@ fn value(knob: &Knob, time: f64, length: f64, carried: f64) -> f64 {
     }
 }
 
+/// Whether the step that `clock` stands before is one of every `every`.
+pub fn is_due(clock: &Clock, every: u64) -> bool {
+    (clock.step + 1).is_multiple_of(every)
+}
+
 /// What the step that `clock` stands before does. After the recipe's end it is what the last step did, at rest.
 pub fn plan(recipe: &Recipe, clock: &Clock) -> StepPlan {
     let v = values(recipe, clock);
     let of = |param: Param| v[param as usize];
     let stage = &recipe.stage[clock.stage.min(recipe.stage.len() - 1)];
     // Counted as people do: after the step that makes it the n-th.
-    let (step, in_stage) = (clock.step + 1, clock.step + 1 - clock.stage_step);
+    let in_stage = clock.step + 1 - clock.stage_step;
     let density = stage.density.as_ref();
     let (densify, reset_opacity) = match density {
         Some(density @ Density::Classic(knobs)) => (
-            (in_stage % knobs.every == 0).then(|| (density.clone(), clock.was_reset)),
-            (knobs.reset_every > 0 && step % knobs.reset_every == 0).then_some(knobs.reset_to),
+            in_stage
+                .is_multiple_of(knobs.every)
+                .then(|| (density.clone(), clock.was_reset)),
+            (knobs.reset_every > 0 && is_due(clock, knobs.reset_every)).then_some(knobs.reset_to),
         ),
         None => (None, None),
     };
@@ -164,8 +171,8 @@ pub fn plan(recipe: &Recipe, clock: &Clock) -> StepPlan {
         gathers: density.is_some(),
         densify,
         reset_opacity,
-        evaluate: step.is_multiple_of(recipe.eval_every),
-        checkpoint: step.is_multiple_of(recipe.checkpoint_every),
+        evaluate: is_due(clock, recipe.eval_every),
+        checkpoint: is_due(clock, recipe.checkpoint_every),
     }
 }
 

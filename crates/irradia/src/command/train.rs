@@ -318,17 +318,16 @@ fn write_view(folder: &RunFolder, view: &EvaluatedView) -> Result<ViewReport> {
         lpips: view.metrics.lpips,
         truth: write("truth", &view.truth)?,
         render: write("render", &view.render)?,
-        error: write("error", &error_image(&view.truth, &view.render))?,
+        error: write("error", &error_image(view))?,
     })
 }
 
-/// Absolute difference, four times enlarged so that a difference of a quarter is white.
-fn error_image(truth: &Image, render: &Image) -> Image {
-    let data = truth
-        .data
-        .iter()
-        .zip(&render.data)
-        .map(|(t, r)| 4.0 * (t - r).abs())
-        .collect();
+/// Absolute difference, four times enlarged so that a difference of a quarter is white; black where a mask says that the
+/// pixel does not count.
+fn error_image(view: &EvaluatedView) -> Image {
+    let (truth, render) = (&view.truth, &view.render);
+    let counts = |pixel: usize| view.mask.as_ref().is_none_or(|mask| mask[pixel] != 0);
+    let error = |(i, (t, r)): (usize, (&f32, &f32))| if counts(i / 3) { 4.0 * (t - r).abs() } else { 0.0 };
+    let data = truth.data.iter().zip(&render.data).enumerate().map(error).collect();
     Image::new(truth.width, truth.height, 3, data)
 }

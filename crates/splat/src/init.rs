@@ -69,20 +69,32 @@ fn neighbour_distances(positions: &[[f32; 3]]) -> Vec<f32> {
         .collect()
 }
 
+/// What a photograph shows in a pixel.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Look {
+    /// This colour, sRGB.
+    Color([u8; 3]),
+    /// Nothing: it is transparent there.
+    Empty,
+    /// Something that is not to be trained on.
+    Masked,
+}
+
 /// At most `count` points in the space that the cameras see, for scenes that come without any. `depth_bounds[i]` says how
 /// near and far view i's scene lies, where that is known; otherwise it is taken around the point that the cameras look at.
 ///
 /// Points are drawn along random pixels' rays, uniformly in inverse depth, and kept with a probability that grows with
-/// the share of cameras that see them, so that they gather where views overlap. `look(view, pixel)` gives the colour
-/// there, `None` where the photograph is transparent: a point that any camera sees through is outside the visual hull of
-/// what is shown (Laurentini 1994) and is not kept. A point's colour is the mean over the cameras that see it: right
-/// where it lies on a surface, and never so dark elsewhere that the clamp of negative colours keeps it from learning.
+/// the share of cameras that see them, so that they gather where views overlap. `look(view, pixel)` says what is there.
+/// A point that any camera sees through is outside the visual hull of what is shown (Laurentini 1994) and is not kept;
+/// nor is one that more cameras have masked than not, for nothing would ever clear it away. A point's colour is the mean
+/// over the cameras that see it: right where it lies on a surface, and never so dark elsewhere that the clamp of negative
+/// colours keeps it from learning.
 pub fn random_points(
     cameras: &[Camera],
     depth_bounds: &[Option<[f32; 2]>],
     count: usize,
     rng: &mut Rng,
-    look: impl Fn(usize, Vec2) -> Option<[u8; 3]>,
+    look: impl Fn(usize, Vec2) -> Look,
 ) -> PointCloud {
     let mut cloud = PointCloud::default();
     let focus = focus_point(cameras);
@@ -114,19 +126,23 @@ pub fn random_points(
     cloud
 }
 
-/// How many cameras see `point`, and its mean colour in them; `None` where one of them sees nothing there.
-fn mean_color(
-    cameras: &[Camera],
-    point: Vec3,
-    look: &impl Fn(usize, Vec2) -> Option<[u8; 3]>,
-) -> Option<(u32, [u8; 3])> {
-    let (mut seen, mut sum) = (0u32, [0u32; 3]);
+/// How many cameras see `point`, and its mean colour in them; `None` where it cannot be part of the scene.
+fn mean_color(cameras: &[Camera], point: Vec3, look: &impl Fn(usize, Vec2) -> Look) -> Option<(u32, [u8; 3])> {
+    let (mut seen, mut masked, mut sum) = (0u32, 0u32, [0u32; 3]);
     for (view, camera) in cameras.iter().enumerate() {
         if let Some(pixel) = sees(camera, point) {
-            let color = look(view, pixel)?;
-            seen += 1;
-            (0..3).for_each(|c| sum[c] += u32::from(color[c]));
+            match look(view, pixel) {
+                Look::Color(color) => {
+                    seen += 1;
+                    (0..3).for_each(|c| sum[c] += u32::from(color[c]));
+                }
+                Look::Masked => masked += 1,
+                Look::Empty => return None,
+            }
         }
+    }
+    if masked > seen {
+        return None;
     }
     Some((seen, sum.map(|s| (s / seen.max(1)) as u8)))
 }
@@ -225,10 +241,15 @@ mod tests {
             })
             .collect();
         assert!(focus_point(&cameras).distance(target) < 0.02);
-        let cloud = random_points(&cameras, &[], 500, &mut Rng::new(1, 0), |view, _| Some([view as u8; 3]));
+        let cloud = random_points(&cameras, &[], 500, &mut Rng::new(1, 0), |view, _| {
+            Look::Color([view as u8; 3])
+        });
         assert_eq!(cloud.len(), 500);
         let mean = cloud.positions.iter().sum::<Vec3>() / 500.0;
         assert!(mean.distance(target) < 0.5, "{mean}");
-        assert!(random_points(&[], &[], 10, &mut Rng::new(1, 0), |_, _| Some([0; 3])).is_empty());
+        assert!(random_points(&[], &[], 10, &mut Rng::new(1, 0), |_, _| Look::Color([0; 3])).is_empty());
+        for nothing in [Look::Empty, Look::Masked] {
+            assert!(random_points(&cameras, &[], 10, &mut Rng::new(1, 0), |_, _| nothing).is_empty());
+        }
     }
 }

@@ -9,7 +9,7 @@ use irradia_compute::adam::AdamStep;
 use irradia_measure::{LossWeights, PhotometricLoss, Target, Truth};
 use irradia_scene::{Camera, Dataset, LoadError, Rng, sh};
 use irradia_splat::densify::{DensityChange, classic};
-use irradia_splat::init::{self, InitOptions};
+use irradia_splat::init::{self, InitOptions, Look};
 use irradia_splat::{OutputGradient, RenderOptions, Renderer, SplatGradients, SplatState, ViewParams};
 use std::sync::Arc;
 use std::time::Instant;
@@ -24,7 +24,9 @@ pub enum TrainError {
     #[error("the dataset has {0} training views; at least 1 is needed after holding some out")]
     NoViews(usize),
     /// There is nothing to start from.
-    #[error("there is nothing to start from: no points, and no space that the cameras share; check the poses")]
+    #[error(
+        "there is nothing to start from: no points, and no space that the cameras share and the masks leave; check poses and masks"
+    )]
     NoPoints,
     /// A checkpoint does not fit.
     #[error("{0}")]
@@ -150,8 +152,14 @@ impl Trainer {
                 let points = init::random_points(&cameras, &bounds, knobs.random_points, &mut rng, |view, pixel| {
                     let photo = photos[view].as_ref().expect("loaded above");
                     let at = pixel.y as usize * photo.width as usize + pixel.x as usize;
-                    let empty = photo.alpha.as_ref().is_some_and(|alpha| alpha[at] == 0);
-                    (!empty).then(|| [0, 1, 2].map(|c| photo.rgb[3 * at + c]))
+                    let zero = |plane: &Option<Vec<u8>>| plane.as_ref().is_some_and(|plane| plane[at] == 0);
+                    if zero(&photo.mask) {
+                        Look::Masked
+                    } else if zero(&photo.alpha) {
+                        Look::Empty
+                    } else {
+                        Look::Color([0, 1, 2].map(|c| photo.rgb[3 * at + c]))
+                    }
                 });
                 init::from_points(&points, &options)
             }

@@ -103,11 +103,7 @@ fn report_parts(what: &str, splats: &Splats, views: &[ViewParams], options: &Ren
         for view in views {
             renderer.render(splats, view, options);
             let v_color = vec![1e-6; renderer.color().len()];
-            let v_out = OutputGradient {
-                color: &v_color,
-                alpha: None,
-                depth: None,
-            };
+            let v_out = OutputGradient::of_color(&v_color);
             renderer.backward(splats, &v_out, &mut gradients);
         }
     });
@@ -155,15 +151,7 @@ fn blend() -> Result<()> {
     let forward = time(5, || renderer.render(&splats, &view, &options));
     let both = time(5, || {
         renderer.render(&splats, &view, &options);
-        renderer.backward(
-            &splats,
-            &OutputGradient {
-                color: &v_color,
-                alpha: None,
-                depth: None,
-            },
-            &mut gradients,
-        );
+        renderer.backward(&splats, &OutputGradient::of_color(&v_color), &mut gradients);
     });
     println!(
         "{} on {} threads: forward {:.2} G pairs a CPU second, backward {:.2}",

@@ -7,6 +7,6 @@ pub mod render;
 mod splats;
 mod state;
 
-pub use render::{OutputGradient, RenderOptions, Renderer, SplatGradients, ViewParams};
+pub use render::{CameraGradient, Gather, OutputGradient, RenderOptions, Renderer, SplatGradients, ViewParams};
 pub use splats::{COLUMN_NAMES, Splats, logit, sigmoid};
 pub use state::{Rates, SplatState};

@@ -205,9 +205,8 @@ impl Trainer {
         let (loss, mse) = self.evaluate_loss(&photo, &plan);
         let alpha = (plan.alpha_weight > 0.0 && photo.alpha.is_some()).then_some(&self.v_alpha[..]);
         let v_out = OutputGradient {
-            color: &self.v_color,
             alpha,
-            depth: None,
+            ..OutputGradient::of_color(&self.v_color)
         };
         self.renderer.backward(&self.state.splats, &v_out, &mut self.gradients);
 

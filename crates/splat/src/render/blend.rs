@@ -9,6 +9,7 @@
 use super::bin::{BAND_BLOCKS, BLOCK_HEIGHT, BLOCK_WIDTH, Entry, TILE};
 use irradia_compute::each;
 use irradia_compute::simd::{Kernel, Lanes, Mask, Simd};
+use std::f64::consts::LN_2;
 
 /// Alpha never exceeds this (Inria code).
 pub const ALPHA_MAX: f64 = 0.99;
@@ -40,8 +41,18 @@ pub(super) const TILE_PIXELS: usize = TILE * TILE;
 /// Channels a tile's forward state has: red, green, blue, depth, transmittance; `[channel, block, pixel]`.
 pub(super) const CHANNELS: usize = 5;
 /// Sums a splat collects in each tile, in this order: the moments 1, dx, dy, dx^2, dx dy, dy^2 of v_p / ln 2, then the
-/// gradients of red, green, blue and depth; two more fill up whole vectors.
+/// gradients of red, green, blue and depth; then the two that a [`super::Gather`] asks for.
 pub(super) const SUMS: usize = 12;
+
+/// What backward sums up for density control, as the blend's loops know it.
+pub(super) mod gather {
+    /// Nothing.
+    pub const NOTHING: u8 = 0;
+    /// |dL/dx| and |dL/dy| of the centre, fragment by fragment.
+    pub const ABSOLUTE: u8 = 1;
+    /// Weight times the pixel's error, and weight.
+    pub const ERROR: u8 = 2;
+}
 
 /// What happens to one vector of pixels when a splat passes over it.
 pub(super) struct Fragment<F: Lanes> {
@@ -258,11 +269,14 @@ pub(super) struct BlendTileVjp<'a, I> {
     pub footprints: &'a [Footprint2d],
     pub entries: I,
     pub corner: [f32; 2],
-    /// Gradients of red, green, blue and depth over the tile, `[4, blocks, BLOCK]`; zero outside the image.
-    pub v_out: &'a [f32; (CHANNELS - 1) * TILE_PIXELS],
+    /// Gradients of red, green, blue and depth over the tile, then its error, `[CHANNELS, blocks, BLOCK]`; zero outside the
+    /// image.
+    pub v_out: &'a [f32; CHANNELS * TILE_PIXELS],
     /// `color . v_color + depth v_depth - T v_alpha`, background included, `[blocks, BLOCK]`; overwritten.
     pub rest: &'a mut [f32; TILE_PIXELS],
     pub with_depth: bool,
+    /// One of [`gather`]'s.
+    pub gather: u8,
     /// The entries' sums, in their order.
     pub sums: &'a mut [[f32; SUMS]],
 }
@@ -275,22 +289,26 @@ impl<I: Iterator<Item = Entry>> Kernel for BlendTileVjp<'_, I> {
     where
         S::F: Lanes<Scalar = f32>,
     {
-        if self.with_depth {
-            self.backward::<S, true>(simd);
-        } else {
-            self.backward::<S, false>(simd);
+        match (self.with_depth, self.gather) {
+            (false, gather::ABSOLUTE) => self.backward::<S, false, { gather::ABSOLUTE }>(simd),
+            (false, gather::ERROR) => self.backward::<S, false, { gather::ERROR }>(simd),
+            (false, _) => self.backward::<S, false, { gather::NOTHING }>(simd),
+            (true, gather::ABSOLUTE) => self.backward::<S, true, { gather::ABSOLUTE }>(simd),
+            (true, gather::ERROR) => self.backward::<S, true, { gather::ERROR }>(simd),
+            (true, _) => self.backward::<S, true, { gather::NOTHING }>(simd),
         }
     }
 }
 
 impl<I: Iterator<Item = Entry>> BlendTileVjp<'_, I> {
     #[inline(always)]
-    fn backward<S: Simd, const DEPTH: bool>(self, simd: S)
+    fn backward<S: Simd, const DEPTH: bool, const GATHER: u8>(self, simd: S)
     where
         S::F: Lanes<Scalar = f32>,
     {
         let mut transmittances = [1.0f32; TILE_PIXELS];
-        let [v_red, v_green, v_blue, v_depth] = std::array::from_fn(|c| &self.v_out[c * TILE_PIXELS..][..TILE_PIXELS]);
+        let [v_red, v_green, v_blue, v_depth, error] =
+            std::array::from_fn(|c| &self.v_out[c * TILE_PIXELS..][..TILE_PIXELS]);
         let zero = simd.splat(0.0);
         let mut live = u64::MAX;
         for (entry, out) in self.entries.zip(self.sums) {
@@ -304,6 +322,8 @@ impl<I: Iterator<Item = Entry>> BlendTileVjp<'_, I> {
             let depth = simd.set(s.depth);
             let mut sums = [zero; 6];
             let mut v_color = [zero; 4];
+            let mut gathered = [zero; 2];
+            let [a, b, c] = each!(i in 3 => simd.set(s.quadratic[i]));
             for band in 0..TILE / BLOCK_WIDTH {
                 let mut todo = band_blocks(blocks, band);
                 if todo == 0 {
@@ -339,6 +359,19 @@ impl<I: Iterator<Item = Entry>> BlendTileVjp<'_, I> {
                         let rest = (-w).mul_add(g, simd.load(&self.rest[at..]));
                         rest.store(&mut self.rest[at..]);
                         let v_p = fragment_vjp(&f, t, g, rest);
+                        if GATHER == gather::ABSOLUTE {
+                            // dp/dx = 2 a dx + b dy, dp/dy = b dx + 2 c dy.
+                            let dx = over.dx[part];
+                            let (ax, cy) = (a * dx, c * dy);
+                            let slope = [b.mul_add(dy, ax + ax), b.mul_add(dx, cy + cy)];
+                            let magnitude = v_p.abs();
+                            gathered[0] = magnitude.mul_add(slope[0].abs(), gathered[0]);
+                            gathered[1] = magnitude.mul_add(slope[1].abs(), gathered[1]);
+                        }
+                        if GATHER == gather::ERROR {
+                            gathered[0] = w.mul_add(simd.load(&error[at..]), gathered[0]);
+                            gathered[1] += w;
+                        }
                         let m = &mut moments[part];
                         m[0] += v_p;
                         let v_dy = v_p * dy;
@@ -368,7 +401,11 @@ impl<I: Iterator<Item = Entry>> BlendTileVjp<'_, I> {
             }
             let [s0, s1, s2, s3, s4, s5] = sums;
             let [c0, c1, c2, c3] = v_color;
-            S::F::sums(&[s0, s1, s2, s3, s4, s5, c0, c1, c2, c3, zero, zero], out);
+            if GATHER == gather::ABSOLUTE {
+                gathered = each!(i in 2 => gathered[i] * simd.splat(LN_2));
+            }
+            let [g0, g1] = gathered;
+            S::F::sums(&[s0, s1, s2, s3, s4, s5, c0, c1, c2, c3, g0, g1], out);
         }
     }
 }

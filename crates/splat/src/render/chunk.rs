@@ -4,7 +4,7 @@
 use super::blend::{Footprint2d, SUMS};
 use super::harmonics::{CHUNK, Harmonics};
 use super::project::{Footprint, Geometry, footprint_gradient, project, project_vjp, quadratic};
-use super::{RenderOptions, Renderer, ViewParams};
+use super::{CameraGradient, RenderOptions, Renderer, ViewParams};
 use crate::Splats;
 use irradia_compute::each;
 use irradia_compute::simd::{Kernel, Lanes, Mask, Simd};
@@ -22,8 +22,23 @@ where
     }
 }
 
+/// The filter's variances from splat `at` on, where there is one.
+#[inline(always)]
+fn load_filter<S: Simd>(simd: S, filter: &[f32], at: usize) -> Option<S::F>
+where
+    S::F: Lanes<Scalar = f32>,
+{
+    if filter.is_empty() {
+        None
+    } else {
+        Some(simd.load(&filter[at..]))
+    }
+}
+
 pub(super) struct ProjectChunk<'a> {
     pub splats: &'a Splats,
+    /// As [`Renderer::set_filter`] was given it.
+    pub filter: &'a [f32],
     pub view: &'a ViewParams,
     pub options: &'a RenderOptions,
     pub first: usize,
@@ -46,7 +61,8 @@ impl Kernel for ProjectChunk<'_> {
         for at in (0..self.footprints.len()).step_by(S::LANES) {
             let first = self.first + at;
             let geometry = load_geometry(simd, self.splats, first);
-            let (footprint, visible) = project(&view, &geometry, self.options.antialias);
+            let filter = load_filter(simd, self.filter, first);
+            let (footprint, visible) = project(&view, &geometry, filter, self.options.antialias);
             let inside = (1u32 << S::LANES.min(n.saturating_sub(first))) - 1;
             let visible = visible.bits() & inside;
             let keys = &mut self.depth_keys[at..at + S::LANES];
@@ -102,8 +118,11 @@ impl Kernel for ProjectChunk<'_> {
 pub(super) struct GradientChunk<'a> {
     pub active: &'a mut [f32],
     pub screen: Vec<&'a mut [f32]>,
+    pub gathered: Vec<&'a mut [f32]>,
     pub columns: [Vec<&'a mut [f32]>; 5],
     pub non_finite: usize,
+    /// This chunk's part of it.
+    pub camera: CameraGradient,
 }
 
 pub(super) struct ProjectChunkVjp<'a, 'b> {
@@ -111,6 +130,8 @@ pub(super) struct ProjectChunkVjp<'a, 'b> {
     pub splats: &'a Splats,
     pub view: &'a ViewParams,
     pub degree: u32,
+    /// Whether the camera's gradient is asked for.
+    pub camera: bool,
     pub first: usize,
     pub chunk: &'a mut GradientChunk<'b>,
 }
@@ -123,6 +144,20 @@ impl Kernel for ProjectChunkVjp<'_, '_> {
     where
         S::F: Lanes<Scalar = f32>,
     {
+        if self.camera {
+            self.backward::<S, true>(simd);
+        } else {
+            self.backward::<S, false>(simd);
+        }
+    }
+}
+
+impl ProjectChunkVjp<'_, '_> {
+    #[inline(always)]
+    fn backward<S: Simd, const CAMERA: bool>(self, simd: S)
+    where
+        S::F: Lanes<Scalar = f32>,
+    {
         let view = self.view.lanes(simd);
         let chunk = self.chunk;
         let renderer = self.renderer;
@@ -130,6 +165,10 @@ impl Kernel for ProjectChunkVjp<'_, '_> {
         let mut harmonics = Harmonics::new(self.degree);
         let mut v_colors = [[0.0f32; CHUNK]; 3];
         let mut magnitudes = [0.0f32; CHUNK];
+        // Sums over the chunk of the gradients of R, of t, and of the camera's centre through the direction of view.
+        let mut v_rotation = [[simd.splat(0.0); 3]; 3];
+        let mut v_translation = [simd.splat(0.0); 3];
+        let mut v_center = [simd.splat(0.0); 3];
         for at in (0..chunk.active.len()).step_by(S::LANES) {
             let first = self.first + at;
             // Sum each visible splat's entries, in their order; [sum, lane]. What invisible lanes hold is masked below.
@@ -171,7 +210,8 @@ impl Kernel for ProjectChunkVjp<'_, '_> {
             let moments = [s0, sx, sy, sxx, sxy, syy];
             let v_footprint = footprint_gradient([a, b, c], log2_opacity, moments, v_depth);
             let geometry = load_geometry(simd, self.splats, first);
-            let v = project_vjp(&view, &geometry, antialias, &v_footprint);
+            let filter = load_filter(simd, &renderer.filter, first);
+            let (v, v_camera) = project_vjp(&view, &geometry, filter, antialias, &v_footprint);
 
             // Colour was clamped at 0 where it is not above.
             let v_color = [
@@ -190,6 +230,18 @@ impl Kernel for ProjectChunkVjp<'_, '_> {
                 magnitude += value.abs();
             }
             magnitude.store(&mut magnitudes[at..]);
+            if CAMERA {
+                let counts = shown.and(magnitude.lt(simd.splat(f64::from(f32::MAX))));
+                for i in 0..3 {
+                    v_translation[i] += v_camera.translation[i].zero_where_not(counts);
+                    for j in 0..3 {
+                        v_rotation[i][j] += v_camera.rotation[i][j].zero_where_not(counts);
+                    }
+                }
+            }
+            for (sum, to) in sums[10..].iter().zip(&mut chunk.gathered) {
+                simd.load(sum).store(&mut to[at..]);
+            }
             visible.store(&mut chunk.active[at..]);
             for (value, to) in v_footprint.xy.iter().zip(&mut chunk.screen) {
                 value.store(&mut to[at..]);
@@ -215,6 +267,12 @@ impl Kernel for ProjectChunkVjp<'_, '_> {
             if self.degree > 0 {
                 let mean = load_geometry(simd, self.splats, self.first + at).mean;
                 let v_mean = harmonics.v_mean(at, mean, view.center);
+                if CAMERA {
+                    for c in 0..3 {
+                        let finite = v_mean[c].abs().lt(simd.splat(f64::from(f32::MAX)));
+                        v_center[c] -= v_mean[c].zero_where_not(shown.and(finite));
+                    }
+                }
                 for (v, to) in v_mean.iter().zip(&mut chunk.columns[0]) {
                     (simd.load(&to[at..]) + *v).store(&mut to[at..]);
                     magnitude += v.abs();
@@ -223,6 +281,13 @@ impl Kernel for ProjectChunkVjp<'_, '_> {
             let finite = magnitude.lt(simd.splat(f64::from(f32::MAX)));
             chunk.non_finite += shown.and_not(finite).bits().count_ones() as usize;
             visible.zero_where_not(shown.and(finite)).store(&mut chunk.active[at..]);
+        }
+        if CAMERA {
+            chunk.camera = self.view.gradient(
+                each!(i in 3 => each!(j in 3 => f64::from(v_rotation[i][j].sum()))),
+                each!(i in 3 => f64::from(v_translation[i].sum())),
+                each!(i in 3 => f64::from(v_center[i].sum())),
+            );
         }
     }
 }

@@ -1,6 +1,7 @@
 //! Finite differences in double precision, through the very code that trains: projection, harmonics and fragments are
 //! generic over lanes, and here a lane is one `f64`. Only the loops around them are written again, plainly.
 
+use super::CameraGradient;
 use super::blend::{ALPHA_MAX, LOG2_ALPHA_MIN, TRANSMITTANCE_MIN, fragment, fragment_vjp};
 use super::project::{Geometry, footprint_gradient, project, project_vjp, quadratic};
 use super::sh::{MAX_COEFFICIENTS, basis, basis_vjp, direction, direction_vjp};
@@ -15,6 +16,8 @@ const GEOMETRY: usize = 11;
 struct Scene {
     view: ViewParams,
     antialias: bool,
+    /// Variance of the 3D smoothing filter.
+    filter: Option<f64>,
     degree: u32,
     background: [f64; 3],
     /// Weights of each pixel's red, green, blue, alpha and depth in the loss.
@@ -48,7 +51,7 @@ impl Scene {
             .enumerate()
             .filter_map(|(index, flat)| {
                 let g = geometry(flat);
-                let (footprint, visible) = project(&view, &g, self.antialias);
+                let (footprint, visible) = project(&view, &g, self.filter, self.antialias);
                 let (d, _) = direction(g.mean, view.center);
                 let b = basis(self.degree, d);
                 let color = std::array::from_fn(|c| {
@@ -117,7 +120,7 @@ impl Scene {
         loss
     }
 
-    fn gradient(&self, splats: &[Flat]) -> Vec<Flat> {
+    fn gradient(&self, splats: &[Flat]) -> (Vec<Flat>, CameraGradient) {
         let shown = self.show(splats);
         // Moments of v_p, then colour and depth, for each shown splat.
         let mut sums = vec![[0.0; 10]; shown.len()];
@@ -148,12 +151,13 @@ impl Scene {
         });
         let view = self.view.lanes(Double);
         let mut gradients: Vec<Flat> = splats.iter().map(|s| vec![0.0; s.len()]).collect();
+        let (mut v_rotation, mut v_translation, mut v_center) = ([[0.0; 3]; 3], [0.0; 3], [0.0; 3]);
         for (s, sum) in shown.iter().zip(&sums) {
             let flat = &splats[s.index];
             let g = geometry(flat);
             let moments = [sum[0], sum[1], sum[2], sum[3], sum[4], sum[5]];
             let v_footprint = footprint_gradient(s.quadratic, s.log2_opacity, moments, sum[9]);
-            let v = project_vjp(&view, &g, self.antialias, &v_footprint);
+            let (v, v_camera) = project_vjp(&view, &g, self.filter, self.antialias, &v_footprint);
             let v_color: [f64; 3] = std::array::from_fn(|c| if s.color[c] > 0.0 { sum[6 + c] } else { 0.0 });
             let (d, inverse) = direction(g.mean, view.center);
             let b = basis(self.degree, d);
@@ -167,13 +171,18 @@ impl Scene {
             }
             let v_mean = direction_vjp(d, inverse, basis_vjp(self.degree, d, &v_basis));
             for i in 0..3 {
+                v_center[i] -= v_mean[i];
+                v_translation[i] += v_camera.translation[i];
+                for j in 0..3 {
+                    v_rotation[i][j] += v_camera.rotation[i][j];
+                }
                 out[i] = v.mean[i] + v_mean[i];
                 out[7 + i] = v.log_scale[i];
             }
             out[3..7].copy_from_slice(&v.quat);
             out[10] = v.opacity_logit;
         }
-        gradients
+        (gradients, self.view.gradient(v_rotation, v_translation, v_center))
     }
 
     /// Smallest relative distance of any fragment from one of the hard decisions: a finite difference across one is void.
@@ -237,7 +246,14 @@ fn splats(rng: &mut Rng, degree: u32) -> Vec<Flat> {
 #[test]
 fn finite_differences_hold_every_gradient() {
     let mut compared = 0;
-    for (seed, antialias, degree) in [(1, false, 3), (2, true, 2), (3, false, 1), (4, true, 3), (5, false, 0)] {
+    for (seed, antialias, filter, degree) in [
+        (1, false, None, 3),
+        (2, true, None, 2),
+        (3, false, None, 1),
+        (4, true, Some(0.02), 3),
+        (5, false, None, 0),
+        (6, false, Some(0.1), 1),
+    ] {
         let mut rng = Rng::new(seed, 77);
         let scene = Scene {
             view: ViewParams {
@@ -251,6 +267,7 @@ fn finite_differences_hold_every_gradient() {
                 near: 0.2,
             },
             antialias,
+            filter,
             degree,
             background: [0.2, 0.5, 0.9],
             weights: (0..21 * 18)
@@ -263,7 +280,7 @@ fn finite_differences_hold_every_gradient() {
             scene.margin(&splats) > 1e-5,
             "seed {seed} lies on a hard decision: choose another"
         );
-        let gradient = scene.gradient(&splats);
+        let (gradient, camera) = scene.gradient(&splats);
         let largest = gradient.iter().flatten().fold(0.0f64, |m, v| m.max(v.abs()));
         for (i, splat) in splats.iter().enumerate() {
             for j in 0..splat.len() {
@@ -283,8 +300,49 @@ fn finite_differences_hold_every_gradient() {
                 compared += 1;
             }
         }
+        // The camera, moved and turned: R -> exp(h [axis]) R.
+        for axis in 0..6 {
+            let moved = |h: f64| {
+                let mut view = scene.view.clone();
+                if axis < 3 {
+                    view.translation[axis] += h;
+                } else {
+                    let mut angles = [0.0; 3];
+                    angles[axis - 3] = h;
+                    view.rotation = product(rotation(angles[0], angles[1], angles[2]), view.rotation);
+                }
+                view
+            };
+            let h = 1e-6;
+            let loss = |h: f64| {
+                let scene = Scene {
+                    view: moved(h),
+                    weights: scene.weights.clone(),
+                    ..scene
+                };
+                scene.loss(&splats)
+            };
+            let want = (loss(h) - loss(-h)) / (2.0 * h);
+            let (above, below) = (moved(h), moved(-h));
+            let mut got = 0.0;
+            for i in 0..3 {
+                got += camera.translation[i] * (above.translation[i] - below.translation[i]) / (2.0 * h);
+                for j in 0..3 {
+                    got += camera.rotation[i][j] * (above.rotation[i][j] - below.rotation[i][j]) / (2.0 * h);
+                }
+            }
+            assert!(
+                (got - want).abs() <= 1e-6 * want.abs() + 1e-6 * largest,
+                "seed {seed} camera {axis}: {got} and not {want}"
+            );
+        }
     }
     assert!(compared > 1000);
+}
+
+/// `a b`.
+fn product(a: [[f64; 3]; 3], b: [[f64; 3]; 3]) -> [[f64; 3]; 3] {
+    std::array::from_fn(|i| std::array::from_fn(|j| (0..3).map(|k| a[i][k] * b[k][j]).sum()))
 }
 
 /// Rotation matrix of Euler angles.

@@ -20,7 +20,7 @@ pub use view::ViewParams;
 
 use crate::Splats;
 use bin::{BAND_BLOCKS, BLOCK_HEIGHT, BLOCK_WIDTH, Bins, TILE};
-use blend::{BLOCK, BlendTile, BlendTileVjp, CHANNELS, Footprint2d, SUMS, TILE_PIXELS};
+use blend::{BLOCK, BlendTile, BlendTileVjp, CHANNELS, Footprint2d, SUMS, TILE_PIXELS, gather};
 use chunk::{GradientChunk, ProjectChunk, ProjectChunkVjp};
 use harmonics::CHUNK;
 use irradia_compute::Planes;
@@ -60,6 +60,44 @@ pub struct OutputGradient<'a> {
     pub alpha: Option<&'a [f32]>,
     /// `[H, W]`, of the accumulated depth; the frame must have been rendered with depth.
     pub depth: Option<&'a [f32]>,
+    /// What else to sum up for each splat.
+    pub gather: Gather<'a>,
+    /// Whether to work out [`SplatGradients::camera`] too.
+    pub camera: bool,
+}
+
+impl<'a> OutputGradient<'a> {
+    /// Of the colour alone, `[3, H, W]`.
+    pub fn of_color(color: &'a [f32]) -> Self {
+        Self {
+            color,
+            alpha: None,
+            depth: None,
+            gather: Gather::Nothing,
+            camera: false,
+        }
+    }
+}
+
+/// What backward sums up for density control, beside the gradients.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Gather<'a> {
+    /// Nothing.
+    Nothing,
+    /// The screen gradient of the centre with each fragment's part taken absolutely (AbsGS, Ye et al. 2024, eq. 6).
+    Absolute,
+    /// `[H, W]`, an error a pixel: each splat collects the error it shows, weighted by how much of the pixel it is, and
+    /// the sum of these weights (Rota Bulo et al. 2024, "Revising Densification in Gaussian Splatting", eq. 5).
+    Error(&'a [f32]),
+}
+
+/// The gradient of the loss with regard to a camera: `x_cam = R x + t`, the entries of R taken as independent.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct CameraGradient {
+    /// Of R, row-major.
+    pub rotation: [[f64; 3]; 3],
+    /// Of t.
+    pub translation: [f64; 3],
 }
 
 /// Gradients of the loss with regard to the splats.
@@ -71,6 +109,10 @@ pub struct SplatGradients {
     pub active: Vec<f32>,
     /// Gradient of the projected centre, pixels: 2 planes.
     pub screen: Planes,
+    /// What [`OutputGradient::gather`] asked for, 2 planes: absolute screen gradients, or error and weight.
+    pub gathered: Planes,
+    /// Of the camera, where [`OutputGradient::camera`] asked for it.
+    pub camera: Option<CameraGradient>,
     /// Splats left out because a gradient was not finite.
     pub non_finite: usize,
 }
@@ -79,6 +121,8 @@ pub struct SplatGradients {
 pub struct Renderer {
     /// Instruction set to use.
     pub level: Level,
+    /// Variance of each splat's 3D smoothing filter, world units squared, padded to the splats' stride; empty for none.
+    filter: Vec<f32>,
     view: Option<ViewParams>,
     options: RenderOptions,
     footprints: Vec<Footprint2d>,
@@ -109,6 +153,7 @@ impl Renderer {
     pub fn with_level(level: Level) -> Self {
         Self {
             level,
+            filter: Vec::new(),
             view: None,
             options: RenderOptions::default(),
             footprints: Vec::new(),
@@ -120,6 +165,13 @@ impl Renderer {
             depth: Vec::new(),
             sums: Vec::new(),
         }
+    }
+
+    /// Convolves every splat with an isotropic Gaussian of this variance (world units squared, one a splat) from the next
+    /// frame on: the 3D smoothing filter of Mip-Splatting (Yu et al. 2024, eq. 8). Empty for none.
+    pub fn set_filter(&mut self, variances: &[f32]) {
+        self.filter.clear();
+        self.filter.extend_from_slice(variances);
     }
 
     /// Colour of the last frame, `[3, H, W]`, not clamped.
@@ -163,6 +215,10 @@ impl Renderer {
 
     /// Renders `splats` into this renderer's buffers.
     pub fn render(&mut self, splats: &Splats, view: &ViewParams, options: &RenderOptions) {
+        assert!(
+            self.filter.is_empty() || self.filter.len() == splats.stride(),
+            "a filter for every splat, with padding"
+        );
         self.project(splats, view, options);
         self.bins
             .build(self.level, view.width, view.height, &self.footprints, &self.depth_keys);
@@ -175,7 +231,7 @@ impl Renderer {
         let stride = splats.stride();
         self.footprints.resize(stride, Footprint2d::default());
         self.depth_keys.resize(stride, u32::MAX);
-        let level = self.level;
+        let (level, filter) = (self.level, &self.filter);
         self.footprints
             .par_chunks_mut(CHUNK)
             .zip(self.depth_keys.par_chunks_mut(CHUNK))
@@ -183,6 +239,7 @@ impl Renderer {
             .for_each(|(chunk, (footprints, depth_keys))| {
                 level.run(ProjectChunk {
                     splats,
+                    filter,
                     view,
                     options,
                     first: chunk * CHUNK,
@@ -265,9 +322,13 @@ impl Renderer {
             v_out.depth.is_none_or(|v| v.len() == pixels && self.options.depth),
             "a depth gradient per pixel of a frame with depth"
         );
+        assert!(
+            !matches!(v_out.gather, Gather::Error(error) if error.len() != pixels),
+            "an error per pixel"
+        );
         assert_eq!(self.depth_keys.len(), splats.stride(), "the splats that were rendered");
         self.blend_vjp(&view, v_out);
-        self.project_vjp(splats, &view, gradients);
+        self.project_vjp(splats, &view, v_out.camera, gradients);
     }
 
     fn blend_vjp(&mut self, view: &ViewParams, v_out: &OutputGradient) {
@@ -283,6 +344,11 @@ impl Renderer {
             })
             .collect();
         let background = self.options.background;
+        let (gather, error) = match v_out.gather {
+            Gather::Nothing => (gather::NOTHING, None),
+            Gather::Absolute => (gather::ABSOLUTE, None),
+            Gather::Error(error) => (gather::ERROR, Some(error)),
+        };
         self.tiles
             .as_chunks::<{ CHANNELS * TILE_PIXELS }>()
             .0
@@ -290,7 +356,7 @@ impl Renderer {
             .zip(sums)
             .enumerate()
             .for_each(|(tile, (state, sums))| {
-                let mut v_tile = [0.0f32; (CHANNELS - 1) * TILE_PIXELS];
+                let mut v_tile = [0.0f32; CHANNELS * TILE_PIXELS];
                 let mut rest = [0.0f32; TILE_PIXELS];
                 let (x0, y0) = ((tile % bins.tiles_x) * TILE, (tile / bins.tiles_x) * TILE);
                 let columns = TILE.min(width - x0);
@@ -321,6 +387,9 @@ impl Renderer {
                             }
                             put(3, v);
                         }
+                        if let Some(error) = error {
+                            put(4, v(error, from));
+                        }
                         if let Some(v_alpha) = v_out.alpha {
                             let v = v(v_alpha, from);
                             for i in 0..BLOCK_WIDTH {
@@ -337,17 +406,19 @@ impl Renderer {
                     v_out: &v_tile,
                     rest: &mut rest,
                     with_depth: v_out.depth.is_some(),
+                    gather,
                     sums,
                 });
             });
     }
 
-    fn project_vjp(&mut self, splats: &Splats, view: &ViewParams, gradients: &mut SplatGradients) {
+    fn project_vjp(&mut self, splats: &Splats, view: &ViewParams, camera: bool, gradients: &mut SplatGradients) {
         let (stride, n) = (splats.stride(), splats.len());
         for (to, like) in gradients.splats.columns_mut().into_iter().zip(splats.columns()) {
             to.reshape(like.count(), n);
         }
         gradients.screen.reshape(2, n);
+        gradients.gathered.reshape(2, n);
         gradients.active.resize(stride, 0.0);
         let degree = self.options.sh_degree.min(splats.sh_degree());
         let mut chunks: Vec<GradientChunk> = gradients
@@ -356,14 +427,21 @@ impl Renderer {
             .map(|active| GradientChunk {
                 active,
                 screen: Vec::with_capacity(2),
+                gathered: Vec::with_capacity(2),
                 columns: Default::default(),
                 non_finite: 0,
+                camera: CameraGradient::default(),
             })
             .collect();
         if stride > 0 {
             for plane in gradients.screen.as_mut_slice().chunks_mut(stride) {
                 for (chunk, part) in chunks.iter_mut().zip(plane.chunks_mut(CHUNK)) {
                     chunk.screen.push(part);
+                }
+            }
+            for plane in gradients.gathered.as_mut_slice().chunks_mut(stride) {
+                for (chunk, part) in chunks.iter_mut().zip(plane.chunks_mut(CHUNK)) {
+                    chunk.gathered.push(part);
                 }
             }
             for (c, column) in gradients.splats.columns_mut().into_iter().enumerate() {
@@ -381,11 +459,24 @@ impl Renderer {
                 splats,
                 view,
                 degree,
+                camera,
                 first: i * CHUNK,
                 chunk,
             });
         });
         gradients.non_finite = chunks.iter().map(|chunk| chunk.non_finite).sum();
+        gradients.camera = camera.then(|| {
+            let mut sum = CameraGradient::default();
+            for chunk in &chunks {
+                for i in 0..3 {
+                    sum.translation[i] += chunk.camera.translation[i];
+                    for j in 0..3 {
+                        sum.rotation[i][j] += chunk.camera.rotation[i][j];
+                    }
+                }
+            }
+            sum
+        });
     }
 }
 

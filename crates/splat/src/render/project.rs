@@ -26,6 +26,14 @@ pub(super) struct Geometry<F> {
     pub opacity_logit: F,
 }
 
+/// The gradient of the camera, before the part that goes through the direction of view: `x = R m + t` with the entries of
+/// R taken as independent.
+#[derive(Clone, Copy)]
+pub(super) struct CameraTerms<F> {
+    pub rotation: [[F; 3]; 3],
+    pub translation: [F; 3],
+}
+
 /// The footprint.
 #[derive(Clone, Copy)]
 pub(super) struct Footprint<F> {
@@ -59,7 +67,10 @@ struct Intermediate<F> {
     q: [F; 4],
     inv_q_norm: F,
     rot: [[F; 3]; 3],
+    /// After the 3D filter.
     scale: [F; 3],
+    /// The variance along each axis before the 3D filter over that after it.
+    share: [F; 3],
     /// Rows of J R.
     jr: [[F; 3]; 2],
     v: [[F; 3]; 2],
@@ -70,6 +81,8 @@ struct Intermediate<F> {
     cov_dilated: [F; 3],
     det_dilated: F,
     sigmoid: F,
+    /// sqrt of the product of the shares: what the 3D filter takes from the opacity.
+    thinning: F,
 }
 
 #[inline(always)]
@@ -84,7 +97,7 @@ pub(super) fn exp<F: Lanes>(x: F) -> F {
 }
 
 #[inline(always)]
-fn intermediate<F: Lanes>(view: &ViewLanes<F>, g: &Geometry<F>) -> Intermediate<F> {
+fn intermediate<F: Lanes>(view: &ViewLanes<F>, g: &Geometry<F>, filter: Option<F>) -> Intermediate<F> {
     let one = view.near.splat(1.0);
     let two = view.near.splat(2.0);
     let x = each!(i in 3 => dot(view.r[i], g.mean) + view.t[i]);
@@ -111,7 +124,20 @@ fn intermediate<F: Lanes>(view: &ViewLanes<F>, g: &Geometry<F>) -> Intermediate<
             one - two * (i * i + j * j),
         ],
     ];
-    let scale = each!(k in 3 => exp(g.log_scale[k]));
+    let own_scale = each!(k in 3 => exp(g.log_scale[k]));
+    // Mip-Splatting (Yu et al. 2024), eq. 8: convolved with an isotropic Gaussian, at the same mass.
+    let (scale, share, thinning) = match filter {
+        Some(variance) => {
+            let scale: [F; 3] = each!(k in 3 => own_scale[k].mul_add(own_scale[k], variance).sqrt());
+            let ratio: [F; 3] = each!(k in 3 => own_scale[k] / scale[k]);
+            (
+                scale,
+                each!(k in 3 => ratio[k] * ratio[k]),
+                ratio[0] * ratio[1] * ratio[2],
+            )
+        }
+        None => (own_scale, [one; 3], one),
+    };
     // J = [[fx/z, 0, -fx tx/z], [0, fy/z, -fy ty/z]] with the clamped tangents tx, ty.
     let j_scale = each!(r in 2 => view.f[r] * inv_z);
     let jr = each!(r in 2 => each!(c in 3 => j_scale[r] * (view.r[r][c] - tangent[r] * view.r[2][c])));
@@ -136,6 +162,7 @@ fn intermediate<F: Lanes>(view: &ViewLanes<F>, g: &Geometry<F>) -> Intermediate<
         inv_q_norm,
         rot,
         scale,
+        share,
         jr,
         v,
         cov,
@@ -143,19 +170,27 @@ fn intermediate<F: Lanes>(view: &ViewLanes<F>, g: &Geometry<F>) -> Intermediate<
         cov_dilated: [cov[0] + dilation, cov[1], cov[2] + dilation],
         det_dilated,
         sigmoid,
+        thinning,
     }
 }
 
-/// Projects; the mask holds the lanes that can touch the image. Lanes outside it hold unspecified numbers.
+/// Projects; the mask holds the lanes that can touch the image. Lanes outside it hold unspecified numbers. `filter` is the
+/// variance of the 3D smoothing filter, world units squared.
 #[inline(always)]
-pub(super) fn project<F: Lanes>(view: &ViewLanes<F>, g: &Geometry<F>, antialias: bool) -> (Footprint<F>, F::Mask) {
-    let at = intermediate(view, g);
+pub(super) fn project<F: Lanes>(
+    view: &ViewLanes<F>,
+    g: &Geometry<F>,
+    filter: Option<F>,
+    antialias: bool,
+) -> (Footprint<F>, F::Mask) {
+    let at = intermediate(view, g, filter);
+    let own_opacity = at.sigmoid * at.thinning;
     let inv_det = at.inv_z.splat(1.0) / at.det_dilated;
     let [a, b, c] = at.cov_dilated;
     let opacity = if antialias {
-        at.sigmoid * (at.det * inv_det).max(inv_det.splat(COMPENSATION_FLOOR)).sqrt()
+        own_opacity * (at.det * inv_det).max(inv_det.splat(COMPENSATION_FLOOR)).sqrt()
     } else {
-        at.sigmoid
+        own_opacity
     };
     let xy: [F; 2] = each!(i in 2 => view.f[i] * at.x[i] * at.inv_z + view.c[i]);
     // alpha >= 1/255 inside d^T conic d <= 2 ln(255 opacity), whose box has half sizes sqrt(2 ln(255 opacity) cov_ii).
@@ -220,10 +255,11 @@ pub(super) fn footprint_gradient<F: Lanes>(
 pub(super) fn project_vjp<F: Lanes>(
     view: &ViewLanes<F>,
     g: &Geometry<F>,
+    filter: Option<F>,
     antialias: bool,
     v_out: &FootprintGradient<F>,
-) -> Geometry<F> {
-    let at = intermediate(view, g);
+) -> (Geometry<F>, CameraTerms<F>) {
+    let at = intermediate(view, g, filter);
     let one = at.inv_z.splat(1.0);
     let two = one.splat(2.0);
     let zero = one.splat(0.0);
@@ -246,11 +282,12 @@ pub(super) fn project_vjp<F: Lanes>(
     ];
 
     // Opacity, with its compensation sqrt(det / det_dilated).
-    let v_sigmoid = if antialias {
+    let own_opacity = at.sigmoid * at.thinning;
+    let v_own_opacity = if antialias {
         let ratio = at.det * inv_det;
         let floor = one.splat(COMPENSATION_FLOOR);
         let compensation = ratio.max(floor).sqrt();
-        let v_ratio = (v_out.opacity * at.sigmoid * one.splat(0.5) / compensation).zero_where_not(floor.lt(ratio));
+        let v_ratio = (v_out.opacity * own_opacity * one.splat(0.5) / compensation).zero_where_not(floor.lt(ratio));
         let v_det = v_ratio * inv_det;
         let v_det_dilated = -v_det * ratio;
         v_cov[0] += v_det * at.cov[2] + v_det_dilated * c;
@@ -266,15 +303,25 @@ pub(super) fn project_vjp<F: Lanes>(
         each!(k in 3 => two * v_cov[0] * at.v[0][k] + v_cov[1] * at.v[1][k]),
         each!(k in 3 => two * v_cov[2] * at.v[1][k] + v_cov[1] * at.v[0][k]),
     ];
-    let v_log_scale = each!(k in 3 => v_v[0][k] * at.v[0][k] + v_v[1][k] * at.v[1][k]);
+    let v_log_filtered = each!(k in 3 => v_v[0][k] * at.v[0][k] + v_v[1][k] * at.v[1][k]);
+    let v_log_thinning = v_own_opacity * own_opacity;
+    let v_log_scale: [F; 3] = match filter {
+        Some(_) => each!(k in 3 => v_log_filtered[k] * at.share[k] + v_log_thinning * (one - at.share[k])),
+        None => v_log_filtered,
+    };
     let v_u: [[F; 3]; 2] = each!(r in 2 => each!(k in 3 => v_v[r][k] * at.scale[k]));
     let v_rot: [[F; 3]; 3] = each!(j in 3 => each!(k in 3 => at.jr[0][j] * v_u[0][k] + at.jr[1][j] * v_u[1][k]));
     let v_jr: [[F; 3]; 2] = each!(r in 2 => each!(j in 3 => dot(v_u[r], at.rot[j])));
 
     // J R: row r is f_r / z (R_r - tangent_r R_2).
     let mut v_x = [zero; 3];
+    let mut v_r = [[zero; 3]; 3];
     for r in 0..2 {
         let j_scale = view.f[r] * at.inv_z;
+        for c in 0..3 {
+            v_r[r][c] = j_scale * v_jr[r][c];
+            v_r[2][c] -= at.tangent[r] * v_r[r][c];
+        }
         let v_j_scale = dot(v_jr[r], view.r[r]) - at.tangent[r] * dot(v_jr[r], view.r[2]);
         v_x[2] -= v_j_scale * j_scale * at.inv_z;
         let v_tangent = -j_scale * dot(v_jr[r], view.r[2]);
@@ -287,6 +334,11 @@ pub(super) fn project_vjp<F: Lanes>(
     }
     v_x[2] += v_out.depth;
     let v_mean = each!(j in 3 => dot(v_x, [view.r[0][j], view.r[1][j], view.r[2][j]]));
+    for i in 0..3 {
+        for j in 0..3 {
+            v_r[i][j] = v_x[i].mul_add(g.mean[j], v_r[i][j]);
+        }
+    }
 
     // Rot(q), then the normalisation of q.
     let [w, i, j, k] = at.q;
@@ -303,10 +355,15 @@ pub(super) fn project_vjp<F: Lanes>(
     let along = v_q[0] * w + v_q[1] * i + v_q[2] * j + v_q[3] * k;
     let v_quat = each!(n in 4 => (v_q[n] - at.q[n] * along) * at.inv_q_norm);
 
-    Geometry {
+    let geometry = Geometry {
         mean: v_mean,
         quat: v_quat,
         log_scale: v_log_scale,
-        opacity_logit: v_sigmoid * at.sigmoid * (one - at.sigmoid),
-    }
+        opacity_logit: v_log_thinning * (one - at.sigmoid),
+    };
+    let camera = CameraTerms {
+        rotation: v_r,
+        translation: v_x,
+    };
+    (geometry, camera)
 }

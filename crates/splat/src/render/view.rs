@@ -1,3 +1,4 @@
+use super::CameraGradient;
 use irradia_compute::each;
 use irradia_compute::simd::Simd;
 use irradia_scene::Camera;
@@ -41,6 +42,25 @@ impl ViewParams {
     /// The camera's centre in the world: `-R^T t`.
     pub fn center(&self) -> [f64; 3] {
         std::array::from_fn(|j| -(0..3).map(|i| self.rotation[i][j] * self.translation[i]).sum::<f64>())
+    }
+
+    /// The camera's whole gradient from its direct part and that of the centre, which moves the directions of view:
+    /// `center = -R^-1 t`, so `d center = -R^-1 (dR center + dt)`.
+    pub(super) fn gradient(
+        &self,
+        mut rotation: [[f64; 3]; 3],
+        mut translation: [f64; 3],
+        v_center: [f64; 3],
+    ) -> CameraGradient {
+        let center = self.center();
+        for i in 0..3 {
+            let along: f64 = (0..3).map(|j| self.rotation[i][j] * v_center[j]).sum();
+            translation[i] -= along;
+            for j in 0..3 {
+                rotation[i][j] -= along * center[j];
+            }
+        }
+        CameraGradient { rotation, translation }
     }
 
     /// `|X / Z|` beyond which J is evaluated at the limit: Inria's 1.3 tan(fov / 2), about the axis.

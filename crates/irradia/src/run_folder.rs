@@ -257,6 +257,7 @@ pub fn render_knobs_beside(scene: &Path) -> irradia_train::recipe::RenderKnobs {
     let fallback = irradia_train::recipe::RenderKnobs {
         background: [0.0; 3],
         antialias: false,
+        smoothing_filter: false,
     };
     let Some(folder) = scene.parent() else { return fallback };
     fs::read_to_string(folder.join("recipe.toml"))

@@ -4,7 +4,10 @@
 //! One thread's wall time is the processor time; each figure is the median of many runs.
 
 use irradia_compute::Level;
-use irradia_measure::{LossWeights, Lpips, PhotometricLoss, Target, Truth, psnr, ssim};
+use irradia_measure::{
+    CoarseLoss, Crop, DepthKind, DepthLoss, DepthSample, LossWeights, Lpips, PhotometricLoss, SmoothLoss, Smoothed,
+    Target, Truth, perceptual, psnr, ssim,
+};
 use irradia_scene::{Image, Rng};
 use std::hint::black_box;
 use std::time::Instant;
@@ -56,6 +59,58 @@ fn loss_times(width: usize, height: usize, weights: &LossWeights, eight_bits: bo
     })
 }
 
+/// The losses beside the photometric one, on one thread.
+fn curriculum_times(width: usize, height: usize, net: Option<&Lpips>) {
+    let mut rng = Rng::new(3, 0);
+    let pixels = width * height;
+    let render: Vec<f32> = (0..3 * pixels).map(|_| rng.uniform()).collect();
+    let bytes: Vec<u8> = (0..3 * pixels).map(|_| rng.below(256) as u8).collect();
+    let depth: Vec<f32> = (0..pixels).map(|_| 1.0 + rng.uniform()).collect();
+    let alpha = vec![1.0; pixels];
+    let samples: Vec<DepthSample> = (0..2000)
+        .map(|_| DepthSample {
+            pixel: rng.below(pixels as u32),
+            depth: 1.0 + rng.uniform(),
+            weight: 1.0,
+        })
+        .collect();
+    let target = Target {
+        width,
+        height,
+        truth: Truth::Rgb8(&bytes),
+        mask: None,
+    };
+    let (mut v, mut v_depth, mut v_alpha) = (vec![0.0; 3 * pixels], vec![0.0; pixels], vec![0.0; pixels]);
+    let said = |name: &str, seconds: f64| println!("{width}x{height} {name:<30} {:7.3} ms of CPU", 1e3 * seconds);
+    for factor in [2, 8] {
+        let mut loss = CoarseLoss::default();
+        let time = seconds(100, || {
+            _ = black_box(loss.evaluate(&render, &target, factor, 1.0, &mut v))
+        });
+        said(&format!("coarse, cells of {factor}"), time);
+    }
+    let mut loss = DepthLoss::default();
+    let kind = DepthKind::Relative;
+    let time = seconds(100, || {
+        _ = black_box(loss.evaluate(&depth, &alpha, &samples, kind, 1.0, &mut v_depth, &mut v_alpha));
+    });
+    said("depth, 2000 samples", time);
+    let mut loss = SmoothLoss::default();
+    let of = Smoothed::Disparity;
+    let time = seconds(100, || {
+        _ = black_box(loss.evaluate(&depth, &alpha, &target, of, 10.0, 1.0, &mut v_depth, &mut v_alpha));
+    });
+    said("smoothness", time);
+    let Some(net) = net else { return };
+    for side in [64, 128, usize::MAX] {
+        let crop = Crop::random(width, height, side, &mut rng);
+        let time = seconds(10, || {
+            _ = black_box(perceptual(net, &render, &target, crop, 1.0, &mut v));
+        });
+        said(&format!("LPIPS of {}x{}", crop.width, crop.height), time);
+    }
+}
+
 fn main() {
     println!("instructions: {}", Level::detect().name());
     let classic = LossWeights::photometric(0.2);
@@ -78,6 +133,7 @@ fn main() {
     let net = std::env::args()
         .nth(1)
         .map(|path| Lpips::load(path).unwrap_or_else(|error| panic!("{error}")));
+    with_threads(1, || curriculum_times(270, 480, net.as_ref()));
     for (width, height) in [(270, 480), (540, 960)] {
         let mut rng = Rng::new(2, 0);
         let mut image = || {

@@ -7,7 +7,12 @@
 
 pub mod loss;
 pub mod metric;
+mod real;
 mod window;
 
+pub use loss::coarse::CoarseLoss;
+pub use loss::depth::{DepthKind, DepthLoss, DepthSample};
+pub use loss::perceptual::{Crop, perceptual};
+pub use loss::smooth::{SmoothLoss, Smoothed};
 pub use loss::{LossValues, LossWeights, PhotometricLoss, Target, Truth};
 pub use metric::{Evaluation, Lpips, LpipsError, evaluate, psnr, psnr_masked, ssim, ssim_masked};

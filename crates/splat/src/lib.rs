@@ -2,11 +2,13 @@
 #![forbid(unsafe_code)]
 
 pub mod densify;
+pub mod filter;
 pub mod init;
+pub mod regularize;
 pub mod render;
 mod splats;
 mod state;
 
 pub use render::{CameraGradient, Gather, OutputGradient, RenderOptions, Renderer, SplatGradients, ViewParams};
 pub use splats::{COLUMN_NAMES, Splats, logit, sigmoid};
-pub use state::{Rates, SplatState};
+pub use state::{Rates, SplatState, Statistics};

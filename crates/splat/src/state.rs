@@ -12,8 +12,21 @@ pub struct SplatState {
     /// Adam's first and second moments.
     pub moments: [Splats; 2],
     /// What density control has gathered since it last acted: planes [`SplatState::GRADIENT`], [`SplatState::SEEN`],
-    /// [`SplatState::EXTENT`].
+    /// [`SplatState::EXTENT`], [`SplatState::ERROR`], [`SplatState::WEIGHT`].
     pub statistics: Planes,
+    /// Variance of each splat's 3D smoothing filter, world units squared, 1 plane; zeros where the recipe has no filter.
+    pub filter: Planes,
+}
+
+/// What [`SplatState::gather_statistics`] is to add up.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Statistics {
+    /// The norm of the screen gradient (3DGS).
+    Gradient,
+    /// The norm of the screen gradient whose fragments were taken absolutely (AbsGS).
+    AbsoluteGradient,
+    /// The norm of the screen gradient, the error shown and the weight.
+    Error,
 }
 
 /// Learning rates of one step.
@@ -40,6 +53,12 @@ impl SplatState {
     pub const SEEN: usize = 1;
     /// Statistics plane: largest half size on screen, pixels.
     pub const EXTENT: usize = 2;
+    /// Statistics plane: sum over frames of the error that the splat showed, pixels times the error's unit.
+    pub const ERROR: usize = 3;
+    /// Statistics plane: sum over frames of its blending weights, pixels.
+    pub const WEIGHT: usize = 4;
+    /// Statistics planes.
+    pub const STATISTICS: usize = 5;
 
     /// Fresh moments and statistics for `splats`, which are put into Morton order.
     pub fn new(splats: Splats) -> Self {
@@ -47,7 +66,8 @@ impl SplatState {
         let mut state = Self {
             splats,
             moments: std::array::from_fn(|_| Splats::zeros(n, degree)),
-            statistics: Planes::zeros(3, n),
+            statistics: Planes::zeros(Self::STATISTICS, n),
+            filter: Planes::zeros(1, n),
         };
         state.sort_by_place();
         state
@@ -68,6 +88,7 @@ impl SplatState {
         self.splats = self.splats.gather(indices);
         self.moments = [self.moments[0].gather(indices), self.moments[1].gather(indices)];
         self.statistics = self.statistics.gather(indices);
+        self.filter = self.filter.gather(indices);
     }
 
     /// Adds `splats` with moments and statistics of zero.
@@ -77,7 +98,24 @@ impl SplatState {
         for moment in &mut self.moments {
             moment.append(&zeros);
         }
-        self.statistics.append(&Planes::zeros(3, splats.len()));
+        self.statistics.append(&Planes::zeros(Self::STATISTICS, splats.len()));
+        self.filter.append(&Planes::zeros(1, splats.len()));
+    }
+
+    /// Sets the moments of splat `i` back to zero.
+    pub fn forget_moments(&mut self, i: usize) {
+        for moment in &mut self.moments {
+            for column in moment.columns_mut() {
+                for c in 0..column.count() {
+                    column.set(c, i, 0.0);
+                }
+            }
+        }
+    }
+
+    /// Statistics plane `plane` of splat `i`, the mean over the frames that saw it.
+    pub fn mean_statistic(&self, plane: usize, i: usize) -> f32 {
+        self.statistics.get(plane, i) / self.statistics.get(Self::SEEN, i).max(1.0)
     }
 
     /// Puts neighbours in space beside each other in memory (Morton order of the means), so that a vector of splats is
@@ -119,9 +157,10 @@ impl SplatState {
     }
 
     /// Adds one frame's gradients to the statistics. `width` and `height` are the frame's, pixels; `extent(i)` is splat
-    /// i's half size on screen.
+    /// i's half size on screen. All but [`Statistics::Gradient`] need what backward was asked to gather for them.
     pub fn gather_statistics(
         &mut self,
+        what: Statistics,
         gradients: &SplatGradients,
         width: u32,
         height: u32,
@@ -129,26 +168,34 @@ impl SplatState {
     ) {
         let n = self.len();
         let stride = self.statistics.stride();
-        let (x, y) = (gradients.screen.plane(0), gradients.screen.plane(1));
+        let screen = match what {
+            Statistics::AbsoluteGradient => &gradients.gathered,
+            Statistics::Gradient | Statistics::Error => &gradients.screen,
+        };
+        let (x, y) = (screen.plane(0), screen.plane(1));
+        let (error, weight) = (gradients.gathered.plane(0), gradients.gathered.plane(1));
         // Pixels to normalised device coordinates, whose range is 2.
         let scale = [0.5 * width as f32, 0.5 * height as f32];
-        let [gradient, seen, extents] = {
-            let (a, rest) = self.statistics.as_mut_slice().split_at_mut(stride);
-            let (b, c) = rest.split_at_mut(stride);
-            [a, b, c]
-        };
-        gradient[..n]
+        let mut planes = self.statistics.as_mut_slice().chunks_mut(stride.max(1));
+        let mut plane = || &mut planes.next().expect("a plane for each statistic")[..n];
+        let (gradient, seen, extents, errors, weights) = (plane(), plane(), plane(), plane(), plane());
+        gradient
             .par_iter_mut()
-            .zip(&mut seen[..n])
-            .zip(&mut extents[..n])
+            .zip(seen)
+            .zip(extents)
+            .zip(errors.par_iter_mut().zip(weights))
             .with_min_len(4096)
             .enumerate()
             .filter(|(i, _)| gradients.active[*i] != 0.0)
-            .for_each(|(i, ((gradient, seen), largest))| {
+            .for_each(|(i, (((gradient, seen), largest), (errors, weights)))| {
                 let (gx, gy) = (x[i] * scale[0], y[i] * scale[1]);
                 *gradient += (gx * gx + gy * gy).sqrt();
                 *seen += 1.0;
                 *largest = largest.max(extent(i));
+                if what == Statistics::Error {
+                    *errors += error[i];
+                    *weights += weight[i];
+                }
             });
     }
 }

@@ -2,7 +2,7 @@
 //! would have written. Only bytes are made and read here; where they go is the caller's.
 
 use crate::recipe::{Param, Recipe};
-use crate::schedule::Clock;
+use crate::schedule::{Clock, Watch};
 use crate::trainer::{TrainError, TrainOptions, Trainer};
 use irradia_compute::Planes;
 use irradia_scene::Dataset;
@@ -11,7 +11,7 @@ use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use std::collections::HashMap;
 use std::sync::Arc;
 
-const FORMAT: &str = "irradia-checkpoint-1";
+const FORMAT: &str = "irradia-checkpoint-2";
 const OWNERS: [&str; 3] = ["splats", "first_moments", "second_moments"];
 
 /// `trainer` as a safetensors file: columns `[components, N]` of splats and moments, statistics, and the clock.
@@ -35,16 +35,29 @@ pub fn to_bytes(trainer: &Trainer) -> Vec<u8> {
         vec![statistics.count(), statistics.len()],
         plane_bytes(statistics),
     ));
+    arrays.push((
+        "filter".into(),
+        Dtype::F32,
+        vec![1, state.filter.len()],
+        plane_bytes(&state.filter),
+    ));
     let clock = &trainer.clock;
     let whole = [
         clock.step,
         clock.stage as u64,
         clock.stage_step,
         u64::from(clock.was_reset),
+        clock.watch.steps,
     ];
     let real: Vec<f64> = [
         clock.time,
         clock.stage_time,
+        clock.progress,
+        clock.stretch,
+        clock.watch.mean,
+        clock.watch.start,
+        clock.watch.best,
+        clock.watch.best_time,
         trainer.pace,
         trainer.seconds,
         trainer.cpu_seconds,
@@ -141,6 +154,7 @@ pub fn from_bytes(bytes: &[u8], dataset: Arc<Dataset>, options: TrainOptions) ->
         splats: splats(OWNERS[0])?,
         moments: [splats(OWNERS[1])?, splats(OWNERS[2])?],
         statistics: planes("statistics")?,
+        filter: planes("filter")?,
     };
     let like = |s: &Splats| s.columns().map(|c| (c.count(), c.len()));
     let shape = like(&state.splats);
@@ -148,6 +162,8 @@ pub fn from_bytes(bytes: &[u8], dataset: Arc<Dataset>, options: TrainOptions) ->
     if state.moments.iter().any(|m| like(m) != shape)
         || shape != expected
         || state.statistics.len() != state.splats.len()
+        || state.statistics.count() != SplatState::STATISTICS
+        || state.filter.len() != state.splats.len()
     {
         return Err(wrong("its columns have different lengths".into()));
     }
@@ -165,8 +181,23 @@ pub fn from_bytes(bytes: &[u8], dataset: Arc<Dataset>, options: TrainOptions) ->
         .iter()
         .map(|b| f64::from_le_bytes(*b))
         .collect();
-    let ([step, stage, stage_step, was_reset], [time, stage_time, pace, seconds, cpu_seconds, carried @ ..]) =
-        (&whole[..], &real[..])
+    let (
+        [step, stage, stage_step, was_reset, watched],
+        [
+            time,
+            stage_time,
+            progress,
+            stretch,
+            mean,
+            start,
+            best,
+            best_time,
+            pace,
+            seconds,
+            cpu_seconds,
+            carried @ ..,
+        ],
+    ) = (&whole[..], &real[..])
     else {
         return Err(wrong("its clock has the wrong length".into()));
     };
@@ -179,12 +210,22 @@ pub fn from_bytes(bytes: &[u8], dataset: Arc<Dataset>, options: TrainOptions) ->
     trainer.clock = Clock {
         step: *step,
         time: *time,
+        progress: *progress,
+        stretch: *stretch,
         stage: *stage as usize,
         stage_time: *stage_time,
         stage_step: *stage_step,
         carried,
         was_reset: *was_reset != 0,
+        watch: Watch {
+            mean: *mean,
+            steps: *watched,
+            start: *start,
+            best: *best,
+            best_time: *best_time,
+        },
     };
+    trainer.restore_filter();
     Ok(trainer)
 }
 

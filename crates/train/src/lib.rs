@@ -4,6 +4,7 @@
 pub mod checkpoint;
 pub mod eval;
 pub mod event;
+mod objective;
 mod photos;
 pub mod recipe;
 pub mod report;

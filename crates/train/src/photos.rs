@@ -18,6 +18,8 @@ pub struct Prepared {
     pub alpha: Option<Vec<u8>>,
     /// `[H, W]`, 0 where the pixel must not be trained on.
     pub mask: Option<Vec<u8>>,
+    /// What `rgb` lies over.
+    background: [f32; 3],
 }
 
 impl Prepared {
@@ -30,7 +32,18 @@ impl Prepared {
             rgb: photo.over(background),
             alpha: photo.alpha(),
             mask: photo.mask,
+            background,
         }
+    }
+
+    /// `rgb` over another `background`.
+    pub fn recolor(&self, alpha: &[u8], background: [f32; 3], to: &mut Vec<u8>) {
+        let change: [f32; 3] = std::array::from_fn(|c| background[c] - self.background[c]);
+        to.clear();
+        to.extend(self.rgb.iter().enumerate().map(|(i, value)| {
+            let through = f32::from(255 - alpha[i / 3]);
+            (f32::from(*value) + through * change[i % 3]).round() as u8
+        }));
     }
 
     fn bytes(&self) -> usize {
@@ -194,6 +207,21 @@ mod tests {
 
     fn loads(sources: &[Arc<Counting>]) -> usize {
         sources.iter().map(|s| s.0.load(Ordering::Relaxed)).sum()
+    }
+
+    #[test]
+    fn another_background_shows_through_where_it_is_clear() {
+        let photo = Photo {
+            width: 3,
+            height: 1,
+            channels: 4,
+            data: vec![200, 100, 0, 255, 200, 100, 0, 0, 200, 100, 0, 51],
+            mask: None,
+        };
+        let white = Prepared::new(&photo, 3, 1, [1.0; 3]);
+        let mut blue = Vec::new();
+        white.recolor(white.alpha.as_ref().unwrap(), [0.0, 0.0, 1.0], &mut blue);
+        assert_eq!(blue, [200, 100, 0, 0, 0, 255, 40, 20, 204]);
     }
 
     #[test]

@@ -112,7 +112,7 @@ fn held_out_psnr(trainer: &Trainer) -> Result<f64, TrainError> {
     let options = trainer.render_options(plan(&trainer.recipe, &trainer.clock).sh_degree);
     let mut psnr = Vec::new();
     evaluate_views(
-        &trainer.state.splats,
+        &trainer.scene(),
         &trainer.dataset,
         &trainer.dataset.test,
         &options,

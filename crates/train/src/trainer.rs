@@ -1,16 +1,20 @@
 //! Read this first: [`Trainer::step`] is one step from batch to update.
 
 use crate::event::{Event, StepReport};
+use crate::objective::{Objective, Reference};
 use crate::photos::{PhotoCache, Prepared};
 use crate::recipe::{Density, Recipe};
-use crate::schedule::{Clock, StepPlan, coming_views, plan};
+use crate::schedule::{Clock, Round, Signal, StepPlan, coming_views, plan};
 use cpu_time::ProcessTime;
 use irradia_compute::adam::AdamStep;
-use irradia_measure::{LossWeights, PhotometricLoss, Target, Truth};
-use irradia_scene::{Camera, Dataset, LoadError, Rng, sh};
-use irradia_splat::densify::{DensityChange, classic};
+use irradia_measure::{DepthSample, Lpips};
+use irradia_scene::{Camera, Dataset, LoadError, Rng, View, sh};
+use irradia_splat::densify::{DensityChange, classic, fast, mcmc, merge, taming};
 use irradia_splat::init::{self, InitOptions, Look};
-use irradia_splat::{OutputGradient, RenderOptions, Renderer, SplatGradients, SplatState, ViewParams};
+use irradia_splat::{
+    Gather, RenderOptions, Renderer, SplatGradients, SplatState, Splats, Statistics, ViewParams, filter, regularize,
+};
+use std::borrow::Cow;
 use std::sync::Arc;
 use std::time::Instant;
 
@@ -34,7 +38,7 @@ pub enum TrainError {
 }
 
 /// What a run is asked for beside its recipe.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone)]
 pub struct TrainOptions {
     /// Everything random follows from it.
     pub seed: u64,
@@ -42,6 +46,8 @@ pub struct TrainOptions {
     pub steps: Option<u64>,
     /// Bytes that photographs may take.
     pub photo_budget: usize,
+    /// Weights of the perceptual loss; a recipe's is left out without them.
+    pub lpips: Option<Arc<Lpips>>,
 }
 
 impl Default for TrainOptions {
@@ -51,6 +57,7 @@ impl Default for TrainOptions {
             seed: 0,
             steps: None,
             photo_budget: 2 << 30,
+            lpips: None,
         }
     }
 }
@@ -58,6 +65,10 @@ impl Default for TrainOptions {
 /// Streams of the run's seed; each use of chance has its own.
 const STREAM_INIT: u64 = 1;
 const STREAM_DENSIFY: u64 = 2;
+const STREAM_STEP: u64 = 5;
+
+/// Training views over which the error is measured.
+const MEASURED_VIEWS: usize = 8;
 
 /// A run in the making.
 pub struct Trainer {
@@ -79,12 +90,12 @@ pub struct Trainer {
     pub seconds: f64,
     /// Processor time likewise, over all threads.
     pub cpu_seconds: f64,
+    /// Never more splats than this: the recipe's limits for this data.
+    pub cap: usize,
     photos: PhotoCache,
     renderer: Renderer,
-    loss: PhotometricLoss,
+    objective: Objective,
     gradients: SplatGradients,
-    v_color: Vec<f32>,
-    v_alpha: Vec<f32>,
 }
 
 impl Trainer {
@@ -117,11 +128,10 @@ impl Trainer {
             cpu_seconds: 0.0,
             extent: init::camera_extent(&cameras),
             photos: PhotoCache::new(dataset.clone(), recipe.render.background, options.photo_budget),
+            cap: cap(&recipe, &cameras),
             renderer: Renderer::new(),
-            loss: PhotometricLoss::new(),
+            objective: Objective::new(options.lpips.clone()),
             gradients: SplatGradients::default(),
-            v_color: Vec::new(),
-            v_alpha: Vec::new(),
             state: SplatState::default(),
             recipe,
             dataset,
@@ -129,7 +139,7 @@ impl Trainer {
         })
     }
 
-    fn first_splats(&mut self) -> Result<irradia_splat::Splats, TrainError> {
+    fn first_splats(&mut self) -> Result<Splats, TrainError> {
         let knobs = &self.recipe.init;
         let options = InitOptions {
             opacity: knobs.opacity,
@@ -140,7 +150,7 @@ impl Trainer {
         let splats = match dataset.points.as_ref().filter(|points| points.len() >= 10) {
             Some(points) => init::from_points(points, &options),
             None => {
-                let views: Vec<&irradia_scene::View> = dataset.train.iter().map(|i| &dataset.views[*i]).collect();
+                let views: Vec<&View> = dataset.train.iter().map(|i| &dataset.views[*i]).collect();
                 let cameras: Vec<Camera> = views.iter().map(|v| v.camera).collect();
                 let bounds: Vec<Option<[f32; 2]>> = views.iter().map(|v| v.depth_bounds).collect();
                 let mut photos: Vec<Option<Arc<Prepared>>> = vec![None; views.len()];
@@ -196,45 +206,60 @@ impl Trainer {
         let coming = coming_views(&self.dataset.train, self.options.seed, &self.clock);
         let photo = self.photos.get(&coming, plan.image_scale)?;
         let (started, cpu_started) = (Instant::now(), ProcessTime::now());
-        let mut camera = self.dataset.views[coming[0]].camera;
-        camera.intrinsics = camera.intrinsics.scaled(plan.image_scale);
+        let mut rng = Rng::new(self.options.seed ^ self.clock.step << 20, STREAM_STEP);
+        let camera = self.scaled_camera(coming[0], plan.image_scale);
         let view = ViewParams::new(&camera);
+        if plan.refilter {
+            self.update_filter();
+        }
 
-        self.renderer
-            .render(&self.state.splats, &view, &self.render_options(plan.sh_degree));
-        let (loss, mse) = self.evaluate_loss(&photo, &plan);
-        let alpha = (plan.alpha_weight > 0.0 && photo.alpha.is_some()).then_some(&self.v_alpha[..]);
-        let v_out = OutputGradient {
-            alpha,
-            ..OutputGradient::of_color(&self.v_color)
+        let background = plan
+            .random_background
+            .then(|| std::array::from_fn(|_| rng.uniform()))
+            .filter(|_| photo.alpha.is_some());
+        let options = RenderOptions {
+            background: background.unwrap_or(self.recipe.render.background),
+            depth: plan.losses.depth > 0.0 || plan.losses.smooth > 0.0,
+            ..self.render_options(plan.sh_degree)
+        };
+        self.renderer.render(&self.state.splats, &view, &options);
+        let reference = Reference {
+            photo: &photo,
+            background,
+            depths: &self.known_depths(coming[0], &camera, &plan),
+        };
+        let loss = self
+            .objective
+            .evaluate(&self.renderer, &reference, &plan.losses, &mut rng);
+        if plan.gathers == Some(Statistics::Error) {
+            self.objective
+                .error(self.renderer.color(), &photo, background.is_some());
+        }
+        let mut v_out = self.objective.gradient();
+        v_out.gather = match plan.gathers {
+            Some(Statistics::AbsoluteGradient) => Gather::Absolute,
+            Some(Statistics::Error) => self.objective.gather_error(),
+            Some(Statistics::Gradient) | None => Gather::Nothing,
         };
         self.renderer.backward(&self.state.splats, &v_out, &mut self.gradients);
-
-        let mut rates = plan.rates;
-        rates.means *= self.extent;
-        let adam = &self.recipe.adam;
-        let step = AdamStep {
-            beta1: adam.beta1,
-            beta2: adam.beta2,
-            epsilon: adam.epsilon,
-            step: self.clock.step + 1,
-        };
-        self.state
-            .step(self.renderer.level, &self.gradients, &rates, plan.sh_degree, step);
-        if plan.gathers {
-            let renderer = &self.renderer;
-            let extent = |i: usize| renderer.screen_extent(i).map_or(0.0, |e| e[0].max(e[1]));
-            self.state
-                .gather_statistics(&self.gradients, view.width, view.height, extent);
-        }
         let visible = self.renderer.visible();
+        self.update(&plan, &view);
         if let Some(change) = self.control_density(&plan) {
             events.push(Event::densified(self.clock.step + 1, change, self.state.len()));
         }
         self.seconds += started.elapsed().as_secs_f64();
         self.cpu_seconds += cpu_started.elapsed().as_secs_f64();
-        let stage_ended = self.clock.tick(&self.recipe, self.pace);
-        if stage_ended && !self.finished() {
+
+        let signal = Signal {
+            error: loss.l1,
+            measured: if plan.measure {
+                Some(self.measure_error(&coming, &plan)?)
+            } else {
+                None
+            },
+            views: self.dataset.train.len() as u64,
+        };
+        if self.tick(signal) && !self.finished() {
             events.push(Event::StageEntered {
                 stage: self.stage_name().to_owned(),
                 step: self.clock.step,
@@ -245,12 +270,167 @@ impl Trainer {
             step: self.clock.step,
             seconds: self.seconds,
             view: coming[0],
-            loss,
-            mse,
+            loss: loss.total,
+            mse: loss.mse,
             splats: self.state.len(),
             visible,
             non_finite: self.gradients.non_finite,
         })
+    }
+
+    /// Adam, and what goes with it, for the gradients of the frame of `view`.
+    fn update(&mut self, plan: &StepPlan, view: &ViewParams) {
+        let level = self.renderer.level;
+        if let Some(statistics) = plan.gathers {
+            let renderer = &self.renderer;
+            let extent = |i: usize| renderer.screen_extent(i).map_or(0.0, |e| e[0].max(e[1]));
+            self.state
+                .gather_statistics(statistics, &self.gradients, view.width, view.height, extent);
+        }
+        if !plan.regularizers.is_zero() {
+            let (weights, gradients) = (&plan.regularizers, &mut self.gradients);
+            regularize::add_gradients(level, &self.state.splats, weights, self.extent, gradients);
+        }
+        if plan.trained_share < 1.0 {
+            regularize::rest_small(&self.state.splats, plan.trained_share, &mut self.gradients);
+        }
+        let mut rates = plan.rates;
+        rates.means *= self.extent;
+        let adam = &self.recipe.adam;
+        let step = AdamStep {
+            beta1: adam.beta1,
+            beta2: adam.beta2,
+            epsilon: adam.epsilon,
+            step: self.clock.step + 1,
+        };
+        self.state.step(level, &self.gradients, &rates, plan.sh_degree, step);
+        if plan.noise > 0.0 {
+            mcmc::add_noise(
+                &mut self.state,
+                plan.noise * rates.means,
+                self.options.seed,
+                self.clock.step,
+            );
+        }
+        if let Some(limit) = plan.condition_cap {
+            regularize::cap_condition(&mut self.state.splats, limit);
+        }
+    }
+
+    fn control_density(&mut self, plan: &StepPlan) -> Option<DensityChange> {
+        let change = plan.densify.as_ref().map(|round| self.densify(round));
+        let merged = plan.merge.map(|knobs| merge::merge(&mut self.state, &knobs.options()));
+        if let Some(ceiling) = plan.reset_opacity {
+            classic::reset_opacity(&mut self.state, ceiling);
+        }
+        if change.is_some() && self.recipe.render.smoothing_filter {
+            self.update_filter();
+        }
+        match (change, merged) {
+            (Some(change), Some(merged)) => Some(DensityChange {
+                pruned: change.pruned + merged.pruned,
+                ..change
+            }),
+            (change, merged) => change.or(merged),
+        }
+    }
+
+    fn densify(&mut self, round: &Round) -> DensityChange {
+        let limit = (self.cap as f64 * round.count_share) as usize;
+        let mut rng = Rng::new(self.options.seed ^ self.clock.step << 20, STREAM_DENSIFY);
+        let state = &mut self.state;
+        match round.density {
+            Density::Classic(knobs) => {
+                let options = knobs.options(self.extent, round.prune_large, limit);
+                classic::densify(state, &options, &mut rng)
+            }
+            Density::Mcmc(knobs) => mcmc::densify(state, &knobs.options(self.pace, limit), &mut rng),
+            Density::Taming(knobs) => {
+                let target = taming::next_count(state.len(), limit, round.share);
+                taming::densify(state, &knobs.options(self.extent, target), &mut rng)
+            }
+            Density::Fast(knobs) => fast::densify(state, &knobs.options(limit)),
+        }
+    }
+
+    fn update_filter(&mut self) {
+        let views: Vec<ViewParams> = self
+            .dataset
+            .train
+            .iter()
+            .map(|i| ViewParams::new(&self.dataset.views[*i].camera))
+            .collect();
+        filter::update(&mut self.state, &views);
+        self.restore_filter();
+    }
+
+    /// Gives the state's filter to the renderer.
+    pub(crate) fn restore_filter(&mut self) {
+        if self.recipe.render.smoothing_filter {
+            self.renderer.set_filter(self.state.filter.plane(0));
+        }
+    }
+
+    fn scaled_camera(&self, view: usize, scale: f32) -> Camera {
+        let mut camera = self.dataset.views[view].camera;
+        camera.intrinsics = camera.intrinsics.scaled(scale);
+        camera
+    }
+
+    /// Depths of the points that view number `view` is known to see, where the plan has a use for them.
+    fn known_depths(&self, view: usize, camera: &Camera, plan: &StepPlan) -> Vec<DepthSample> {
+        let Some(points) = self.dataset.points.as_ref().filter(|_| plan.losses.depth > 0.0) else {
+            return Vec::new();
+        };
+        let seen = &self.dataset.views[view].points_seen;
+        seen.iter()
+            .filter_map(|i| {
+                let (pixel, depth) = camera.project(*points.positions.get(*i as usize)?)?;
+                let [column, row] = [pixel.x.floor(), pixel.y.floor()];
+                let k = &camera.intrinsics;
+                let inside = (0.0..k.width as f32).contains(&column) && (0.0..k.height as f32).contains(&row);
+                inside.then(|| DepthSample {
+                    pixel: row as u32 * k.width + column as u32,
+                    depth,
+                    weight: 1.0,
+                })
+            })
+            .collect()
+    }
+
+    /// Mean L1 error over some training views, evenly chosen, as the plan renders them.
+    fn measure_error(&mut self, coming: &[usize], plan: &StepPlan) -> Result<f64, TrainError> {
+        let train = self.dataset.train.clone();
+        let stride = train.len().div_ceil(MEASURED_VIEWS).max(1);
+        let (mut sum, mut count) = (0.0, 0);
+        for view in train.into_iter().step_by(stride) {
+            let order: Vec<usize> = std::iter::once(view)
+                .chain(coming.iter().copied().filter(|other| *other != view))
+                .collect();
+            let photo = self.photos.get(&order, plan.image_scale)?;
+            let (started, cpu_started) = (Instant::now(), ProcessTime::now());
+            let params = ViewParams::new(&self.scaled_camera(view, plan.image_scale));
+            let options = self.render_options(plan.sh_degree);
+            self.renderer.render(&self.state.splats, &params, &options);
+            self.objective.error(self.renderer.color(), &photo, false);
+            sum += self.objective.mean_error();
+            count += 1;
+            self.seconds += started.elapsed().as_secs_f64();
+            self.cpu_seconds += cpu_started.elapsed().as_secs_f64();
+        }
+        Ok(sum / f64::from(count.max(1)))
+    }
+
+    /// Moves the clock; steps that an early end of a stage sets free go to the stages that are left.
+    fn tick(&mut self, signal: Signal) -> bool {
+        let stretch = self.clock.stretch;
+        let ended = self.clock.tick(&self.recipe, self.pace, signal);
+        if let Some(steps) = self.options.steps.filter(|_| self.clock.stretch != stretch)
+            && steps > self.clock.step
+        {
+            self.pace = (self.recipe.total_steps() as f64 - self.clock.time) / (steps - self.clock.step) as f64;
+        }
+        ended
     }
 
     /// How this run's frames are rendered, with SH up to `sh_degree`.
@@ -263,51 +443,25 @@ impl Trainer {
         }
     }
 
-    /// Loss and mean squared error; leaves the gradients in `v_color` and `v_alpha`.
-    fn evaluate_loss(&mut self, photo: &Prepared, plan: &StepPlan) -> (f64, f64) {
-        let (width, height) = (photo.width as usize, photo.height as usize);
-        self.v_color.resize(3 * width * height, 0.0);
-        let target = Target {
-            width,
-            height,
-            truth: Truth::Rgb8(&photo.rgb),
-            mask: photo.mask.as_deref(),
-        };
-        let weights = LossWeights::photometric(plan.ssim_weight);
-        let values = self
-            .loss
-            .evaluate(self.renderer.color(), &target, &weights, &mut self.v_color);
-        let mut total = values.total;
-        if let Some(alpha) = photo.alpha.as_ref().filter(|_| plan.alpha_weight > 0.0) {
-            let weight = plan.alpha_weight / (width * height) as f32;
-            let mut sum = 0.0f64;
-            self.v_alpha.clear();
-            self.v_alpha
-                .extend(self.renderer.alpha().iter().zip(alpha).map(|(got, want)| {
-                    let difference = got - f32::from(*want) / 255.0;
-                    sum += f64::from(difference.abs());
-                    if difference == 0.0 {
-                        0.0
-                    } else {
-                        weight * difference.signum()
-                    }
-                }));
-            total += f64::from(weight) * sum;
+    /// The scene as a file holds it and held-out views show it: with the smoothing filter made part of it.
+    pub fn scene(&self) -> Cow<'_, Splats> {
+        if self.recipe.render.smoothing_filter {
+            Cow::Owned(filter::baked(&self.state))
+        } else {
+            Cow::Borrowed(&self.state.splats)
         }
-        (total, values.mse)
     }
+}
 
-    fn control_density(&mut self, plan: &StepPlan) -> Option<DensityChange> {
-        let change = plan.densify.as_ref().map(|(density, prune_large)| match density {
-            Density::Classic(knobs) => {
-                let options = knobs.options(self.extent, *prune_large, self.recipe.max_splats);
-                let mut rng = Rng::new(self.options.seed ^ self.clock.step << 20, STREAM_DENSIFY);
-                classic::densify(&mut self.state, &options, &mut rng)
-            }
-        });
-        if let Some(ceiling) = plan.reset_opacity {
-            classic::reset_opacity(&mut self.state, ceiling);
-        }
-        change
-    }
+/// The recipe's limits on the number of splats, for images of these cameras.
+fn cap(recipe: &Recipe, cameras: &[Camera]) -> usize {
+    let pixels: f64 = cameras
+        .iter()
+        .map(|c| f64::from(c.intrinsics.width) * f64::from(c.intrinsics.height))
+        .sum();
+    let mean = pixels / cameras.len().max(1) as f64;
+    let by_pixels = recipe
+        .splats_per_pixel
+        .map_or(usize::MAX, |share| (f64::from(share) * mean) as usize);
+    recipe.max_splats.min(by_pixels).max(1)
 }

@@ -229,7 +229,7 @@ fn finish(
     ran?;
     journal.finish();
 
-    let mut cloud = trainer.state.splats.to_cloud();
+    let mut cloud = trainer.scene().to_cloud();
     cloud.antialiased = trainer.recipe.render.antialias;
     write_splats(&folder.file("scene.ply"), &cloud)?;
     saved.map_err(anyhow::Error::msg)?;
@@ -239,7 +239,7 @@ fn finish(
     let options = trainer.render_options(sh::MAX_DEGREE);
     let mut outcome = Ok(());
     evaluate_views(
-        &trainer.state.splats,
+        &trainer.scene(),
         &trainer.dataset,
         &trainer.dataset.test,
         &options,

@@ -36,6 +36,13 @@ pub(super) struct Gains {
 }
 
 impl Gains {
+    /// For losses that have their own.
+    pub(super) const NONE: Self = Self {
+        l1: 0.0,
+        ssim: 0.0,
+        mse: 0.0,
+    };
+
     pub(super) fn of(weights: &LossWeights, count: f64) -> Self {
         Self {
             l1: f64::from(weights.l1) / count,

@@ -1,4 +1,6 @@
-//! The photometric loss with its gradient: L1, D-SSIM and squared error, fused, one pass over the image.
+//! The losses with their gradients. Here the photometric one: L1, D-SSIM and squared error, fused, one pass over the image.
+//! It overwrites the gradient; all others ([`coarse`], [`depth`], [`perceptual`], [`smooth`]) add to what is there, and
+//! their share is multiplied by a weight on the way, so that a sum of losses needs no further pass.
 //!
 //! `total = l1 L1 + ssim (1 - SSIM) + mse MSE`, each a mean over the H W 3 values. With a mask m in \[0, 1\] the render x is
 //! first replaced by `y + m (x - y)`, y being the truth, so that a pixel of weight 0 differs in nothing and has no
@@ -7,9 +9,13 @@
 //! The image is cut into bands of rows of one channel, whose number depends on its height alone, and their sums are added
 //! in order: the number of threads changes no bit of the result.
 
+pub mod coarse;
+pub mod depth;
 mod job;
+pub mod perceptual;
 mod pointwise;
 mod rows;
+pub mod smooth;
 mod ssim;
 
 use irradia_compute::simd::{Kernel, Lanes, Level, Scalar, Simd};
@@ -227,6 +233,17 @@ impl LossValues {
     }
 }
 
+impl<T: Scalar> Target<'_, T> {
+    /// Channel `c` of the photograph at a pixel.
+    #[inline(always)]
+    fn color(&self, pixel: usize, c: usize) -> T {
+        match self.truth {
+            Truth::Rgb8(truth) => T::from_f64(f64::from(truth[3 * pixel + c]) / 255.0),
+            Truth::Planar(truth) => truth[c * (truth.len() / 3) + pixel],
+        }
+    }
+}
+
 impl<T> Target<'_, T> {
     /// Sum of the pixels' weights.
     fn weight(&self) -> f64 {
@@ -241,6 +258,12 @@ impl<T> Target<'_, T> {
         let planar = |len: usize| len.is_multiple_of(3) && len / 3 >= pixels;
         assert!(planar(render), "the render is [3, stride] and holds every pixel");
         assert_eq!(render, v_render, "the gradient has the render's shape");
+        self.assert_truth();
+    }
+
+    fn assert_truth(&self) {
+        let pixels = self.width * self.height;
+        let planar = |len: usize| len.is_multiple_of(3) && len / 3 >= pixels;
         match self.truth {
             Truth::Rgb8(truth) => assert_eq!(truth.len(), 3 * pixels, "the truth is [H, W, 3]"),
             Truth::Planar(truth) => assert!(planar(truth.len()), "the truth is [3, stride] and holds every pixel"),
@@ -251,5 +274,7 @@ impl<T> Target<'_, T> {
     }
 }
 
+#[cfg(test)]
+mod differences;
 #[cfg(test)]
 mod tests;

@@ -5,6 +5,7 @@ mod psnr;
 mod ssim;
 
 pub use lpips::{Lpips, LpipsError};
+pub(crate) use lpips::{Map, Network};
 pub use psnr::{psnr, psnr_masked};
 pub use ssim::{ssim, ssim_masked};
 

@@ -1,6 +1,11 @@
 //! Density control: where splats are added and removed. One file a strategy.
 
 pub mod classic;
+pub mod fast;
+pub mod mcmc;
+pub mod merge;
+mod split;
+pub mod taming;
 
 /// What one round of density control did.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]

@@ -15,6 +15,7 @@ mod view;
 mod gradients;
 
 pub use blend::{ALPHA_MAX, TRANSMITTANCE_MIN};
+pub(crate) use project::exp;
 pub use project::{ALPHA_MIN, DILATION};
 pub use view::ViewParams;
 

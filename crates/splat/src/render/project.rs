@@ -92,7 +92,7 @@ pub(super) fn dot<F: Lanes>(a: [F; 3], b: [F; 3]) -> F {
 
 /// e^x through 2^x; safe for any finite x.
 #[inline(always)]
-pub(super) fn exp<F: Lanes>(x: F) -> F {
+pub(crate) fn exp<F: Lanes>(x: F) -> F {
     (x * x.splat(LOG2_E)).min(x.splat(126.0)).exp2()
 }
 

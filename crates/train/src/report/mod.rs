@@ -118,19 +118,27 @@ fn or_nan<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f64, D::Error> {
 }
 
 const PAGE: &str = include_str!("page.html");
-const STYLE: &str = include_str!("page.css");
 const SCRIPT: &str = include_str!("page.js");
+/// What every page looks like.
+const STYLE: &str = include_str!("page.css");
+/// Charts and dividers, for every page.
+const WIDGETS: &str = include_str!("widgets.js");
 
 /// The report as one HTML page, for a file beside the pictures its views name.
 ///
 /// All text reaches the page as data that the script sets as text, never as markup.
 pub fn to_html(report: &Report) -> String {
-    let data = serde_json::to_string(report).expect("plain data always serialises");
+    filled(PAGE, "", SCRIPT, report)
+}
+
+/// `page` with what all pages share, what this one adds to the style, its script, and its data.
+pub(crate) fn filled(page: &str, style: &str, script: &str, data: &impl Serialize) -> String {
+    let data = serde_json::to_string(data).expect("plain data always serialises");
     // Within a script element only `<` can end the data (`</script>`, `<!--`); JSON strings may escape any character.
     let data = data.replace('<', "\\u003c");
     // The data goes in last: nothing in it is looked at for marks.
-    PAGE.replace("/*STYLE*/", STYLE)
-        .replace("/*SCRIPT*/", SCRIPT)
+    page.replace("/*STYLE*/", &format!("{STYLE}{style}"))
+        .replace("/*SCRIPT*/", &format!("{WIDGETS}{script}"))
         .replace("/*DATA*/", &data)
 }
 

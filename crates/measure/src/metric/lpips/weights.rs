@@ -1,5 +1,6 @@
 //! The weights file, checked before anything is taken from it.
 
+use irradia_compute::simd::Scalar;
 use safetensors::{Dtype, SafeTensors};
 use std::fs::File;
 use std::io::Read;
@@ -31,9 +32,9 @@ pub enum LpipsError {
     )]
     TooSmall {
         /// Pixels.
-        width: u32,
+        width: usize,
         /// Pixels.
-        height: u32,
+        height: usize,
     },
 }
 
@@ -73,8 +74,8 @@ impl<'a> Weights<'a> {
         Ok(Self { path, tensors })
     }
 
-    /// The values of tensor `name`, which must be of `shape`, in single precision and finite.
-    pub(super) fn tensor(&self, name: &str, shape: &[usize]) -> Result<Vec<f32>, LpipsError> {
+    /// The values of tensor `name`, which must be of `shape`, stored in single precision and finite.
+    pub(super) fn tensor<T: Scalar>(&self, name: &str, shape: &[usize]) -> Result<Vec<T>, LpipsError> {
         let wrong = |reason: String| LpipsError::Weights {
             path: self.path.to_owned(),
             reason,
@@ -94,6 +95,6 @@ impl<'a> Weights<'a> {
         if values.iter().any(|v| !v.is_finite()) {
             return Err(wrong(format!("tensor {name} has values that are not finite")));
         }
-        Ok(values)
+        Ok(values.iter().map(|v| T::from_f64(f64::from(*v))).collect())
     }
 }

@@ -1,11 +1,22 @@
 //! A recipe: one way of training, as a file. Raw TOML, then overrides, then this validated value.
 
-use irradia_splat::densify::classic::ClassicOptions;
-use serde::{Deserialize, Deserializer, Serialize};
-use std::collections::BTreeMap;
+mod density;
+mod param;
+
+pub use density::{ClassicKnobs, Density, FastKnobs, McmcKnobs, MergeKnobs, TamingKnobs};
+use param::check_knob;
+pub use param::{Knob, Param, Params, Shape};
+use serde::{Deserialize, Serialize};
 
 /// The recipes that come with the program: name and text.
-pub const BUILT_IN: [(&str, &str); 1] = [("classic", include_str!("../../../recipes/classic.toml"))];
+pub const BUILT_IN: [(&str, &str); 6] = [
+    ("classic", include_str!("../../../../recipes/classic.toml")),
+    ("absgrad", include_str!("../../../../recipes/absgrad.toml")),
+    ("mcmc", include_str!("../../../../recipes/mcmc.toml")),
+    ("taming", include_str!("../../../../recipes/taming.toml")),
+    ("fast", include_str!("../../../../recipes/fast.toml")),
+    ("curriculum", include_str!("../../../../recipes/curriculum.toml")),
+];
 
 /// Why a recipe was refused: one line that names the key.
 #[derive(Debug, thiserror::Error)]
@@ -46,6 +57,9 @@ pub struct Recipe {
     pub about: String,
     /// Never more splats than this.
     pub max_splats: usize,
+    /// Nor than this many for each pixel of a training image, all views' mean; no such limit when absent.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub splats_per_pixel: Option<f32>,
     /// Held-out views are looked at every so many steps while training.
     pub eval_every: u64,
     /// A checkpoint is written every so many steps.
@@ -70,6 +84,9 @@ pub struct RenderKnobs {
     pub background: [f32; 3],
     /// Scale opacities by the area that the 0.3 pixel dilation adds.
     pub antialias: bool,
+    /// Keep splats from being finer than the training views can show (Mip-Splatting's 3D smoothing filter).
+    #[serde(default)]
+    pub smoothing_filter: bool,
 }
 
 /// The first splats.
@@ -110,183 +127,36 @@ pub struct Stage {
     /// How splats are added and removed; none are when absent.
     #[serde(default)]
     pub density: Option<Density>,
+    /// How adjacent splats are merged; none are when absent.
+    #[serde(default)]
+    pub merge: Option<MergeKnobs>,
+    /// When the stage may end before its steps are over; never when absent.
+    #[serde(default)]
+    pub exit: Option<Exit>,
 }
 
-/// Knobs by name.
-pub type Params = BTreeMap<Param, Knob>;
-
-/// What can change over time.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Param {
-    /// Size of the training images relative to the data's.
-    ImageScale,
-    /// SH bands in use.
-    ShDegree,
-    /// w in (1 - w) L1 + w (1 - SSIM).
-    SsimWeight,
-    /// Weight of the mean |alpha - alpha of the photograph|, where it has one.
-    AlphaWeight,
-    /// Learning rate of the means, in units of the scene's extent.
-    RateMeans,
-    /// Learning rate of the quaternions.
-    RateQuats,
-    /// Learning rate of the ln scales.
-    RateScales,
-    /// Learning rate of the opacity logits.
-    RateOpacities,
-    /// Learning rate of the SH's DC coefficients.
-    RateShDc,
-    /// Learning rate of the other SH coefficients.
-    RateShRest,
-}
-
-impl Param {
-    /// All of them, in order.
-    pub const ALL: [Param; 10] = [
-        Param::ImageScale,
-        Param::ShDegree,
-        Param::SsimWeight,
-        Param::AlphaWeight,
-        Param::RateMeans,
-        Param::RateQuats,
-        Param::RateScales,
-        Param::RateOpacities,
-        Param::RateShDc,
-        Param::RateShRest,
-    ];
-
-    /// As recipes write it.
-    fn name(self) -> String {
-        let name = toml::Value::try_from(self).expect("a name is plain text");
-        name.as_str().unwrap_or_default().to_owned()
-    }
-
-    /// The value where no recipe says anything.
-    pub fn default_value(self) -> f64 {
-        match self {
-            Param::ImageScale => 1.0,
-            _ => 0.0,
-        }
-    }
-}
-
-/// A value over time.
-#[derive(Clone, Debug, PartialEq, Serialize)]
-#[serde(untagged)]
-pub enum Knob {
-    /// Always the same.
-    Const(f64),
-    /// From one value to another over the stage (or the run).
-    Ramp {
-        /// At the start; goes on from the value in force when absent.
-        #[serde(skip_serializing_if = "Option::is_none")]
-        from: Option<f64>,
-        /// At the end.
-        to: f64,
-        /// How it goes from one to the other.
-        shape: Shape,
-    },
-    /// `[at, value]` pairs: `value` holds from recipe step `at` of the stage (or run) on.
-    Steps {
-        /// In ascending order of `at`.
-        steps: Vec<(u64, f64)>,
-    },
-}
-
-/// How a ramp runs.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, Default)]
-#[serde(rename_all = "snake_case")]
-pub enum Shape {
-    /// Straight.
-    #[default]
-    Linear,
-    /// Straight in the logarithm; both ends must be positive.
-    Log,
-    /// Half a cosine.
-    Cosine,
-}
-
-/// What a file may say for a knob; serde's own message for an untagged enum would name nothing.
-#[derive(Deserialize)]
-#[serde(deny_unknown_fields)]
-struct RawKnob {
-    from: Option<f64>,
-    to: Option<f64>,
-    shape: Option<Shape>,
-    steps: Option<Vec<(u64, f64)>>,
-}
-
-impl<'de> Deserialize<'de> for Knob {
-    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        use serde::de::Error;
-        match toml::Value::deserialize(deserializer)? {
-            toml::Value::Integer(v) => Ok(Knob::Const(v as f64)),
-            toml::Value::Float(v) => Ok(Knob::Const(v)),
-            table @ toml::Value::Table(_) => {
-                let raw = RawKnob::deserialize(table).map_err(|e| D::Error::custom(e.message()))?;
-                match (raw.to, raw.steps) {
-                    (Some(to), None) => Ok(Knob::Ramp {
-                        from: raw.from,
-                        to,
-                        shape: raw.shape.unwrap_or_default(),
-                    }),
-                    (None, Some(steps)) if raw.from.is_none() && raw.shape.is_none() => Ok(Knob::Steps { steps }),
-                    _ => Err(D::Error::custom(
-                        "a knob is a number, { from, to, shape } or { steps = [[at, value], ..] }",
-                    )),
-                }
-            }
-            other => Err(D::Error::custom(format!(
-                "a knob is a number or a table, not {}",
-                other.type_str()
-            ))),
-        }
-    }
-}
-
-/// How splats are added and removed.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(tag = "strategy", rename_all = "snake_case")]
-pub enum Density {
-    /// Clone, split, prune and reset, as in 3DGS.
-    Classic(ClassicKnobs),
-}
-
-/// Knobs of [`irradia_splat::densify::classic`].
+/// When a stage has done its work: rules on S, the mean L1 error over the training views (CurriculumGS's S_t), of which a
+/// running estimate is kept and which is measured now and then.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct ClassicKnobs {
-    /// Steps (of the run, not stretched) between rounds.
-    pub every: u64,
-    /// Mean screen gradient, normalised device coordinates, from which a splat is densified.
-    pub gradient_threshold: f32,
-    /// Size that divides what is cloned from what is split, in units of the scene's extent.
-    pub small: f32,
-    /// Opacity below which a splat is removed.
-    pub min_opacity: f32,
-    /// Half size on screen above which a splat is removed, pixels, once opacities were reset.
-    pub max_extent: f32,
-    /// World size above which a splat is removed, in units of the scene's extent, once opacities were reset.
-    pub max_scale: f32,
-    /// Steps (of the run, not stretched) between resets of the opacities; 0 for never.
-    pub reset_every: u64,
-    /// What opacities are lowered to.
-    pub reset_to: f32,
-}
-
-impl ClassicKnobs {
-    /// With sizes in world units.
-    pub fn options(&self, extent: f32, prune_large: bool, max_splats: usize) -> ClassicOptions {
-        ClassicOptions {
-            gradient_threshold: self.gradient_threshold,
-            small: self.small * extent,
-            min_opacity: self.min_opacity,
-            max_extent: prune_large.then_some(self.max_extent),
-            max_scale: self.max_scale * extent,
-            max_splats,
-        }
-    }
+#[serde(tag = "when", rename_all = "snake_case", deny_unknown_fields)]
+pub enum Exit {
+    /// S falls below `tau`.
+    Threshold {
+        /// Mean absolute difference of colours in \[0, 1\].
+        tau: f64,
+    },
+    /// S falls below `ratio` of what it was when the stage had seen every view once: a tau that no one has to tune.
+    Relative {
+        /// Share of the stage's first S.
+        ratio: f64,
+    },
+    /// S has not fallen by the share `drop` within `window` recipe steps.
+    Plateau {
+        /// Share of the best S so far.
+        drop: f64,
+        /// Recipe steps.
+        window: u64,
+    },
 }
 
 impl Recipe {
@@ -371,10 +241,25 @@ impl Recipe {
             if self.stage[..i].iter().any(|s| s.name == stage.name) {
                 return Err(format!("two stages are called {}", stage.name));
             }
-            if let Some(Density::Classic(knobs)) = &stage.density
-                && knobs.every == 0
+            if stage.density.as_ref().is_some_and(|density| density.every() == 0)
+                || stage.merge.as_ref().is_some_and(|merge| merge.every == 0)
             {
-                return Err(format!("stage.{}.density.every must be at least 1", stage.name));
+                return Err(format!(
+                    "stage.{}: density.every and merge.every must be at least 1",
+                    stage.name
+                ));
+            }
+            let sensible = match stage.exit {
+                None => true,
+                Some(Exit::Threshold { tau }) => tau > 0.0,
+                Some(Exit::Relative { ratio }) => ratio > 0.0 && ratio < 1.0,
+                Some(Exit::Plateau { drop, window }) => (0.0..1.0).contains(&drop) && window > 0,
+            };
+            if !sensible {
+                return Err(format!(
+                    "stage.{}.exit: tau and window must be above 0, ratio and drop between 0 and 1",
+                    stage.name
+                ));
             }
         }
         let everywhere = std::iter::once(("params".to_owned(), &self.params));
@@ -388,36 +273,6 @@ impl Recipe {
             }
         }
         Ok(())
-    }
-}
-
-fn check_knob(param: Param, knob: &Knob) -> Result<(), String> {
-    let values: Vec<f64> = match knob {
-        Knob::Const(v) => vec![*v],
-        Knob::Ramp { from, to, shape } => {
-            let ends: Vec<f64> = from.iter().copied().chain([*to]).collect();
-            if *shape == Shape::Log && ends.iter().any(|v| *v <= 0.0) {
-                return Err("a log ramp needs ends above 0".into());
-            }
-            ends
-        }
-        Knob::Steps { steps } => {
-            if steps.is_empty() || steps[0].0 != 0 || steps.windows(2).any(|w| w[0].0 >= w[1].0) {
-                return Err("steps must start at 0 and ascend".into());
-            }
-            steps.iter().map(|(_, v)| *v).collect()
-        }
-    };
-    let (low, high) = match param {
-        Param::ImageScale => (0.01, 1.0),
-        Param::ShDegree => (0.0, 3.0),
-        Param::SsimWeight => (0.0, 1.0),
-        _ => (0.0, f64::MAX),
-    };
-    match values.iter().find(|v| !(low..=high).contains(*v)) {
-        Some(v) if high == f64::MAX => Err(format!("{v} is below 0")),
-        Some(v) => Err(format!("{v} is not within {low} to {high}")),
-        None => Ok(()),
     }
 }
 

@@ -1,16 +1,31 @@
 //! Everything that depends on time. [`plan`] is pure: what one step does. [`Clock::tick`] moves on by one step.
 
-use crate::recipe::{Density, Knob, Param, Recipe, Shape};
+mod outline;
+mod watch;
+
+pub use outline::{Moment, outline};
+pub use watch::Watch;
+
+use crate::recipe::{Density, Exit, Knob, MergeKnobs, Param, Recipe, Shape};
+use irradia_measure::LossWeights;
 use irradia_scene::Rng;
-use irradia_splat::Rates;
+use irradia_splat::regularize::Regularizers;
+use irradia_splat::{Rates, Statistics};
+use watch::MEASURE_EVERY;
 
 /// Where a run stands.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Clock {
     /// Steps made.
     pub step: u64,
-    /// Recipe steps gone by; runs faster than `step` when a run is shorter than its recipe.
+    /// Recipe steps gone by; runs faster than `step` when a run is shorter than its recipe, and jumps over what is left of
+    /// a stage that ends early.
     pub time: f64,
+    /// Where knobs over the whole run stand, in recipe steps: like `time`, but what was jumped over is spread over what is
+    /// left, so that nothing jumps.
+    pub progress: f64,
+    /// Recipe steps of `progress` in one of `time`.
+    pub stretch: f64,
     /// The stage.
     pub stage: usize,
     /// `time` when it was entered.
@@ -21,6 +36,19 @@ pub struct Clock {
     pub carried: [f64; Param::ALL.len()],
     /// Whether opacities were reset before.
     pub was_reset: bool,
+    /// The training error in this stage.
+    pub watch: Watch,
+}
+
+/// What a step tells the schedule.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Signal {
+    /// L1 error of the step's view.
+    pub error: f64,
+    /// Mean L1 error over (a subset of) the training views, where the plan asked for it.
+    pub measured: Option<f64>,
+    /// Training views.
+    pub views: u64,
 }
 
 /// What one step does.
@@ -30,22 +58,68 @@ pub struct StepPlan {
     pub image_scale: f32,
     /// SH bands in use.
     pub sh_degree: u32,
-    /// w in (1 - w) L1 + w (1 - SSIM).
-    pub ssim_weight: f32,
-    /// Weight of the alpha term.
-    pub alpha_weight: f32,
+    /// Weights of the losses.
+    pub losses: Losses,
+    /// Whether photographs with alpha are laid over a random colour.
+    pub random_background: bool,
+    /// Losses of the splats themselves.
+    pub regularizers: Regularizers,
+    /// Largest condition number of a covariance.
+    pub condition_cap: Option<f32>,
+    /// Noise on the means, in units of their rate.
+    pub noise: f32,
+    /// Share of the visible splats that are trained, the largest first.
+    pub trained_share: f32,
     /// Learning rates; that of the means in units of the scene's extent.
     pub rates: Rates,
-    /// Whether density statistics are gathered.
-    pub gathers: bool,
-    /// A round of density control, after the step; the flag says whether oversized splats go too.
-    pub densify: Option<(Density, bool)>,
+    /// Density statistics to gather.
+    pub gathers: Option<Statistics>,
+    /// A round of density control, after the step.
+    pub densify: Option<Round>,
+    /// Adjacent splats are merged, after the step.
+    pub merge: Option<MergeKnobs>,
     /// Opacities are lowered to this, after the step.
     pub reset_opacity: Option<f32>,
+    /// The smoothing filter is worked out anew, before the step.
+    pub refilter: bool,
+    /// The error is measured over training views, after the step.
+    pub measure: bool,
     /// Held-out views are evaluated, after the step.
     pub evaluate: bool,
     /// A checkpoint is written, after the step.
     pub checkpoint: bool,
+}
+
+/// Weights of what a frame is compared by.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Losses {
+    /// L1, SSIM and squared error.
+    pub photometric: LossWeights,
+    /// Squared error of images shrunk by `coarse_factor`.
+    pub coarse: f32,
+    /// Pixels to one.
+    pub coarse_factor: usize,
+    /// LPIPS.
+    pub perceptual: f32,
+    /// Alpha against the photograph's.
+    pub alpha: f32,
+    /// Depth against that of the points that the view sees.
+    pub depth: f32,
+    /// Edge-aware smoothness of depth.
+    pub smooth: f32,
+}
+
+/// A round of density control.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Round {
+    /// The strategy.
+    pub density: Density,
+    /// Whether oversized splats go too.
+    pub prune_large: bool,
+    /// Splats there may be, as a share of the cap.
+    pub count_share: f64,
+    /// How much of the stage lies behind, now and at the round before.
+    pub share: [f64; 2],
 }
 
 impl Clock {
@@ -54,11 +128,14 @@ impl Clock {
         let mut clock = Self {
             step: 0,
             time: 0.0,
+            progress: 0.0,
+            stretch: 1.0,
             stage: 0,
             stage_time: 0.0,
             stage_step: 0,
             carried: Param::ALL.map(Param::default_value),
             was_reset: false,
+            watch: Watch::default(),
         };
         clock.carried = values(recipe, &clock);
         clock
@@ -70,11 +147,19 @@ impl Clock {
     }
 
     /// Moves on by one step that took `pace` recipe steps; true where a stage ended.
-    pub fn tick(&mut self, recipe: &Recipe, pace: f64) -> bool {
+    pub fn tick(&mut self, recipe: &Recipe, pace: f64, signal: Signal) -> bool {
         let before = values(recipe, self);
         self.was_reset |= plan(recipe, self).reset_opacity.is_some();
         self.step += 1;
         self.time += pace;
+        self.progress += pace * self.stretch;
+        let in_stage = self.time - self.stage_time;
+        self.watch
+            .observe(signal.error, signal.measured, signal.views, in_stage);
+        let exit = recipe.stage.get(self.stage).and_then(|stage| stage.exit.as_ref());
+        if exit.is_some_and(|exit| self.watch.ends(exit, signal.views, in_stage)) {
+            self.leave_early(recipe);
+        }
         // Half a thousandth of a step forgives the rounding of a sum of fractions.
         let mut ended = false;
         while self.stage < recipe.stage.len()
@@ -84,9 +169,18 @@ impl Clock {
             self.stage += 1;
             self.stage_step = self.step;
             self.carried = before;
+            self.watch = Watch::default();
             ended = true;
         }
         ended
+    }
+
+    fn leave_early(&mut self, recipe: &Recipe) {
+        self.time = self.time.max(self.stage_time + recipe.stage[self.stage].steps as f64);
+        let total = recipe.total_steps() as f64;
+        if total > self.time {
+            self.stretch = (total - self.progress) / (total - self.time);
+        }
     }
 }
 
@@ -106,7 +200,7 @@ fn values(recipe: &Recipe, clock: &Clock) -> [f64; Param::ALL.len()] {
                 clock.carried[i],
             )
         } else if let Some(knob) = recipe.params.get(&param) {
-            value(knob, clock.time, total, param.default_value())
+            value(knob, clock.progress, total, param.default_value())
         } else {
             clock.carried[i]
         }
@@ -145,21 +239,35 @@ pub fn plan(recipe: &Recipe, clock: &Clock) -> StepPlan {
     let stage = &recipe.stage[clock.stage.min(recipe.stage.len() - 1)];
     // Counted as people do: after the step that makes it the n-th.
     let in_stage = clock.step + 1 - clock.stage_step;
-    let density = stage.density.as_ref();
-    let (densify, reset_opacity) = match density {
-        Some(density @ Density::Classic(knobs)) => (
-            in_stage
-                .is_multiple_of(knobs.every)
-                .then(|| (density.clone(), clock.was_reset)),
-            (knobs.reset_every > 0 && is_due(clock, knobs.reset_every)).then_some(knobs.reset_to),
-        ),
-        None => (None, None),
-    };
+    let density = stage.density;
+    let measured = matches!(stage.exit, Some(Exit::Threshold { .. } | Exit::Relative { .. }));
+    let ssim = of(Param::SsimWeight) * of(Param::PhotoWeight);
     StepPlan {
         image_scale: of(Param::ImageScale) as f32,
         sh_degree: of(Param::ShDegree) as u32,
-        ssim_weight: of(Param::SsimWeight) as f32,
-        alpha_weight: of(Param::AlphaWeight) as f32,
+        losses: Losses {
+            photometric: LossWeights {
+                l1: (of(Param::PhotoWeight) - ssim) as f32,
+                ssim: ssim as f32,
+                mse: of(Param::MseWeight) as f32,
+            },
+            coarse: of(Param::CoarseWeight) as f32,
+            coarse_factor: of(Param::CoarseFactor) as usize,
+            perceptual: of(Param::PerceptualWeight) as f32,
+            alpha: of(Param::AlphaWeight) as f32,
+            depth: of(Param::DepthWeight) as f32,
+            smooth: of(Param::SmoothWeight) as f32,
+        },
+        random_background: of(Param::RandomBackground) >= 0.5,
+        regularizers: Regularizers {
+            opacity: of(Param::OpacityReg) as f32,
+            opacity_square: of(Param::OpacitySquareReg) as f32,
+            scale: of(Param::ScaleReg) as f32,
+            covariance: of(Param::CovarianceReg) as f32,
+        },
+        condition_cap: (of(Param::ConditionCap) > 0.0).then_some(of(Param::ConditionCap) as f32),
+        noise: of(Param::Noise) as f32,
+        trained_share: of(Param::TrainedShare) as f32,
         rates: Rates {
             means: of(Param::RateMeans) as f32,
             quats: of(Param::RateQuats) as f32,
@@ -168,13 +276,33 @@ pub fn plan(recipe: &Recipe, clock: &Clock) -> StepPlan {
             sh_dc: of(Param::RateShDc) as f32,
             sh_rest: of(Param::RateShRest) as f32,
         },
-        gathers: density.is_some(),
-        densify,
-        reset_opacity,
+        gathers: density.map(|density| density.statistics()),
+        densify: density
+            .filter(|density| in_stage.is_multiple_of(density.every()))
+            .map(|density| {
+                let share = ((clock.time - clock.stage_time) / stage.steps as f64).clamp(0.0, 1.0);
+                // Steps and time run in proportion within a stage, nearly: a budget's pace drifts.
+                let before = share * (in_stage - density.every()) as f64 / in_stage as f64;
+                Round {
+                    density,
+                    prune_large: clock.was_reset,
+                    count_share: of(Param::CountShare),
+                    share: [share, before],
+                }
+            }),
+        merge: stage.merge.filter(|merge| in_stage.is_multiple_of(merge.every)),
+        reset_opacity: density
+            .and_then(|density| density.reset())
+            .and_then(|(every, to)| is_due(clock, every).then_some(to)),
+        refilter: recipe.render.smoothing_filter && clock.step.is_multiple_of(REFILTER_EVERY),
+        measure: measured && in_stage.is_multiple_of(MEASURE_EVERY),
         evaluate: is_due(clock, recipe.eval_every),
         checkpoint: is_due(clock, recipe.checkpoint_every),
     }
 }
+
+/// Steps between updates of the 3D smoothing filter (Mip-Splatting's code: 100).
+const REFILTER_EVERY: u64 = 100;
 
 /// The stream of the run's seed that orders the views.
 const STREAM_VIEWS: u64 = 3;
@@ -204,6 +332,12 @@ pub fn coming_views(train: &[usize], seed: u64, clock: &Clock) -> Vec<usize> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    const QUIET: Signal = Signal {
+        error: 0.1,
+        measured: None,
+        views: 4,
+    };
 
     fn recipe() -> Recipe {
         let text = r#"
@@ -245,7 +379,7 @@ mod tests {
         let mut plans = Vec::new();
         while !clock.finished(recipe) {
             plans.push(plan(recipe, &clock));
-            clock.tick(recipe, pace);
+            clock.tick(recipe, pace, QUIET);
         }
         plans
     }
@@ -264,7 +398,7 @@ mod tests {
         assert!((p[10].rates.quats - p[9].rates.quats).abs() < 1e-6);
         assert!((p[15].rates.quats - 0.5 * p[9].rates.quats).abs() < 1e-6);
         assert_eq!(
-            (p[3].ssim_weight, p[15].ssim_weight),
+            (p[3].losses.photometric.ssim, p[15].losses.photometric.ssim),
             (0.2, 0.2),
             "a knob that a stage does not name is carried"
         );
@@ -275,7 +409,7 @@ mod tests {
     fn density_control_counts_steps_of_its_stage_and_pruning_waits_for_a_reset() {
         let p = plans(&recipe(), 1.0);
         let densify: Vec<(usize, bool)> = (0..20)
-            .filter_map(|i| p[i].densify.as_ref().map(|(_, large)| (i + 1, *large)))
+            .filter_map(|i| p[i].densify.map(|round| (i + 1, round.prune_large)))
             .collect();
         assert_eq!(densify, [(14, true), (18, true)], "step 12 reset the opacities");
         let resets: Vec<usize> = (0..20)
@@ -283,7 +417,7 @@ mod tests {
             .map(|i| i + 1)
             .collect();
         assert_eq!(resets, [12, 18]);
-        assert!(!p[9].gathers && p[10].gathers);
+        assert!(p[9].gathers.is_none() && p[10].gathers.is_some());
         assert_eq!(
             (0..20).filter(|i| p[*i].evaluate).map(|i| i + 1).collect::<Vec<_>>(),
             [7, 14]
@@ -330,8 +464,92 @@ mod tests {
         let mut recipe = recipe();
         recipe.stage[0].steps = 1;
         let mut clock = Clock::new(&recipe);
-        assert!(clock.tick(&recipe, 5.0));
+        assert!(clock.tick(&recipe, 5.0, QUIET));
         assert_eq!((clock.stage, clock.stage_time), (1, 1.0));
-        assert!(clock.tick(&recipe, 100.0) && clock.finished(&recipe));
+        assert!(clock.tick(&recipe, 100.0, QUIET) && clock.finished(&recipe));
+    }
+
+    /// Ticks until the recipe is over with errors made up by `error(step)`; the steps after which a stage ended, and plans.
+    fn ends(recipe: &Recipe, error: impl Fn(u64) -> Signal) -> (Vec<u64>, Vec<StepPlan>) {
+        let mut clock = Clock::new(recipe);
+        let (mut ends, mut plans) = (Vec::new(), Vec::new());
+        while !clock.finished(recipe) {
+            plans.push(plan(recipe, &clock));
+            if clock.tick(recipe, 1.0, error(clock.step)) {
+                ends.push(clock.step);
+            }
+        }
+        (ends, plans)
+    }
+
+    fn with_exit(exit: Exit) -> Recipe {
+        let mut recipe = recipe();
+        recipe.stage[0].steps = 300;
+        recipe.stage[0].exit = Some(exit);
+        recipe
+    }
+
+    fn error(value: f64) -> Signal {
+        Signal { error: value, ..QUIET }
+    }
+
+    #[test]
+    fn a_stage_ends_when_its_error_is_below_the_threshold_but_not_before_every_view_was_seen() {
+        let recipe = with_exit(Exit::Threshold { tau: 0.05 });
+        assert_eq!(ends(&recipe, |_| error(0.01)).0[0], 4, "four views");
+        assert_eq!(ends(&recipe, |_| error(0.1)).0[0], 300, "its steps guard it");
+        // An exponential mean over four views of a step from 0.1 to 0.01 passes 0.05 at the third step after it.
+        assert_eq!(ends(&recipe, |s| error(if s < 50 { 0.1 } else { 0.01 })).0[0], 53);
+        // What was measured counts for more than the estimate.
+        let measured = |step| Signal {
+            measured: (step == 99).then_some(0.02),
+            ..QUIET
+        };
+        assert_eq!(ends(&recipe, measured).0[0], 100);
+        assert!(
+            plan(
+                &recipe,
+                &Clock {
+                    step: 99,
+                    ..Clock::new(&recipe)
+                }
+            )
+            .measure
+        );
+    }
+
+    #[test]
+    fn a_relative_threshold_tunes_itself() {
+        let recipe = with_exit(Exit::Relative { ratio: 0.5 });
+        for scale in [0.3, 0.01] {
+            let (at, _) = ends(&recipe, |s| error(scale * (-(s as f64) / 40.0).exp()));
+            // The first mean is that of steps 0 to 3, at 1.5; half of it is ln 2 * 40 = 28 steps later, and the mean lags.
+            assert!((28..36).contains(&at[0]), "{at:?}");
+        }
+    }
+
+    #[test]
+    fn a_plateau_ends_a_stage_and_a_slope_does_not() {
+        let recipe = with_exit(Exit::Plateau { drop: 0.02, window: 60 });
+        assert_eq!(ends(&recipe, |s| error((-(s as f64) / 100.0).exp())).0[0], 300);
+        let (at, _) = ends(&recipe, |s| error((-(s.min(100) as f64) / 100.0).exp()));
+        assert!((160..180).contains(&at[0]), "{at:?}");
+    }
+
+    #[test]
+    fn no_rate_jumps_when_a_stage_is_left_early_and_the_run_still_ends_at_the_end_of_every_ramp() {
+        let recipe = with_exit(Exit::Threshold { tau: 0.05 });
+        let (at, p) = ends(&recipe, |s| error(if s < 50 { 0.1 } else { 0.01 }));
+        assert_eq!(at, [53, 63]);
+        // Over the whole run: it goes on from where it was, and what is left of it is run through in what is left.
+        let slope: Vec<f32> = p.windows(2).map(|w| w[1].rates.means / w[0].rates.means).collect();
+        assert!(
+            (slope[52] / slope[51] - 1.0).abs() < 0.02,
+            "the step over the border is one of the old slope"
+        );
+        let last = f64::from(p[62].rates.means) * f64::from(slope[61]);
+        assert!((last / 0.01 - 1.0).abs() < 0.01, "{last}");
+        // Over the stage: the next one's ramp goes on from the value in force.
+        assert!((p[53].rates.quats - p[52].rates.quats).abs() < 1e-6);
     }
 }

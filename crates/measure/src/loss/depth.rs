@@ -1,0 +1,381 @@
+//! L1 between rendered depth and the depth of sparse points (L_depth of CurriculumGS; the points are those of structure
+//! from motion that the view sees).
+//!
+//! Symbols, for each sample: D rendered expected depth, accumulated depth A over alpha; z the point's depth; w its weight.
+//!
+//! ```text
+//! metric:    loss = sum w |z - D| / sum w z
+//! relative:  loss = sum w |a z + b - D| / sum w D,   (a, b) = argmin sum w (a z + b - D)^2,  a >= 0
+//! ```
+//!
+//! Either is free of the scene's unit, so one weight serves every scene. In the relative kind it is the *given* depth that is
+//! brought to the render: its spread does not change while training, so the fit is well conditioned and the residual linear
+//! in D, and dividing by the mean of D takes away what shrinking the scene would gain. The gradient goes through the fit and
+//! through that mean: it is that of the formula as it stands. A fit that would turn the depth round (a < 0) is
+//! replaced by a = 0.
+
+use irradia_compute::simd::Scalar;
+
+/// The known depth of one pixel.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct DepthSample {
+    /// `y * width + x`.
+    pub pixel: u32,
+    /// Along +Z of the camera, in world units where depth is metric. Not counted unless positive and finite.
+    pub depth: f32,
+    /// How much it counts. Not counted unless positive and finite.
+    pub weight: f32,
+}
+
+/// What the given depths mean.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum DepthKind {
+    /// World units.
+    #[default]
+    Metric,
+    /// Known up to scale and shift, as a network guesses it.
+    Relative,
+}
+
+/// What the loss was.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct DepthValues {
+    /// Before its weight; 0 where nothing counted.
+    pub loss: f64,
+    /// Samples that counted.
+    pub samples: usize,
+    /// What the given depths were multiplied by.
+    pub scale: f64,
+    /// What was then added to them.
+    pub shift: f64,
+}
+
+/// Computes the loss and its gradient; keeps its working memory.
+#[derive(Clone, Debug)]
+pub struct DepthLoss {
+    /// Pixels less opaque than this do not count: their depth is that of whatever little there is. 0.5 by default.
+    pub min_alpha: f32,
+    counted: Vec<Counted>,
+}
+
+impl Default for DepthLoss {
+    fn default() -> Self {
+        Self {
+            min_alpha: 0.5,
+            counted: Vec::new(),
+        }
+    }
+}
+
+#[derive(Clone, Copy, Debug)]
+struct Counted {
+    pixel: usize,
+    /// D.
+    rendered: f64,
+    /// z.
+    given: f64,
+    weight: f64,
+}
+
+impl DepthLoss {
+    /// The loss of the accumulated `depth [H * W]` and `alpha [H * W]`; `weight` times the gradients is added to `v_depth` and
+    /// `v_alpha`, of the same shape. Samples beyond the image do not count.
+    ///
+    /// # Panics
+    /// When the lengths differ: that is a bug of the caller.
+    pub fn evaluate(
+        &mut self,
+        depth: &[f32],
+        alpha: &[f32],
+        samples: &[DepthSample],
+        kind: DepthKind,
+        weight: f32,
+        v_depth: &mut [f32],
+        v_alpha: &mut [f32],
+    ) -> DepthValues {
+        self.run(depth, alpha, samples, kind, f64::from(weight), v_depth, v_alpha)
+    }
+
+    // One thread: a view has some thousand samples, which take microseconds.
+    fn run<T: Scalar>(
+        &mut self,
+        depth: &[T],
+        alpha: &[T],
+        samples: &[DepthSample],
+        kind: DepthKind,
+        weight: f64,
+        v_depth: &mut [T],
+        v_alpha: &mut [T],
+    ) -> DepthValues {
+        for length in [alpha.len(), v_depth.len(), v_alpha.len()] {
+            assert_eq!(length, depth.len(), "depth, alpha and their gradients are [H, W]");
+        }
+        self.take_in(depth, alpha, samples);
+        let (fit, norm) = match kind {
+            DepthKind::Metric => (Fit::NONE, self.sum(|s| s.weight * s.given)),
+            DepthKind::Relative => (Fit::of(&self.counted), self.sum(|s| s.weight * s.rendered)),
+        };
+        // Also false where it is NaN; nothing counted leaves 0.
+        let sound = norm > 0.0 && norm.is_finite();
+        if !sound {
+            return DepthValues {
+                loss: 0.0,
+                samples: 0,
+                scale: 1.0,
+                shift: 0.0,
+            };
+        }
+        let loss = self.sum(|s| s.weight * fit.residual(s).abs()) / norm;
+        let signed = |s: &Counted| s.weight * sign(fit.residual(s));
+        let (by_shift, by_scale) = (self.sum(signed), self.sum(|s| signed(s) * (s.given - fit.mean_given)));
+        for s in &self.counted {
+            let mut v_rendered = -signed(s);
+            if kind == DepthKind::Relative {
+                let through_fit = by_shift + by_scale * (s.given - fit.mean_given) * fit.inverse_variance;
+                v_rendered += s.weight / fit.weight * through_fit - s.weight * loss;
+            }
+            let v_rendered = weight * v_rendered / norm;
+            let opacity = alpha[s.pixel].to_f64();
+            let (v_d, v_a) = (&mut v_depth[s.pixel], &mut v_alpha[s.pixel]);
+            *v_d = *v_d + T::from_f64(v_rendered / opacity);
+            *v_a = *v_a + T::from_f64(-v_rendered * s.rendered / opacity);
+        }
+        DepthValues {
+            loss,
+            samples: self.counted.len(),
+            scale: fit.scale,
+            shift: fit.shift,
+        }
+    }
+
+    fn take_in<T: Scalar>(&mut self, depth: &[T], alpha: &[T], samples: &[DepthSample]) {
+        self.counted.clear();
+        let good = |value: f32| value > 0.0 && value.is_finite();
+        for sample in samples.iter().filter(|s| good(s.depth) && good(s.weight)) {
+            let pixel = sample.pixel as usize;
+            let Some(opacity) = alpha.get(pixel).map(|a| a.to_f64()) else {
+                continue;
+            };
+            let rendered = depth[pixel].to_f64() / opacity;
+            if opacity > 0.0 && opacity >= f64::from(self.min_alpha) && rendered.is_finite() {
+                self.counted.push(Counted {
+                    pixel,
+                    rendered,
+                    given: f64::from(sample.depth),
+                    weight: f64::from(sample.weight),
+                });
+            }
+        }
+    }
+
+    fn sum(&self, of: impl Fn(&Counted) -> f64) -> f64 {
+        self.counted.iter().map(of).sum()
+    }
+}
+
+fn sign(x: f64) -> f64 {
+    if x == 0.0 { 0.0 } else { x.signum() }
+}
+
+/// How given depths are brought to the render: `scale z + shift`.
+struct Fit {
+    scale: f64,
+    shift: f64,
+    mean_given: f64,
+    /// Of z; 0 where the scale does not depend on the render.
+    inverse_variance: f64,
+    /// Sum of w.
+    weight: f64,
+}
+
+impl Fit {
+    const NONE: Self = Self {
+        scale: 1.0,
+        shift: 0.0,
+        mean_given: 0.0,
+        inverse_variance: 0.0,
+        weight: 1.0,
+    };
+
+    /// Weighted least squares.
+    fn of(samples: &[Counted]) -> Self {
+        let sum = |of: &dyn Fn(&Counted) -> f64| samples.iter().map(|s| s.weight * of(s)).sum::<f64>();
+        let weight = sum(&|_| 1.0);
+        let (mean_given, mean_rendered) = (sum(&|s| s.given) / weight, sum(&|s| s.rendered) / weight);
+        let variance = sum(&|s| (s.given - mean_given).powi(2)) / weight;
+        let covariance = sum(&|s| (s.given - mean_given) * (s.rendered - mean_rendered)) / weight;
+        // A spread that is only rounding fits nothing.
+        let fits = covariance > 0.0 && variance > 1e-12 * mean_given * mean_given;
+        let scale = if fits { covariance / variance } else { 0.0 };
+        Self {
+            scale,
+            shift: mean_rendered - scale * mean_given,
+            mean_given,
+            inverse_variance: if fits { 1.0 / variance } else { 0.0 },
+            weight,
+        }
+    }
+
+    fn residual(&self, s: &Counted) -> f64 {
+        self.scale * s.given + self.shift - s.rendered
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::differences::coordinates;
+    use super::*;
+    use irradia_scene::Rng;
+
+    const PIXELS: usize = 60;
+
+    /// Accumulated depth and alpha of every pixel, and samples on most of them (some pixels twice).
+    fn random(seed: u64) -> (Vec<f64>, Vec<f64>, Vec<DepthSample>) {
+        let mut rng = Rng::new(seed, 0);
+        let alpha: Vec<f64> = (0..PIXELS).map(|_| f64::from(rng.uniform())).collect();
+        let depth = alpha
+            .iter()
+            .map(|a| a * f64::from(2.0 + 3.0 * rng.uniform()))
+            .collect::<Vec<_>>();
+        let samples = (0..50)
+            .map(|_| {
+                let pixel = rng.below(PIXELS as u32);
+                let rendered = depth[pixel as usize] / alpha[pixel as usize];
+                DepthSample {
+                    pixel,
+                    depth: rendered as f32 + 0.5 * rng.normal(),
+                    weight: 0.5 + rng.uniform(),
+                }
+            })
+            .collect();
+        (depth, alpha, samples)
+    }
+
+    fn value(depth: &[f64], alpha: &[f64], samples: &[DepthSample], kind: DepthKind) -> (DepthValues, [Vec<f64>; 2]) {
+        let mut v = [vec![0.0; depth.len()], vec![0.0; depth.len()]];
+        let [v_depth, v_alpha] = &mut v;
+        let values = DepthLoss::default().run(depth, alpha, samples, kind, 1.0, v_depth, v_alpha);
+        (values, v)
+    }
+
+    #[test]
+    fn finite_differences_hold_both_gradients_of_both_kinds() {
+        for seed in 0..4 {
+            for kind in [DepthKind::Metric, DepthKind::Relative] {
+                let (depth, alpha, mut samples) = random(seed);
+                if seed == 3 {
+                    // Turned round: the fit is held at a = 0.
+                    samples.iter_mut().for_each(|s| s.depth = 10.0 - s.depth);
+                }
+                let (values, [v_depth, v_alpha]) = value(&depth, &alpha, &samples, kind);
+                assert!(values.samples > 10 && values.loss > 0.0);
+                assert_eq!(values.scale == 0.0, seed == 3 && kind == DepthKind::Relative);
+                // No residual of these seeds lies within a step of its kink, no alpha within one of the threshold.
+                coordinates(
+                    &depth,
+                    &v_depth,
+                    |d| value(d, &alpha, &samples, kind).0.loss,
+                    1e-6,
+                    1e-6,
+                );
+                coordinates(
+                    &alpha,
+                    &v_alpha,
+                    |a| value(&depth, a, &samples, kind).0.loss,
+                    1e-6,
+                    1e-6,
+                );
+            }
+        }
+    }
+
+    fn sample(pixel: u32, depth: f32) -> DepthSample {
+        DepthSample {
+            pixel,
+            depth,
+            weight: 1.0,
+        }
+    }
+
+    #[test]
+    fn half_a_unit_off_at_depth_two_is_a_quarter() {
+        let samples = [sample(0, 2.0), sample(1, 2.0)];
+        let (values, [v_depth, v_alpha]) = value(&[2.5, 0.75], &[1.0, 0.5], &samples, DepthKind::Metric);
+        assert_eq!((values.loss, values.samples), (0.25, 2));
+        // D is 2.5 and 1.5; a unit of D costs 1 / 4.
+        assert_eq!(v_depth, [0.25, -0.5]);
+        assert_eq!(v_alpha, [-0.625, 0.75]);
+    }
+
+    #[test]
+    fn relative_depth_needs_neither_scale_nor_shift_nor_the_scenes_unit() {
+        let (depth, alpha, samples) = random(5);
+        let (first, _) = value(&depth, &alpha, &samples, DepthKind::Relative);
+        let larger: Vec<f64> = depth.iter().map(|d| 7.0 * d).collect();
+        let other: Vec<DepthSample> = samples
+            .iter()
+            .map(|s| DepthSample {
+                depth: 4.0 * s.depth + 3.0,
+                ..*s
+            })
+            .collect();
+        let (second, _) = value(&larger, &alpha, &other, DepthKind::Relative);
+        // The samples are single precision.
+        assert!((first.loss - second.loss).abs() < 1e-6, "{first:?} {second:?}");
+        assert!(
+            (second.scale - first.scale * 7.0 / 4.0).abs() < 1e-5,
+            "{first:?} {second:?}"
+        );
+        let exact = [sample(0, 1.0), sample(1, 2.0), sample(2, 4.0)];
+        let (values, _) = value(&[5.0, 7.0, 11.0], &[1.0; 3], &exact, DepthKind::Relative);
+        assert!(values.loss < 1e-12 && (values.scale - 2.0).abs() < 1e-12 && (values.shift - 3.0).abs() < 1e-12);
+    }
+
+    #[test]
+    fn what_cannot_be_judged_does_not_count() {
+        let poison = [
+            sample(9, 1.0),
+            sample(u32::MAX, 1.0),
+            sample(0, f32::NAN),
+            sample(0, -1.0),
+            sample(0, f32::INFINITY),
+            sample(1, 1.0),
+            sample(2, 1.0),
+            DepthSample {
+                weight: f32::NAN,
+                ..sample(0, 1.0)
+            },
+        ];
+        for kind in [DepthKind::Metric, DepthKind::Relative] {
+            // Pixel 1 is nearly empty, pixel 2 holds no number.
+            let (values, v) = value(&[1.0, 0.1, f64::NAN], &[1.0, 0.1, 1.0], &poison, kind);
+            assert_eq!((values.loss, values.samples), (0.0, 0));
+            assert!(v.iter().flatten().all(|v| *v == 0.0));
+            // One sample, or equal ones, cannot be fitted: only the shift remains, and nothing is left.
+            let (values, v) = value(&[1.0, 0.1, 1.5], &[1.0; 3], &[sample(0, 3.0)], kind);
+            assert_eq!(values.loss == 0.0, kind == DepthKind::Relative);
+            assert!(v.iter().flatten().all(|v| v.is_finite()));
+        }
+    }
+
+    #[test]
+    fn single_precision_adds_its_weighted_gradient() {
+        let (depth, alpha, samples) = random(6);
+        let (want, [v_want, _]) = value(&depth, &alpha, &samples, DepthKind::Relative);
+        let single = |v: &[f64]| v.iter().map(|v| *v as f32).collect::<Vec<f32>>();
+        let (mut v_depth, mut v_alpha) = (vec![1.0; PIXELS], vec![0.0; PIXELS]);
+        let got = DepthLoss::default().evaluate(
+            &single(&depth),
+            &single(&alpha),
+            &samples,
+            DepthKind::Relative,
+            2.0,
+            &mut v_depth,
+            &mut v_alpha,
+        );
+        assert!((got.loss - want.loss).abs() < 1e-6);
+        for (got, want) in v_depth.iter().zip(&v_want) {
+            assert!((f64::from(*got) - 1.0 - 2.0 * want).abs() < 1e-5, "{got} {want}");
+        }
+    }
+}

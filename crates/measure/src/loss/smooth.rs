@@ -1,0 +1,370 @@
+//! Edge-aware smoothness of rendered depth (L_smooth; Godard, Mac Aodha, Brostow 2017, eq. 5).
+//!
+//! Symbols: A accumulated depth, alpha opacity; q disparity alpha / A (or depth A / alpha); I the photograph, whose change
+//! |dI| between two pixels is the mean over its channels; k how sharply an edge of the photograph permits one in depth.
+//!
+//! ```text
+//! loss = sum over pairs of neighbours |dq| exp(-k |dI|) / sum q
+//! ```
+//!
+//! which is the published loss over q divided by its mean, as the authors' later work has it (Godard et al. 2019, section
+//! 3.3): without that a scene could become smooth by moving away. The gradient goes through the mean. k = 0 is plain total
+//! variation. Pixels that the mask leaves out, or that are nearly empty, take no part.
+
+use super::{Target, Truth};
+use crate::real::{Real, sum_over};
+use rayon::prelude::*;
+
+/// What is to be smooth.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Smoothed {
+    /// One over depth: what is far, and little known, counts little.
+    #[default]
+    Disparity,
+    /// Depth itself.
+    Depth,
+}
+
+/// Computes the loss and its gradient; keeps its working memory.
+pub struct SmoothLoss {
+    /// Pixels less opaque than this take no part. 0.5 by default.
+    pub min_alpha: f32,
+    memory: Memory<f32>,
+}
+
+impl Default for SmoothLoss {
+    fn default() -> Self {
+        Self {
+            min_alpha: 0.5,
+            memory: Memory::default(),
+        }
+    }
+}
+
+impl SmoothLoss {
+    /// The loss of the accumulated `depth [H * W]` and `alpha [H * W]` before the photograph `target` (whose colours in
+    /// \[0, 1\] are compared, so that k of 10 lets an edge of 0.1 count 1 / e); `weight` times the gradients is added to
+    /// `v_depth` and `v_alpha`, of the same shape.
+    ///
+    /// # Panics
+    /// When a length does not match the target's size: that is a bug of the caller.
+    pub fn evaluate(
+        &mut self,
+        depth: &[f32],
+        alpha: &[f32],
+        target: &Target,
+        of: Smoothed,
+        k: f32,
+        weight: f32,
+        v_depth: &mut [f32],
+        v_alpha: &mut [f32],
+    ) -> f64 {
+        let knobs = Knobs {
+            of,
+            k: f64::from(k),
+            min_alpha: self.min_alpha,
+            weight: f64::from(weight),
+        };
+        self.memory.evaluate(depth, alpha, target, &knobs, v_depth, v_alpha)
+    }
+}
+
+struct Knobs {
+    of: Smoothed,
+    k: f64,
+    min_alpha: f32,
+    weight: f64,
+}
+
+#[derive(Default)]
+struct Memory<T> {
+    /// q, 0 where a pixel takes no part.
+    q: Vec<T>,
+    /// `exp(-k |dI|) sign(dq)` towards the right and downwards, 0 where either takes no part, `[2, H, W]` row by row.
+    slopes: Vec<T>,
+    /// By row.
+    sums: Vec<f64>,
+    /// `exp(-k |dI|)` by the sum of three channels' differences in 256 steps.
+    edges: Vec<T>,
+}
+
+/// Three channels' largest difference in 256 steps.
+const LARGEST: usize = 3 * 255;
+
+impl<T: Real> Memory<T> {
+    fn evaluate(
+        &mut self,
+        depth: &[T],
+        alpha: &[T],
+        target: &Target<T>,
+        knobs: &Knobs,
+        v_depth: &mut [T],
+        v_alpha: &mut [T],
+    ) -> f64 {
+        let (width, height) = (target.width, target.height);
+        for length in [depth.len(), alpha.len(), v_depth.len(), v_alpha.len()] {
+            assert_eq!(length, width * height, "depth, alpha and their gradients are [H, W]");
+        }
+        target.assert_truth();
+        self.q.resize(width * height, T::zero());
+        self.slopes.resize(2 * width * height, T::zero());
+        self.sums.resize(height, 0.0);
+        self.edges.clear();
+        let weight = |i| T::from_f64((-knobs.k * f64::from(i) / LARGEST as f64).exp());
+        self.edges.extend((0..=LARGEST as u16).map(weight));
+        if width * height == 0 {
+            return 0.0;
+        }
+
+        let rows = self.q.par_chunks_mut(width).zip(&mut self.sums).enumerate();
+        rows.for_each(|(y, (q, sum))| {
+            let row = y * width..(y + 1) * width;
+            let mask = target.mask.map(|mask| &mask[row.clone()]);
+            *sum = quantities(&depth[row.clone()], &alpha[row], mask, knobs, q);
+        });
+        let total: f64 = self.sums.iter().sum();
+        let sound = total > 0.0 && total.is_finite();
+        if !sound {
+            return 0.0;
+        }
+
+        let (q, edges) = (&self.q, &self.edges);
+        let rows = self.slopes.par_chunks_mut(2 * width).zip(&mut self.sums).enumerate();
+        rows.for_each(|(y, (slopes, sum))| {
+            let (right, down) = slopes.split_at_mut(width);
+            let here = y * width;
+            let row = &q[here..here + width];
+            for x in 1..width {
+                right[x - 1] = edge(target, here + x - 1, here + x, edges, knobs.k);
+            }
+            right[width - 1] = T::zero();
+            *sum = slopes_between(&row[..width - 1], &row[1..], &mut right[..width - 1]);
+            if y + 1 == height {
+                down.fill(T::zero());
+                return;
+            }
+            for x in 0..width {
+                down[x] = edge(target, here + x, here + width + x, edges, knobs.k);
+            }
+            *sum += slopes_between(row, &q[here + width..here + 2 * width], down);
+        });
+        let loss = self.sums.iter().sum::<f64>() / total;
+
+        let slopes = &self.slopes;
+        let gain = T::from_f64(knobs.weight / total);
+        let by_mean = T::from_f64(loss);
+        let sign = match knobs.of {
+            Smoothed::Disparity => -T::one(),
+            Smoothed::Depth => T::one(),
+        };
+        let rows = v_depth.par_chunks_mut(width).zip(v_alpha.par_chunks_mut(width));
+        rows.enumerate().for_each(|(y, (v_depth, v_alpha))| {
+            let (right, down) = slopes[2 * y * width..2 * (y + 1) * width].split_at(width);
+            let above = y
+                .checked_sub(1)
+                .map(|y| &slopes[(2 * y + 1) * width..2 * (y + 1) * width]);
+            let row = y * width..(y + 1) * width;
+            let (q, depth, alpha) = (&q[row.clone()], &depth[row.clone()], &alpha[row]);
+            let (v_depth, v_alpha) = (&mut v_depth[..width], &mut v_alpha[..width]);
+            let mut before = T::zero();
+            for x in 0..width {
+                // Of a pair, the later pixel's gradient is the slope and the earlier's its negative.
+                let above = above.map_or(T::zero(), |above| above[x]);
+                let v_q = gain * (before + above - right[x] - down[x] - by_mean);
+                before = right[x];
+                // q is the quotient of the two: its derivative by either is q over it, with a sign.
+                let (v_q, counts) = (sign * v_q * q[x], q[x] != T::zero());
+                v_depth[x] += if counts { v_q / depth[x] } else { T::zero() };
+                v_alpha[x] += if counts { -v_q / alpha[x] } else { T::zero() };
+            }
+        });
+        loss
+    }
+}
+
+/// q of a row, and its sum.
+fn quantities<T: Real>(depth: &[T], alpha: &[T], mask: Option<&[u8]>, knobs: &Knobs, q: &mut [T]) -> f64 {
+    let least = T::from_f64(f64::from(knobs.min_alpha)).max(T::min_positive_value());
+    let mut sum = 0.0;
+    for x in 0..q.len() {
+        let quantity = match knobs.of {
+            Smoothed::Disparity => alpha[x] / depth[x],
+            Smoothed::Depth => depth[x] / alpha[x],
+        };
+        let counts =
+            alpha[x] >= least && depth[x] > T::zero() && quantity.is_finite() && mask.is_none_or(|m| m[x] != 0);
+        q[x] = if counts { quantity } else { T::zero() };
+        sum += q[x].to_f64();
+    }
+    sum
+}
+
+/// Gives each of `weights` the sign of `b - a`, or makes it 0 where either takes no part; the sum of weighted sizes.
+fn slopes_between<T: Real>(a: &[T], b: &[T], weights: &mut [T]) -> f64 {
+    for ((a, b), weight) in a.iter().zip(b).zip(weights.iter_mut()) {
+        let both = (*a != T::zero()) & (*b != T::zero());
+        let signed = if b > a { *weight } else { -*weight };
+        *weight = if both & (a != b) { signed } else { T::zero() };
+    }
+    sum_over(weights.len(), |x| weights[x] * (b[x] - a[x])).to_f64()
+}
+
+/// `exp(-k |dI|)` between two pixels.
+#[inline(always)]
+fn edge<T: Real>(target: &Target<T>, a: usize, b: usize, edges: &[T], k: f64) -> T {
+    match target.truth {
+        Truth::Rgb8(truth) => {
+            let (a, b) = (&truth[3 * a..3 * a + 3], &truth[3 * b..3 * b + 3]);
+            let apart = |c: usize| usize::from(a[c].abs_diff(b[c]));
+            edges[apart(0) + apart(1) + apart(2)]
+        }
+        Truth::Planar(_) => {
+            let apart = |c: usize| (target.color(a, c) - target.color(b, c)).abs();
+            let change = apart(0) + apart(1) + apart(2);
+            (T::from_f64(-k / 3.0) * change).exp()
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::differences::{Picture, coordinates};
+    use super::*;
+    use irradia_scene::Rng;
+
+    fn knobs(of: Smoothed, k: f64) -> Knobs {
+        Knobs {
+            of,
+            k,
+            min_alpha: 0.5,
+            weight: 1.0,
+        }
+    }
+
+    fn value(depth: &[f64], alpha: &[f64], target: &Target<f64>, knobs: &Knobs) -> (f64, [Vec<f64>; 2]) {
+        let mut v = [vec![0.0; depth.len()], vec![0.0; depth.len()]];
+        let [v_depth, v_alpha] = &mut v;
+        let loss = Memory::default().evaluate(depth, alpha, target, knobs, v_depth, v_alpha);
+        (loss, v)
+    }
+
+    /// Alpha from 0.2 up, accumulated depth of 1 to 4.
+    fn planes(pixels: usize, seed: u64) -> (Vec<f64>, Vec<f64>) {
+        let mut rng = Rng::new(seed, 1);
+        let alpha: Vec<f64> = (0..pixels).map(|_| f64::from(0.2 + 0.8 * rng.uniform())).collect();
+        let depth = alpha.iter().map(|a| a * f64::from(1.0 + 3.0 * rng.uniform())).collect();
+        (depth, alpha)
+    }
+
+    #[test]
+    fn finite_differences_hold_both_gradients() {
+        for (seed, (width, height)) in [(9, 7), (1, 5), (6, 1), (13, 12)].into_iter().enumerate() {
+            for of in [Smoothed::Disparity, Smoothed::Depth] {
+                for (k, masked) in [(10.0, false), (0.0, true), (3.0, true)] {
+                    let picture = Picture::random(width, height, masked, seed as u64);
+                    let (depth, alpha) = planes(width * height, seed as u64);
+                    let (target, knobs) = (picture.target(), knobs(of, k));
+                    let (_, [v_depth, v_alpha]) = value(&depth, &alpha, &target, &knobs);
+                    // No two neighbours of these seeds are within a step of one another, no alpha of the threshold.
+                    let by_depth = |depth: &[f64]| value(depth, &alpha, &target, &knobs).0;
+                    coordinates(&depth, &v_depth, by_depth, 1e-7, 1e-6);
+                    let by_alpha = |alpha: &[f64]| value(&depth, alpha, &target, &knobs).0;
+                    coordinates(&alpha, &v_alpha, by_alpha, 1e-7, 1e-6);
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn a_step_costs_its_height_and_an_edge_of_the_photograph_excuses_it() {
+        // Depth 1 on the left, 3 on the right of a 4 x 2 image: two pairs differ by 2; depths add up to 16.
+        let depth = [1.0, 1.0, 3.0, 3.0].repeat(2);
+        let alpha = vec![1.0; 8];
+        let gray = [0.5; 24];
+        let plain = Target {
+            width: 4,
+            height: 2,
+            truth: Truth::Planar(&gray[..]),
+            mask: None,
+        };
+        for k in [0.0, 10.0] {
+            let (loss, _) = value(&depth, &alpha, &plain, &knobs(Smoothed::Depth, k));
+            assert!((loss - 0.25).abs() < 1e-12, "{loss}");
+        }
+        // A change of 0.1 in every channel where the depth changes.
+        let edge = [0.5, 0.5, 0.6, 0.6].repeat(6);
+        let excused = Target {
+            truth: Truth::Planar(&edge[..]),
+            ..plain
+        };
+        let (loss, _) = value(&depth, &alpha, &excused, &knobs(Smoothed::Depth, 10.0));
+        assert!((loss - 0.25 * (-1.0f64).exp()).abs() < 1e-12, "{loss}");
+        // Disparities 1 and 1/3: two pairs of 2/3 over 16/3.
+        let (loss, _) = value(&depth, &alpha, &plain, &knobs(Smoothed::Disparity, 0.0));
+        assert!((loss - 0.25).abs() < 1e-12, "{loss}");
+        let (flat, v) = value(&[2.0; 8], &alpha, &plain, &knobs(Smoothed::Disparity, 1.0));
+        assert!(flat == 0.0 && v.iter().flatten().all(|v| *v == 0.0));
+    }
+
+    #[test]
+    fn the_scenes_unit_does_not_matter_and_empty_pixels_take_no_part() {
+        let picture = Picture::random(12, 9, false, 4);
+        let (mut depth, mut alpha) = planes(108, 4);
+        let (target, knobs) = (picture.target(), knobs(Smoothed::Disparity, 5.0));
+        let (first, _) = value(&depth, &alpha, &target, &knobs);
+        let larger: Vec<f64> = depth.iter().map(|d| 1000.0 * d).collect();
+        assert!((value(&larger, &alpha, &target, &knobs).0 - first).abs() < 1e-12);
+
+        for (i, poison) in [f64::NAN, f64::INFINITY, -1.0, 0.0].into_iter().enumerate() {
+            (depth[20 * i], alpha[20 * i]) = (poison, 1.0);
+            (depth[20 * i + 1], alpha[20 * i + 1]) = (1e9, 0.1);
+        }
+        let (loss, [v_depth, v_alpha]) = value(&depth, &alpha, &target, &knobs);
+        assert!(loss.is_finite() && v_depth.iter().chain(&v_alpha).all(|v| v.is_finite()));
+        assert!((0..4).all(|i| v_depth[20 * i] == 0.0 && v_alpha[20 * i + 1] == 0.0));
+        let (nothing, v) = value(&depth, &[0.0; 108], &target, &knobs);
+        assert!(nothing == 0.0 && v.iter().flatten().all(|v| *v == 0.0));
+    }
+
+    #[test]
+    fn bytes_are_colours_threads_change_nothing_and_gradients_are_added() {
+        let picture = Picture::random(31, 22, true, 9);
+        let bytes = picture.image(&picture.truth).to_u8();
+        let rounded: Vec<f32> = (0..3 * 682)
+            .map(|i| f32::from(bytes[i % 682 * 3 + i / 682]) / 255.0)
+            .collect();
+        let (depth, alpha) = planes(682, 9);
+        let single = |v: &[f64]| v.iter().map(|v| *v as f32).collect::<Vec<f32>>();
+        let (depth, alpha) = (single(&depth), single(&alpha));
+        let run = |truth: Truth, threads: usize, first: f32| {
+            let target = Target {
+                width: 31,
+                height: 22,
+                truth,
+                mask: picture.mask.as_deref(),
+            };
+            let (mut v_depth, mut v_alpha) = (vec![first; 682], vec![first; 682]);
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            let loss = pool.install(|| {
+                let mut loss = SmoothLoss::default();
+                loss.evaluate(
+                    &depth,
+                    &alpha,
+                    &target,
+                    Smoothed::Disparity,
+                    8.0,
+                    3.0,
+                    &mut v_depth,
+                    &mut v_alpha,
+                )
+            });
+            (loss, v_depth, v_alpha)
+        };
+        let one = run(Truth::Rgb8(&bytes), 1, 0.0);
+        assert_eq!(run(Truth::Rgb8(&bytes), 3, 0.0), one);
+        let planar = run(Truth::Planar(&rounded), 2, 0.0);
+        assert!((planar.0 - one.0).abs() < 1e-6, "{} {}", planar.0, one.0);
+        let added = run(Truth::Rgb8(&bytes), 2, 0.5);
+        assert!(added.1.iter().zip(&one.1).all(|(a, b)| (a - 0.5 - b).abs() < 1e-6));
+    }
+}

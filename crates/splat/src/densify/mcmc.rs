@@ -1,0 +1,199 @@
+//! Splats as samples of a distribution: "3D Gaussian Splatting as Markov Chain Monte Carlo" (Kheradmand et al. 2024). Dead
+//! splats move to where live ones are, the number grows to a fixed budget, and noise explores.
+
+use super::DensityChange;
+use super::split::{draw, is_finite};
+use crate::{SplatState, logit, sigmoid};
+use irradia_compute::Planes;
+use irradia_scene::Rng;
+use rayon::prelude::*;
+
+/// Knobs, with the authors' names and defaults.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct McmcOptions {
+    /// Opacity from which down a splat is dead; 0.005.
+    pub min_opacity: f32,
+    /// Factor on the number in each round; 1.05.
+    pub growth: f32,
+    /// The number that it grows to; `cap_max`.
+    pub max_splats: usize,
+}
+
+/// Relocates the dead and grows; restores Morton order and clears the statistics.
+pub fn densify(state: &mut SplatState, options: &McmcOptions, rng: &mut Rng) -> DensityChange {
+    let n = state.len();
+    let opacities: Vec<f32> = (0..n)
+        .map(|i| {
+            let opacity = state.splats.opacity(i);
+            let alive = opacity > options.min_opacity && is_finite(&state.splats, i);
+            if alive { opacity } else { 0.0 }
+        })
+        .collect();
+    let alive: Vec<u32> = (0..n as u32).filter(|i| opacities[*i as usize] > 0.0).collect();
+    if alive.is_empty() {
+        return DensityChange::default(); // There is nowhere to move to.
+    }
+    let dead = n - alive.len();
+    let target = ((n as f32 * options.growth) as usize).clamp(n, options.max_splats.max(n));
+    let sources = draw(&opacities, target - alive.len(), rng);
+    share_out(state, &sources);
+    let copies = state.splats.gather(&sources);
+    state.gather(&alive);
+    state.append(&copies);
+    state.statistics.clear();
+    state.sort_by_place();
+    DensityChange {
+        cloned: sources.len(),
+        split: 0,
+        pruned: dead,
+    }
+}
+
+/// Makes each splat named k times in `sources` (ascending) so faint and small that it and k copies of it together render
+/// as the one did (eq. 9), and forgets its moments.
+fn share_out(state: &mut SplatState, sources: &[u32]) {
+    for group in sources.chunk_by(|a, b| a == b) {
+        let i = group[0] as usize;
+        let (opacity, factor) = shared(state.splats.opacity(i), group.len() + 1);
+        state.splats.opacity_logits.set(0, i, logit(opacity));
+        for c in 0..3 {
+            let log_scale = state.splats.log_scales.get(c, i);
+            state.splats.log_scales.set(c, i, log_scale + factor.ln());
+        }
+        state.forget_moments(i);
+    }
+}
+
+/// Most copies that eq. 9 is evaluated for: its alternating sum loses precision beyond.
+const MOST_COPIES: usize = 51;
+
+/// Opacity of each of `n` splats that share the place of one, and the factor on their size (eq. 9).
+fn shared(opacity: f32, n: usize) -> (f32, f32) {
+    let n = n.min(MOST_COPIES);
+    let before = f64::from(opacity);
+    let after = 1.0 - (1.0 - before).powf(1.0 / n as f64);
+    let mut sum = 0.0;
+    for i in 1..=n {
+        let mut binomial = 1.0;
+        for k in 0..i {
+            let sign = if k % 2 == 0 { 1.0 } else { -1.0 };
+            sum += binomial * sign * after.powi(k as i32 + 1) / (k as f64 + 1.0).sqrt();
+            binomial *= (i - 1 - k) as f64 / (k + 1) as f64;
+        }
+    }
+    // The authors' clamp: as faint as the dead, never quite opaque.
+    (
+        after.clamp(0.005, 1.0 - f64::from(f32::EPSILON)) as f32,
+        (before / sum) as f32,
+    )
+}
+
+/// Splats of a chunk share a stream of chance: the number of threads changes nothing.
+const CHUNK: usize = 4096;
+/// Opacity at which the noise has fallen to half, and how steeply it falls (section 3.3).
+const QUIET_OPACITY: f32 = 0.005;
+const QUIET_STEEPNESS: f32 = 100.0;
+
+/// Moves the means by noise in the shape of each splat: `rate` covariance normal(), faded out for what is opaque (eq. 8).
+/// `rate` is the means' learning rate times the authors' 5e5, world units.
+pub fn add_noise(state: &mut SplatState, rate: f32, seed: u64, step: u64) {
+    let n = state.len();
+    let splats = &state.splats;
+    let offsets: Vec<Vec<(u32, [f32; 3])>> = (0..n.div_ceil(CHUNK))
+        .into_par_iter()
+        .map(|chunk| {
+            let mut rng = Rng::new(seed ^ step << 24 ^ chunk as u64, STREAM_NOISE);
+            (chunk * CHUNK..n.min((chunk + 1) * CHUNK))
+                .filter_map(|i| {
+                    let opacity = splats.opacity(i);
+                    let loud = sigmoid(-QUIET_STEEPNESS * (opacity - QUIET_OPACITY));
+                    // Below this the offset is lost in rounding; most splats of a scene are.
+                    (loud > 1e-6).then(|| {
+                        let normal = glam::Vec3::new(rng.normal(), rng.normal(), rng.normal());
+                        let q = |c: usize| splats.quats.get(c, i);
+                        let rotation = glam::Quat::from_xyzw(q(1), q(2), q(3), q(0)).normalize();
+                        let mut local = rotation.inverse() * normal;
+                        for c in 0..3 {
+                            local[c] *= (2.0 * splats.log_scales.get(c, i)).exp();
+                        }
+                        (i as u32, (rotation * local * (loud * rate)).to_array())
+                    })
+                })
+                .collect()
+        })
+        .collect();
+    let means: &mut Planes = &mut state.splats.means;
+    for (i, offset) in offsets.into_iter().flatten() {
+        for c in 0..3 {
+            let moved = means.get(c, i as usize) + offset[c];
+            if moved.is_finite() {
+                means.set(c, i as usize, moved);
+            }
+        }
+    }
+}
+
+/// The stream of the run's seed that noise is drawn from.
+const STREAM_NOISE: u64 = 4;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::Splats;
+
+    fn state(opacities: &[f32]) -> SplatState {
+        let mut splats = Splats::zeros(opacities.len(), 0);
+        for (i, opacity) in opacities.iter().enumerate() {
+            splats.means.set(0, i, i as f32);
+            splats.quats.set(0, i, 1.0);
+            splats.opacity_logits.set(0, i, logit(*opacity));
+        }
+        SplatState::new(splats)
+    }
+
+    #[test]
+    fn copies_together_are_as_opaque_as_the_one_was() {
+        for (opacity, n) in [(0.5f32, 2usize), (0.9, 5), (0.3, 12), (0.99, 30)] {
+            let (after, factor) = shared(opacity, n);
+            assert!((1.0 - (1.0 - after).powi(n as i32) - opacity).abs() < 1e-4);
+            // The integral of n blended copies over their plane is that of the one (what eq. 9 is made for).
+            let integral = |opacity: f64, n: i32, sigma: f64| {
+                (-4000..4000)
+                    .map(|i| {
+                        let x = f64::from(i) * 0.002;
+                        (1.0 - (1.0 - opacity * (-0.5 * x * x / (sigma * sigma)).exp()).powi(n)) * 0.002
+                    })
+                    .sum::<f64>()
+            };
+            let one = integral(f64::from(opacity), 1, 1.0);
+            let many = integral(f64::from(after), n as i32, f64::from(factor));
+            assert!((many / one - 1.0).abs() < 0.01, "{opacity} {n}: {many} {one}");
+        }
+    }
+
+    #[test]
+    fn the_dead_move_and_the_number_grows_to_the_cap() {
+        let mut s = state(&[0.9, 0.001, 0.5, 0.002]);
+        let options = McmcOptions {
+            min_opacity: 0.005,
+            growth: 1.5,
+            max_splats: 5,
+        };
+        let change = densify(&mut s, &options, &mut Rng::new(3, 3));
+        assert_eq!((s.len(), change.cloned, change.pruned), (5, 3, 2));
+        let places: Vec<f32> = (0..5).map(|i| s.splats.means.get(0, i)).collect();
+        assert!(places.iter().all(|x| *x == 0.0 || *x == 2.0), "{places:?}");
+    }
+
+    #[test]
+    fn noise_moves_the_faint_and_leaves_the_opaque() {
+        let mut s = state(&[0.9, 0.003]);
+        let before = s.splats.clone();
+        add_noise(&mut s, 0.1, 7, 1);
+        assert_eq!(s.splats.means.get(0, 0), before.means.get(0, 0));
+        assert_ne!(s.splats.means.get(0, 1), before.means.get(0, 1));
+        let mut again = state(&[0.9, 0.003]);
+        add_noise(&mut again, 0.1, 7, 1);
+        assert_eq!(again.splats, s.splats);
+    }
+}

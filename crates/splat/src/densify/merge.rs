@@ -1,0 +1,219 @@
+//! Merging of adjacent splats of like position and colour into one of the same mass, mean and covariance: the CurriculumGS
+//! regulariser that undoes what densification overdid.
+
+use super::DensityChange;
+use super::split::is_finite;
+use crate::{SplatState, logit};
+use glam::{Mat3, Quat, Vec3};
+use kiddo::SquaredEuclidean;
+use kiddo::immutable::float::kdtree::ImmutableKdTree;
+use rayon::prelude::*;
+use std::num::NonZero;
+
+/// Knobs.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct MergeOptions {
+    /// Two splats are adjacent when their centres are closer than this many times the smaller one's median axis.
+    pub distance: f32,
+    /// And alike when no channel of their base colours differs by more than this.
+    pub color: f32,
+}
+
+/// Merges pairs that are each other's nearest neighbour, adjacent and alike; clears the statistics.
+pub fn merge(state: &mut SplatState, options: &MergeOptions) -> DensityChange {
+    let pairs = pairs(state, options);
+    let mut gone = vec![false; state.len()];
+    for (a, b) in &pairs {
+        unite(state, *a as usize, *b as usize);
+        gone[*b as usize] = true;
+    }
+    let kept: Vec<u32> = (0..state.len() as u32).filter(|i| !gone[*i as usize]).collect();
+    state.gather(&kept);
+    state.statistics.clear();
+    DensityChange {
+        pruned: pairs.len(),
+        ..Default::default()
+    }
+}
+
+fn mean(state: &SplatState, i: usize) -> Vec3 {
+    Vec3::from_array(std::array::from_fn(|c| state.splats.means.get(c, i)))
+}
+
+fn pairs(state: &SplatState, options: &MergeOptions) -> Vec<(u32, u32)> {
+    let splats = &state.splats;
+    let whole: Vec<u32> = (0..state.len() as u32)
+        .filter(|i| is_finite(splats, *i as usize))
+        .collect();
+    if whole.len() < 2 {
+        return Vec::new();
+    }
+    let positions: Vec<[f32; 3]> = whole.iter().map(|i| mean(state, *i as usize).to_array()).collect();
+    let tree: ImmutableKdTree<f32, u32, 3, 32> = ImmutableKdTree::new_from_slice(&positions);
+    let two = NonZero::new(2).expect("not zero");
+    let nearest: Vec<u32> = positions
+        .par_iter()
+        .enumerate()
+        .map(|(i, p)| {
+            let found = tree.nearest_n::<SquaredEuclidean>(p, two);
+            // Of two at the same place either may come first.
+            found
+                .iter()
+                .map(|n| n.item)
+                .find(|item| *item != i as u32)
+                .unwrap_or(i as u32)
+        })
+        .collect();
+    (0..whole.len() as u32)
+        .filter(|i| {
+            let other = nearest[*i as usize];
+            *i < other && nearest[other as usize] == *i
+        })
+        .map(|i| (whole[i as usize], whole[nearest[i as usize] as usize]))
+        .filter(|(a, b)| alike(state, *a as usize, *b as usize, options))
+        .collect()
+}
+
+fn alike(state: &SplatState, a: usize, b: usize, options: &MergeOptions) -> bool {
+    let splats = &state.splats;
+    let median = |i: usize| {
+        let mut s: [f32; 3] = std::array::from_fn(|c| splats.log_scales.get(c, i));
+        s.sort_unstable_by(f32::total_cmp);
+        s[1].exp()
+    };
+    let near = mean(state, a).distance(mean(state, b)) < options.distance * median(a).min(median(b));
+    let dc = |i: usize, c: usize| irradia_scene::sh::C0 as f32 * splats.sh.get(c, i);
+    near && (0..3).all(|c| (dc(a, c) - dc(b, c)).abs() <= options.color)
+}
+
+fn covariance(state: &SplatState, i: usize) -> Mat3 {
+    let splats = &state.splats;
+    let q = |c: usize| splats.quats.get(c, i);
+    let rotation = Mat3::from_quat(Quat::from_xyzw(q(1), q(2), q(3), q(0)).normalize());
+    let variance = Vec3::from_array(std::array::from_fn(|c| (2.0 * splats.log_scales.get(c, i)).exp()));
+    rotation * Mat3::from_diagonal(variance) * rotation.transpose()
+}
+
+/// Puts the union of a and b in a's place.
+fn unite(state: &mut SplatState, a: usize, b: usize) {
+    let volume = |s: &SplatState, i: usize| (0..3).map(|c| s.splats.log_scales.get(c, i)).sum::<f32>().exp();
+    let masses = [a, b].map(|i| state.splats.opacity(i) * volume(state, i));
+    let total = (masses[0] + masses[1]).max(f32::MIN_POSITIVE);
+    let shares = masses.map(|m| m / total);
+    let (ma, mb) = (mean(state, a), mean(state, b));
+    let center = shares[0] * ma + shares[1] * mb;
+    let outer = |d: Vec3| Mat3::from_cols(d * d.x, d * d.y, d * d.z);
+    let cov = (covariance(state, a) + outer(ma - center)) * shares[0]
+        + (covariance(state, b) + outer(mb - center)) * shares[1];
+    let (rotation, variances) = eigen(cov);
+    let splats = &mut state.splats;
+    for c in 0..3 {
+        splats.means.set(c, a, center[c]);
+        splats.log_scales.set(c, a, 0.5 * variances[c].max(1e-30).ln());
+    }
+    for (c, v) in [rotation.w, rotation.x, rotation.y, rotation.z].into_iter().enumerate() {
+        splats.quats.set(c, a, v);
+    }
+    for c in 0..splats.sh.count() {
+        let v = shares[0] * splats.sh.get(c, a) + shares[1] * splats.sh.get(c, b);
+        splats.sh.set(c, a, v);
+    }
+    let opacity = total / volume(state, a).max(f32::MIN_POSITIVE);
+    state.splats.opacity_logits.set(0, a, logit(opacity.clamp(1e-4, 0.999)));
+    state.forget_moments(a);
+}
+
+/// Rotation to the principal axes and the variances along them, of a symmetric matrix: cyclic Jacobi rotations, which at
+/// this size converge to rounding in a few sweeps.
+fn eigen(mut m: Mat3) -> (Quat, Vec3) {
+    let mut axes = Mat3::IDENTITY;
+    for _ in 0..6 {
+        for (p, q) in [(0, 1), (0, 2), (1, 2)] {
+            let off = m.col(q)[p];
+            if off.abs() <= f32::MIN_POSITIVE {
+                continue;
+            }
+            let theta = 0.5 * (2.0 * off).atan2(m.col(q)[q] - m.col(p)[p]);
+            let (s, c) = theta.sin_cos();
+            let mut turn = Mat3::IDENTITY;
+            turn.col_mut(p)[p] = c;
+            turn.col_mut(q)[q] = c;
+            turn.col_mut(q)[p] = s;
+            turn.col_mut(p)[q] = -s;
+            m = turn.transpose() * m * turn;
+            axes *= turn;
+        }
+    }
+    if axes.determinant() < 0.0 {
+        axes = Mat3::from_cols(axes.x_axis, axes.y_axis, -axes.z_axis);
+    }
+    (
+        Quat::from_mat3(&axes).normalize(),
+        Vec3::new(m.x_axis.x, m.y_axis.y, m.z_axis.z),
+    )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{Splats, sigmoid};
+
+    fn splat(splats: &mut Splats, i: usize, at: Vec3, turn: Quat, scale: Vec3, opacity: f32, color: f32) {
+        for c in 0..3 {
+            splats.means.set(c, i, at[c]);
+            splats.log_scales.set(c, i, scale[c].ln());
+            splats.sh.set(c, i, color / irradia_scene::sh::C0 as f32);
+        }
+        for (c, v) in [turn.w, turn.x, turn.y, turn.z].into_iter().enumerate() {
+            splats.quats.set(c, i, v);
+        }
+        splats.opacity_logits.set(0, i, logit(opacity));
+    }
+
+    #[test]
+    fn the_union_keeps_mass_mean_and_covariance() {
+        let turn = Quat::from_euler(glam::EulerRot::XYZ, 0.4, 0.2, -0.9);
+        let mut splats = Splats::zeros(3, 0);
+        splat(&mut splats, 0, Vec3::ZERO, turn, Vec3::new(1.0, 0.3, 0.2), 0.3, 0.1);
+        splat(
+            &mut splats,
+            1,
+            Vec3::new(0.1, 0.1, 0.0),
+            turn,
+            Vec3::new(0.8, 0.4, 0.3),
+            0.2,
+            0.15,
+        );
+        splat(&mut splats, 2, Vec3::new(9.0, 0.0, 0.0), turn, Vec3::ONE, 0.2, 0.1);
+        let mut state = SplatState::new(splats);
+        let near: Vec<usize> = (0..3).filter(|i| mean(&state, *i).x < 5.0).collect();
+        let mass = |s: &SplatState, i: usize| {
+            sigmoid(s.splats.opacity_logits.get(0, i)) * covariance(s, i).determinant().sqrt()
+        };
+        let masses = [mass(&state, near[0]), mass(&state, near[1])];
+        let total = masses[0] + masses[1];
+        let shares = masses.map(|m| m / total);
+        let center = shares[0] * mean(&state, near[0]) + shares[1] * mean(&state, near[1]);
+        let options = MergeOptions {
+            distance: 1.0,
+            color: 0.1,
+        };
+        let mut picky = state.clone();
+        assert_eq!(merge(&mut picky, &MergeOptions { color: 0.01, ..options }).pruned, 0);
+        let change = merge(&mut state, &options);
+        assert_eq!((change.pruned, state.len()), (1, 2));
+        let one = (0..2).find(|i| mean(&state, *i).x < 5.0).unwrap();
+        assert!(mean(&state, one).distance(center) < 1e-5);
+        assert!((mass(&state, one) / total - 1.0).abs() < 1e-3);
+    }
+
+    #[test]
+    fn principal_axes_rebuild_the_matrix() {
+        let turn = Mat3::from_quat(Quat::from_euler(glam::EulerRot::XYZ, 1.1, -0.7, 0.3));
+        let m = turn * Mat3::from_diagonal(Vec3::new(4.0, 0.25, 1.0)) * turn.transpose();
+        let (q, v) = eigen(m);
+        let r = Mat3::from_quat(q);
+        let again = r * Mat3::from_diagonal(v) * r.transpose();
+        assert!(again.abs_diff_eq(m, 1e-5), "{again} {m}");
+    }
+}

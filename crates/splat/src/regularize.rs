@@ -1,0 +1,226 @@
+//! Losses of the splats themselves, whatever they look like, and their gradients.
+//!
+//! Symbols: `o` opacity, `s` standard deviations in units of the scene's extent, each a mean over the splats that the
+//! frame saw: `opacity o + opacity_square o^2 + scale mean(s) + covariance |Sigma|_F^2`. The first and third are those of 3DGS-MCMC
+//! (Kheradmand et al. 2024, eq. 10), the others CurriculumGS's (`|Sigma|_F^2` is the sum of `s^4`).
+
+use crate::{SplatGradients, Splats};
+use irradia_compute::each;
+use irradia_compute::simd::{Kernel, Lanes, Level, Mask, Simd};
+
+/// Weights of the parts.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Regularizers {
+    /// Of the opacity.
+    pub opacity: f32,
+    /// Of its square.
+    pub opacity_square: f32,
+    /// Of the mean standard deviation.
+    pub scale: f32,
+    /// Of the squared Frobenius norm of the covariance.
+    pub covariance: f32,
+}
+
+impl Regularizers {
+    /// Whether there is anything to do.
+    pub fn is_zero(&self) -> bool {
+        *self == Self::default()
+    }
+}
+
+/// Adds the gradients of the active splats to `gradients`; returns the loss. `extent` is the scene's, world units.
+pub fn add_gradients(
+    level: Level,
+    splats: &Splats,
+    weights: &Regularizers,
+    extent: f32,
+    gradients: &mut SplatGradients,
+) -> f64 {
+    let active = gradients.active.iter().filter(|a| **a != 0.0).count();
+    if active == 0 {
+        return 0.0;
+    }
+    level.run(AddGradients {
+        splats,
+        weights,
+        extent,
+        share: 1.0 / active as f64,
+        gradients,
+    })
+}
+
+struct AddGradients<'a> {
+    splats: &'a Splats,
+    weights: &'a Regularizers,
+    extent: f32,
+    share: f64,
+    gradients: &'a mut SplatGradients,
+}
+
+impl Kernel for AddGradients<'_> {
+    type Output = f64;
+
+    #[inline(always)]
+    fn run<S: Simd>(self, simd: S) -> f64
+    where
+        S::F: Lanes<Scalar = f32>,
+    {
+        let weights = WeightLanes::new(simd, self.weights, f64::from(self.extent), self.share);
+        let zero = simd.splat(0.0);
+        let mut total = 0.0f64;
+        for at in (0..self.splats.len()).step_by(S::LANES) {
+            let active = zero.lt(simd.load(&self.gradients.active[at..]));
+            if active.none() {
+                continue;
+            }
+            let log_scale = each!(c in 3 => simd.load(&self.splats.log_scales.plane(c)[at..]));
+            let logit = simd.load(&self.splats.opacity_logits.plane(0)[at..]);
+            let (value, v_log_scale, v_logit) = regularizer(&weights, log_scale, logit);
+            total += f64::from(value.zero_where_not(active).sum());
+            for c in 0..3 {
+                let to = &mut self.gradients.splats.log_scales.plane_mut(c)[at..];
+                (simd.load(to) + v_log_scale[c]).store(to);
+            }
+            let to = &mut self.gradients.splats.opacity_logits.plane_mut(0)[at..];
+            (simd.load(to) + v_logit).store(to);
+        }
+        total
+    }
+}
+
+struct WeightLanes<F> {
+    opacity: F,
+    opacity_square: F,
+    scale: F,
+    covariance: F,
+}
+
+impl<F: Lanes> WeightLanes<F> {
+    #[inline(always)]
+    fn new<S: Simd<F = F>>(simd: S, weights: &Regularizers, extent: f64, share: f64) -> Self {
+        Self {
+            opacity: simd.splat(f64::from(weights.opacity) * share),
+            opacity_square: simd.splat(f64::from(weights.opacity_square) * share),
+            scale: simd.splat(f64::from(weights.scale) * share / (3.0 * extent)),
+            covariance: simd.splat(f64::from(weights.covariance) * share / extent.powi(4)),
+        }
+    }
+}
+
+/// One splat's part of the loss and its gradients.
+#[inline(always)]
+fn regularizer<F: Lanes>(w: &WeightLanes<F>, log_scale: [F; 3], logit: F) -> (F, [F; 3], F) {
+    let one = logit.splat(1.0);
+    let s = each!(c in 3 => crate::render::exp(log_scale[c]));
+    let squares = each!(c in 3 => s[c] * s[c]);
+    let o = one / (one + crate::render::exp(-logit));
+    let frobenius = squares[0] * squares[0] + squares[1] * squares[1] + squares[2] * squares[2];
+    let value = w.opacity * o + w.opacity_square * o * o + w.scale * (s[0] + s[1] + s[2]) + w.covariance * frobenius;
+    let four = one.splat(4.0);
+    let v_log_scale = each!(c in 3 => w.scale * s[c] + w.covariance * four * squares[c] * squares[c]);
+    let v_o = w.opacity + (w.opacity_square + w.opacity_square) * o;
+    (value, v_log_scale, v_o * o * (one - o))
+}
+
+/// Raises the smaller standard deviations until no covariance has a condition number above `limit`.
+pub fn cap_condition(splats: &mut Splats, limit: f32) {
+    // The condition number of the covariance is the squared ratio of the standard deviations.
+    let span = 0.5 * limit.max(1.0).ln();
+    for i in 0..splats.len() {
+        let s: [f32; 3] = std::array::from_fn(|c| splats.log_scales.get(c, i));
+        let low = s.into_iter().fold(f32::MIN, f32::max) - span;
+        for (c, v) in s.into_iter().enumerate() {
+            if v < low {
+                splats.log_scales.set(c, i, low);
+            }
+        }
+    }
+}
+
+/// Rests all but the `share` of the visible splats that are largest: their gradients no longer count.
+pub fn rest_small(splats: &Splats, share: f32, gradients: &mut SplatGradients) {
+    let size = |i: usize| (0..3).map(|c| splats.log_scales.get(c, i)).fold(f32::MIN, f32::max);
+    let mut sizes: Vec<f32> = (0..splats.len())
+        .filter(|i| gradients.active[*i] != 0.0)
+        .map(size)
+        .collect();
+    let rests = ((1.0 - share) * sizes.len() as f32).round() as usize;
+    if rests == 0 || sizes.is_empty() {
+        return;
+    }
+    let at = rests.min(sizes.len() - 1);
+    let limit = *sizes.select_nth_unstable_by(at, f32::total_cmp).1;
+    for i in 0..splats.len() {
+        if size(i) < limit {
+            gradients.active[i] = 0.0;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use irradia_compute::simd::Double;
+    use irradia_scene::Rng;
+
+    #[test]
+    fn finite_differences_hold_the_gradients() {
+        let mut rng = Rng::new(8, 8);
+        for weights in [
+            [1.0, 0.0, 0.0, 0.0],
+            [0.0, 1.0, 0.0, 0.0],
+            [0.0, 0.0, 1.0, 0.0],
+            [0.0, 0.0, 0.0, 1.0],
+            [0.1, 0.7, 0.3, 0.2],
+        ] {
+            let [opacity, opacity_square, scale, covariance] = weights;
+            let weights = Regularizers {
+                opacity,
+                opacity_square,
+                scale,
+                covariance,
+            };
+            let w = WeightLanes::new(Double, &weights, 1.7, 0.25);
+            let x: [f64; 4] = std::array::from_fn(|_| f64::from(rng.range(-2.0, 1.0)));
+            let value = |x: [f64; 4]| regularizer(&w, [x[0], x[1], x[2]], x[3]).0;
+            let (_, v_log_scale, v_logit) = regularizer(&w, [x[0], x[1], x[2]], x[3]);
+            for i in 0..4 {
+                let h = 1e-5;
+                let moved = |h: f64| {
+                    let mut x = x;
+                    x[i] += h;
+                    value(x)
+                };
+                let want = (moved(h) - moved(-h)) / (2.0 * h);
+                let got = if i < 3 { v_log_scale[i] } else { v_logit };
+                assert!((got - want).abs() < 1e-8, "{weights:?} {i}: {got} {want}");
+            }
+        }
+    }
+
+    #[test]
+    fn the_condition_number_is_capped_from_below() {
+        let mut splats = Splats::zeros(1, 0);
+        splats.log_scales.set(0, 0, -9.0);
+        cap_condition(&mut splats, 100.0);
+        let s: [f32; 3] = std::array::from_fn(|c| splats.log_scales.get(c, 0));
+        assert_eq!((s[1], s[2]), (0.0, 0.0));
+        assert!((s[0] + 10.0f32.ln()).abs() < 1e-6);
+    }
+
+    #[test]
+    fn only_the_largest_are_trained() {
+        let mut splats = Splats::zeros(10, 0);
+        for i in 0..10 {
+            splats.log_scales.set(1, i, i as f32);
+        }
+        let mut gradients = SplatGradients {
+            active: vec![1.0; splats.stride()],
+            ..Default::default()
+        };
+        gradients.active[9] = 0.0;
+        rest_small(&splats, 1.0 / 3.0, &mut gradients);
+        let trained: Vec<usize> = (0..10).filter(|i| gradients.active[*i] != 0.0).collect();
+        assert_eq!(trained, [6, 7, 8]);
+    }
+}

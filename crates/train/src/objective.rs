@@ -1,0 +1,217 @@
+//! What a frame is compared by: every loss of the plan, added up with its gradients.
+
+use crate::photos::Prepared;
+use crate::schedule::Losses;
+use irradia_measure::{
+    CoarseLoss, Crop, DepthKind, DepthLoss, DepthSample, Lpips, PhotometricLoss, SmoothLoss, Smoothed, Target, Truth,
+    perceptual,
+};
+use irradia_scene::Rng;
+use irradia_splat::{Gather, OutputGradient, Renderer};
+use rayon::prelude::*;
+use std::sync::Arc;
+
+/// Side of the square that LPIPS looks at in a step, pixels.
+const PATCH: usize = 128;
+/// How sharply an edge of the photograph permits one in depth: of 0.1 counts 1 / e (Godard et al. 2017 have 1 for colours
+/// that were normalised otherwise).
+const EDGE_SHARPNESS: f32 = 10.0;
+
+/// All losses with their working memory, and the gradients that the last frame had.
+pub struct Objective {
+    /// Weights of the perceptual loss, which is left out without them.
+    pub lpips: Option<Arc<Lpips>>,
+    photometric: PhotometricLoss,
+    coarse: CoarseLoss,
+    depth: DepthLoss,
+    smooth: SmoothLoss,
+    /// The photograph over a background that is not its own.
+    recolored: Vec<u8>,
+    v_color: Vec<f32>,
+    v_alpha: Vec<f32>,
+    v_depth: Vec<f32>,
+    error: Vec<f32>,
+    has: Has,
+}
+
+/// Which gradients the last frame had.
+#[derive(Clone, Copy, Default)]
+struct Has {
+    alpha: bool,
+    depth: bool,
+}
+
+/// What a frame's loss was.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ObjectiveValues {
+    /// The weighted sum.
+    pub total: f64,
+    /// Mean absolute difference.
+    pub l1: f64,
+    /// Mean squared difference.
+    pub mse: f64,
+}
+
+/// What a frame is compared with.
+pub struct Reference<'a> {
+    /// The photograph.
+    pub photo: &'a Prepared,
+    /// What lies behind the photograph and behind the frame, where that changes from step to step.
+    pub background: Option<[f32; 3]>,
+    /// Known depths.
+    pub depths: &'a [DepthSample],
+}
+
+impl Objective {
+    /// With nothing evaluated.
+    pub fn new(lpips: Option<Arc<Lpips>>) -> Self {
+        Self {
+            lpips,
+            photometric: PhotometricLoss::new(),
+            coarse: CoarseLoss::default(),
+            depth: DepthLoss::default(),
+            smooth: SmoothLoss::default(),
+            recolored: Vec::new(),
+            v_color: Vec::new(),
+            v_alpha: Vec::new(),
+            v_depth: Vec::new(),
+            error: Vec::new(),
+            has: Has::default(),
+        }
+    }
+
+    /// Compares the last frame of `renderer`; where depth has a weight it was rendered with depth.
+    pub fn evaluate(
+        &mut self,
+        renderer: &Renderer,
+        reference: &Reference,
+        losses: &Losses,
+        rng: &mut Rng,
+    ) -> ObjectiveValues {
+        let photo = reference.photo;
+        let (width, height) = (photo.width as usize, photo.height as usize);
+        let pixels = width * height;
+        let rgb = match (reference.background, &photo.alpha) {
+            (Some(background), Some(alpha)) => {
+                photo.recolor(alpha, background, &mut self.recolored);
+                &self.recolored
+            }
+            _ => &photo.rgb,
+        };
+        let target = Target {
+            width,
+            height,
+            truth: Truth::Rgb8(rgb),
+            mask: photo.mask.as_deref(),
+        };
+        let color = renderer.color();
+        self.v_color.resize(3 * pixels, 0.0);
+        let values = self
+            .photometric
+            .evaluate(color, &target, &losses.photometric, &mut self.v_color);
+        let mut total = values.total;
+        if losses.coarse > 0.0 {
+            let factor = losses.coarse_factor;
+            let loss = self
+                .coarse
+                .evaluate(color, &target, factor, losses.coarse, &mut self.v_color);
+            total += f64::from(losses.coarse) * loss;
+        }
+        if let Some(lpips) = self.lpips.as_ref().filter(|_| losses.perceptual > 0.0) {
+            let crop = Crop::random(width, height, PATCH, rng);
+            // An image too small for the network has no perceptual loss.
+            if let Ok(loss) = perceptual(lpips, color, &target, crop, losses.perceptual, &mut self.v_color) {
+                total += f64::from(losses.perceptual) * loss;
+            }
+        }
+        let depths = losses.depth > 0.0 || losses.smooth > 0.0;
+        self.has = Has {
+            depth: depths,
+            alpha: depths || losses.alpha > 0.0 && photo.alpha.is_some(),
+        };
+        if self.has.alpha {
+            self.v_alpha.clear();
+            self.v_alpha.resize(pixels, 0.0);
+        }
+        if let Some(alpha) = photo.alpha.as_ref().filter(|_| losses.alpha > 0.0) {
+            total += compare_alpha(renderer.alpha(), alpha, losses.alpha, &mut self.v_alpha);
+        }
+        if depths {
+            self.v_depth.clear();
+            self.v_depth.resize(pixels, 0.0);
+            let frame = (renderer.depth(), renderer.alpha());
+            let (v_depth, v_alpha) = (&mut self.v_depth, &mut self.v_alpha);
+            if losses.depth > 0.0 {
+                let kind = DepthKind::Metric;
+                let values =
+                    self.depth
+                        .evaluate(frame.0, frame.1, reference.depths, kind, losses.depth, v_depth, v_alpha);
+                total += f64::from(losses.depth) * values.loss;
+            }
+            if losses.smooth > 0.0 {
+                let (of, k) = (Smoothed::Disparity, EDGE_SHARPNESS);
+                let loss = self
+                    .smooth
+                    .evaluate(frame.0, frame.1, &target, of, k, losses.smooth, v_depth, v_alpha);
+                total += f64::from(losses.smooth) * loss;
+            }
+        }
+        ObjectiveValues {
+            total,
+            l1: values.l1,
+            mse: values.mse,
+        }
+    }
+
+    /// The mean absolute difference of each pixel of the frame last evaluated, for [`Gather::Error`].
+    pub fn error(&mut self, color: &[f32], photo: &Prepared, recolored: bool) {
+        let (width, pixels) = (photo.width as usize, photo.rgb.len() / 3);
+        let rgb = if recolored { &self.recolored } else { &photo.rgb };
+        self.error.resize(pixels, 0.0);
+        self.error.par_chunks_mut(width).enumerate().for_each(|(y, row)| {
+            for (x, error) in row.iter_mut().enumerate() {
+                let at = y * width + x;
+                let counts = photo.mask.as_ref().is_none_or(|mask| mask[at] != 0);
+                let difference = |c: usize| (color[c * pixels + at] - f32::from(rgb[3 * at + c]) * (1.0 / 255.0)).abs();
+                *error = if counts {
+                    (difference(0) + difference(1) + difference(2)) * (1.0 / 3.0)
+                } else {
+                    0.0
+                };
+            }
+        });
+    }
+
+    /// The mean of what [`Objective::error`] left.
+    pub fn mean_error(&self) -> f64 {
+        self.error.iter().map(|e| f64::from(*e)).sum::<f64>() / self.error.len().max(1) as f64
+    }
+
+    /// The gradients of the frame last evaluated; `gather` is left to the caller.
+    pub fn gradient(&self) -> OutputGradient<'_> {
+        OutputGradient {
+            alpha: self.has.alpha.then_some(&self.v_alpha[..]),
+            depth: self.has.depth.then_some(&self.v_depth[..]),
+            ..OutputGradient::of_color(&self.v_color)
+        }
+    }
+
+    /// What [`Objective::error`] left.
+    pub fn gather_error(&self) -> Gather<'_> {
+        Gather::Error(&self.error)
+    }
+}
+
+/// Mean |got - want|, weighted; adds its gradient to `v_alpha`.
+fn compare_alpha(got: &[f32], want: &[u8], weight: f32, v_alpha: &mut [f32]) -> f64 {
+    let weight = weight / got.len() as f32;
+    let mut sum = 0.0f64;
+    for ((v, got), want) in v_alpha.iter_mut().zip(got).zip(want) {
+        let difference = got - f32::from(*want) / 255.0;
+        sum += f64::from(difference.abs());
+        if difference != 0.0 {
+            *v += weight * difference.signum();
+        }
+    }
+    f64::from(weight) * sum
+}

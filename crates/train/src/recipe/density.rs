@@ -1,0 +1,212 @@
+//! How a stage adds, removes and merges splats: the knobs of each strategy, with sizes in units of the scene's extent.
+
+use irradia_splat::Statistics;
+use irradia_splat::densify::classic::ClassicOptions;
+use irradia_splat::densify::fast::FastOptions;
+use irradia_splat::densify::mcmc::McmcOptions;
+use irradia_splat::densify::merge::MergeOptions;
+use irradia_splat::densify::taming::{ScoreWeights, TamingOptions};
+use serde::{Deserialize, Serialize};
+
+/// A strategy.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "strategy", rename_all = "snake_case")]
+pub enum Density {
+    /// Clone, split, prune and reset, as in 3DGS; also AbsGS's variant of it.
+    Classic(ClassicKnobs),
+    /// Relocation and growth by opacity, as in 3DGS-MCMC.
+    Mcmc(McmcKnobs),
+    /// Growth to an exact number by score, as in Taming 3DGS.
+    Taming(TamingKnobs),
+    /// Splits where the pictures are wrong, to a planned number.
+    Fast(FastKnobs),
+}
+
+impl Density {
+    /// Steps (of the run, not stretched) between rounds.
+    pub fn every(&self) -> u64 {
+        match self {
+            Density::Classic(knobs) => knobs.every,
+            Density::Mcmc(knobs) => knobs.every,
+            Density::Taming(knobs) => knobs.every,
+            Density::Fast(knobs) => knobs.every,
+        }
+    }
+
+    /// Steps (of the run, not stretched) between resets of the opacities and what they are lowered to.
+    pub fn reset(&self) -> Option<(u64, f32)> {
+        match self {
+            Density::Classic(knobs) => (knobs.reset_every > 0).then_some((knobs.reset_every, knobs.reset_to)),
+            Density::Mcmc(_) | Density::Taming(_) | Density::Fast(_) => None,
+        }
+    }
+
+    /// What has to be gathered for it.
+    pub fn statistics(&self) -> Statistics {
+        match self {
+            Density::Classic(knobs) if knobs.absolute => Statistics::AbsoluteGradient,
+            Density::Classic(_) | Density::Mcmc(_) => Statistics::Gradient,
+            Density::Taming(_) | Density::Fast(_) => Statistics::Error,
+        }
+    }
+}
+
+/// Knobs of [`irradia_splat::densify::classic`].
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ClassicKnobs {
+    /// Steps (of the run, not stretched) between rounds.
+    pub every: u64,
+    /// Mean screen gradient, normalised device coordinates, from which a splat is densified.
+    pub gradient_threshold: f32,
+    /// Whether the gradients of a splat's fragments are added absolutely (AbsGS).
+    #[serde(default)]
+    pub absolute: bool,
+    /// Whether clones share the opacity of what they copy.
+    #[serde(default)]
+    pub revised_opacity: bool,
+    /// Size that divides what is cloned from what is split, in units of the scene's extent.
+    pub small: f32,
+    /// Opacity below which a splat is removed.
+    pub min_opacity: f32,
+    /// Half size on screen above which a splat is removed, pixels, once opacities were reset.
+    pub max_extent: f32,
+    /// World size above which a splat is removed, in units of the scene's extent, once opacities were reset.
+    pub max_scale: f32,
+    /// Steps (of the run, not stretched) between resets of the opacities; 0 for never.
+    pub reset_every: u64,
+    /// What opacities are lowered to.
+    pub reset_to: f32,
+}
+
+impl ClassicKnobs {
+    /// With sizes in world units.
+    pub fn options(&self, extent: f32, prune_large: bool, max_splats: usize) -> ClassicOptions {
+        ClassicOptions {
+            gradient_threshold: self.gradient_threshold,
+            small: self.small * extent,
+            min_opacity: self.min_opacity,
+            max_extent: prune_large.then_some(self.max_extent),
+            max_scale: self.max_scale * extent,
+            max_splats,
+            revised_opacity: self.revised_opacity,
+        }
+    }
+}
+
+/// Knobs of [`irradia_splat::densify::mcmc`].
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct McmcKnobs {
+    /// Steps (of the run, not stretched) between rounds.
+    pub every: u64,
+    /// Factor on the number of splats in `every` recipe steps.
+    pub growth: f32,
+    /// Opacity from which down a splat is dead.
+    pub min_opacity: f32,
+}
+
+impl McmcKnobs {
+    /// For a run in which `pace` recipe steps go by in one step.
+    pub fn options(&self, pace: f64, max_splats: usize) -> McmcOptions {
+        McmcOptions {
+            min_opacity: self.min_opacity,
+            growth: f64::from(self.growth).powf(pace) as f32,
+            max_splats,
+        }
+    }
+}
+
+/// Knobs of [`irradia_splat::densify::taming`].
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct TamingKnobs {
+    /// Steps (of the run, not stretched) between rounds.
+    pub every: u64,
+    /// Size that divides what is cloned from what is split, in units of the scene's extent.
+    pub small: f32,
+    /// Opacity below which a splat is removed.
+    pub min_opacity: f32,
+    /// How much each part of the score counts: mean screen gradient,
+    pub score_gradient: f32,
+    /// mean error shown,
+    pub score_error: f32,
+    /// pixels covered,
+    pub score_pixels: f32,
+    /// opacity,
+    pub score_opacity: f32,
+    /// half size on screen,
+    pub score_extent: f32,
+    /// and world size.
+    pub score_scale: f32,
+}
+
+impl TamingKnobs {
+    /// With sizes in world units.
+    pub fn options(&self, extent: f32, target: usize) -> TamingOptions {
+        TamingOptions {
+            target,
+            small: self.small * extent,
+            min_opacity: self.min_opacity,
+            weights: ScoreWeights {
+                gradient: self.score_gradient,
+                error: self.score_error,
+                pixels: self.score_pixels,
+                opacity: self.score_opacity,
+                extent: self.score_extent,
+                scale: self.score_scale,
+            },
+        }
+    }
+}
+
+/// Knobs of [`irradia_splat::densify::fast`].
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct FastKnobs {
+    /// Steps (of the run, not stretched) between rounds.
+    pub every: u64,
+    /// Opacity below which a splat is removed.
+    pub min_opacity: f32,
+    /// Mean weight a frame, in pixels, below which a splat is removed.
+    pub min_weight: f32,
+    /// Mean error a frame, mean absolute colour difference times pixels, from which a splat is cut in two.
+    pub error_threshold: f32,
+    /// Half size on screen in pixels from which a splat is worth cutting.
+    pub min_extent: f32,
+}
+
+impl FastKnobs {
+    /// For at most `target` splats after the round.
+    pub fn options(&self, target: usize) -> FastOptions {
+        FastOptions {
+            target,
+            min_opacity: self.min_opacity,
+            min_weight: self.min_weight,
+            error_threshold: self.error_threshold,
+            min_extent: self.min_extent,
+        }
+    }
+}
+
+/// When and what a stage merges ([`irradia_splat::densify::merge`]).
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct MergeKnobs {
+    /// Steps (of the run, not stretched) between rounds.
+    pub every: u64,
+    /// How near, in units of the smaller splat's median axis.
+    pub distance: f32,
+    /// How alike, in any channel of the base colour.
+    pub color: f32,
+}
+
+impl MergeKnobs {
+    /// As the strategy takes it.
+    pub fn options(&self) -> MergeOptions {
+        MergeOptions {
+            distance: self.distance,
+            color: self.color,
+        }
+    }
+}

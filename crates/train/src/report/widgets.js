@@ -1,0 +1,146 @@
+"use strict";
+// What the pages share: text, a divider between two pictures, and charts.
+const at = (id) => document.getElementById(id);
+const make = (name, text, attributes = {}) => {
+  const element = document.createElement(name);
+  if (text !== undefined) element.textContent = text;
+  for (const [key, value] of Object.entries(attributes)) element.setAttribute(key, value);
+  return element;
+};
+
+// A number that was not finite arrives as null and is shown as a dash.
+const known = (x) => typeof x === "number" && Number.isFinite(x);
+const fixed = (x, digits) => (known(x) ? x.toFixed(digits) : "–");
+const whole = (x) => (known(x) ? Math.round(x).toLocaleString("en") : "–");
+const duration = (s) => {
+  if (!known(s)) return "–";
+  if (s < 60) return `${s.toFixed(1)} s`;
+  const [minutes, rest] = [Math.floor(Math.round(s) / 60), Math.round(s) % 60];
+  return minutes < 60 ? `${minutes} min ${rest} s` : `${Math.floor(minutes / 60)} h ${minutes % 60} min`;
+};
+const bytes = (b) => (!b ? "–" : b < 1e9 ? `${Math.round(b / 1e6)} MB` : `${(b / 1e9).toFixed(1)} GB`);
+const address = (path) => path.split("/").map(encodeURIComponent).join("/");
+
+// A divider over two pictures that lie on each other; the second has the class "over".
+const slider = (frame) => {
+  let divide = 50;
+  const slide = (percent) => {
+    divide = Math.min(100, Math.max(0, percent));
+    frame.style.setProperty("--at", `${divide}%`);
+    frame.setAttribute("aria-valuenow", String(Math.round(divide)));
+    frame.setAttribute("aria-valuetext", `${Math.round(divide)} percent of the left picture`);
+  };
+  const follow = (event) => {
+    const box = frame.getBoundingClientRect();
+    slide((100 * (event.clientX - box.left)) / box.width);
+  };
+  frame.addEventListener("pointerdown", (event) => {
+    frame.setPointerCapture(event.pointerId);
+    follow(event);
+  });
+  frame.addEventListener("pointermove", (event) => {
+    if (frame.hasPointerCapture(event.pointerId)) follow(event);
+  });
+  frame.addEventListener("keydown", (event) => {
+    const step = event.shiftKey ? 10 : 2;
+    const to = { ArrowLeft: divide - step, ArrowDown: divide - step, ArrowRight: divide + step, ArrowUp: divide + step,
+      PageDown: divide - 10, PageUp: divide + 10, Home: 0, End: 100 }[event.key];
+    if (to === undefined) return;
+    event.preventDefault();
+    slide(to);
+  });
+  slide(50);
+};
+
+const svg = (name, attributes, text) => {
+  const element = document.createElementNS("http://www.w3.org/2000/svg", name);
+  for (const [key, value] of Object.entries(attributes)) element.setAttribute(key, value);
+  if (text !== undefined) element.textContent = text;
+  return element;
+};
+const short = (x) => {
+  const size = Math.abs(x);
+  if (size >= 1e6) return `${+(x / 1e6).toFixed(1)}M`;
+  if (size >= 1e4) return `${+(x / 1e3).toFixed(1)}k`;
+  return String(+x.toPrecision(3));
+};
+// Round numbers that part low..high into about four.
+const ticks = (low, high) => {
+  const rough = (high - low) / 4, power = 10 ** Math.floor(Math.log10(rough));
+  const step = [1, 2, 5, 10].map((m) => m * power).find((s) => s >= rough);
+  const list = [];
+  for (let number = Math.ceil(low / step - 1e-9); number * step <= high + step * 1e-9; number++) list.push(number * step);
+  return list;
+};
+
+// Lines { color, points: [{ x, y }], name } in a box of width x height units that scales with the page.
+const chart = (title, lines, { smooth = false, zero = false, digits = 0, unit = "", width = 340, height = 190 } = {}) => {
+  const LEFT = 46, RIGHT = 8, TOP = 8, BOTTOM = 22;
+  const box = make("div", undefined, { class: "curve" });
+  const head = make("h3", title);
+  const lone = lines.length === 1 ? lines[0].points : [];
+  const last = lone.length ? `${fixed(lone[lone.length - 1].y, digits)}${unit}` : lines.length === 1 ? "–" : "";
+  const output = make("output", last);
+  head.append(output);
+  box.append(head);
+  const picture = svg("svg", { viewBox: `0 0 ${width} ${height}`, role: "img", "aria-label": `${title} over the run` });
+  box.append(picture);
+  const all = lines.flatMap((line) => line.points.map((p) => ({ ...p, line })));
+  if (all.length < 2) {
+    picture.append(svg("text", { x: width / 2, y: height / 2, "text-anchor": "middle" }, "not measured during the run"));
+    return box;
+  }
+  const [xs, ys] = [all.map((p) => p.x), all.map((p) => p.y)];
+  const span = (list) => [list.reduce((a, b) => Math.min(a, b)), list.reduce((a, b) => Math.max(a, b))];
+  const [x0, x1] = span(xs);
+  let [y0, y1] = span(ys);
+  // One wild first value must not flatten the rest.
+  if (smooth) y1 = Math.min(y1, [...ys].sort((a, b) => a - b)[Math.floor(0.99 * (ys.length - 1))] * 1.25);
+  if (zero) y0 = 0;
+  if (y1 <= y0) y1 = y0 + (Math.abs(y0) || 1);
+  const px = (x) => LEFT + ((x - x0) / (x1 - x0 || 1)) * (width - LEFT - RIGHT);
+  const py = (y) => height - BOTTOM - ((Math.min(y, y1) - y0) / (y1 - y0)) * (height - TOP - BOTTOM);
+  for (const y of ticks(y0, y1)) {
+    picture.append(svg("line", { x1: LEFT, x2: width - RIGHT, y1: py(y), y2: py(y), class: "grid" }));
+    picture.append(svg("text", { x: LEFT - 6, y: py(y) + 4, "text-anchor": "end" }, short(y)));
+  }
+  const marks = x1 > x0 ? ticks(x0, x1) : [x0];
+  marks.forEach((x) => {
+    const anchor = px(x) > width - 24 ? "end" : "middle";
+    picture.append(svg("text", { x: px(x), y: height - 6, "text-anchor": anchor }, short(x)));
+  });
+  const path = (list) => `M${list.map((p) => `${px(p.x).toFixed(1)} ${py(p.y).toFixed(1)}`).join("L")}`;
+  for (const { color, points } of lines) {
+    if (!points.length) continue;
+    const style = `stroke: ${color}`;
+    if (smooth && points.length > 40) {
+      picture.append(svg("path", { d: path(points), class: "raw", style }));
+      const reach = Math.ceil(points.length / 40);
+      const means = points.map((p, index) => {
+        const part = points.slice(Math.max(0, index - reach), index + reach + 1);
+        return { x: p.x, y: part.reduce((sum, q) => sum + q.y, 0) / part.length };
+      });
+      picture.append(svg("path", { d: path(means), style }));
+    } else picture.append(svg("path", { d: path(points), style }));
+  }
+  const cursor = svg("line", { y1: TOP, y2: height - BOTTOM, class: "cursor", visibility: "hidden" });
+  picture.append(cursor);
+  picture.addEventListener("pointermove", (event) => {
+    const frame = picture.getBoundingClientRect();
+    const x = ((event.clientX - frame.left) / frame.width) * width;
+    const y = ((event.clientY - frame.top) / frame.height) * height;
+    // Where there is one line its height does not matter.
+    const far = (p) => Math.abs(px(p.x) - x) + (lines.length > 1 ? Math.abs(py(p.y) - y) : 0);
+    const near = all.reduce((a, b) => (far(b) < far(a) ? b : a));
+    cursor.setAttribute("x1", px(near.x));
+    cursor.setAttribute("x2", px(near.x));
+    cursor.setAttribute("visibility", "visible");
+    const name = near.line.name ? `${near.line.name} ` : "";
+    output.textContent = `${name}${fixed(near.y, digits)}${unit} at ${short(near.x)}`;
+  });
+  picture.addEventListener("pointerleave", () => {
+    cursor.setAttribute("visibility", "hidden");
+    output.textContent = last;
+  });
+  return box;
+};

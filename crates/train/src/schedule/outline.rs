@@ -1,0 +1,52 @@
+//! A recipe's whole plan at a glance, to be printed and drawn.
+
+use super::{Clock, Signal, values};
+use crate::recipe::{Param, Recipe};
+
+/// The knobs at one time.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Moment {
+    /// Recipe steps gone by.
+    pub time: f64,
+    /// Index of the stage.
+    pub stage: usize,
+    /// By [`Param::ALL`].
+    pub values: [f64; Param::ALL.len()],
+}
+
+/// `recipe` at `moments` times, evenly over its steps and at both ends of every stage, as if no stage ended early.
+pub fn outline(recipe: &Recipe, moments: usize) -> Vec<Moment> {
+    let pace = recipe.total_steps() as f64 / moments.max(1) as f64;
+    let mut clock = Clock::new(recipe);
+    let mut plan = Vec::new();
+    let mut recipe = recipe.clone();
+    for stage in &mut recipe.stage {
+        stage.exit = None;
+    }
+    while !clock.finished(&recipe) {
+        let moment = |clock: &Clock| Moment {
+            time: clock.time,
+            stage: clock.stage,
+            values: values(&recipe, clock),
+        };
+        plan.push(moment(&clock));
+        let left = clock.stage_time + recipe.stage[clock.stage].steps as f64 - clock.time;
+        let signal = Signal {
+            error: 0.0,
+            measured: None,
+            views: 1,
+        };
+        if left > pace {
+            clock.tick(&recipe, pace, signal);
+        } else {
+            let last = Clock {
+                time: clock.time + left * (1.0 - 1e-9),
+                progress: clock.progress + left * (1.0 - 1e-9),
+                ..clock.clone()
+            };
+            plan.push(moment(&last));
+            clock.tick(&recipe, left, signal);
+        }
+    }
+    plan
+}

@@ -1,0 +1,56 @@
+//! The training error as stages are left by it: S, the mean L1 over the training views (CurriculumGS).
+
+use crate::recipe::Exit;
+
+/// A running estimate of S since the stage began.
+#[derive(Clone, Copy, Debug, PartialEq, Default)]
+pub struct Watch {
+    /// Its value.
+    pub mean: f64,
+    /// Steps it has seen.
+    pub steps: u64,
+    /// Its value when every view had been seen once.
+    pub start: f64,
+    /// The least that it was at a time that counted.
+    pub best: f64,
+    /// Recipe steps into the stage when it was.
+    pub best_time: f64,
+}
+
+/// Views beyond which the estimate forgets: as many steps as it averages over at most.
+const LONGEST: u64 = 100;
+/// Steps between measurements of S where a stage may end by its value.
+pub const MEASURE_EVERY: u64 = 100;
+
+impl Watch {
+    /// Takes in a step's error, and S itself where it was measured; `time` is in recipe steps since the stage began.
+    pub fn observe(&mut self, error: f64, measured: Option<f64>, views: u64, time: f64) {
+        self.steps += 1;
+        let window = views.clamp(1, LONGEST);
+        // A plain mean until the window is full, then an exponential one.
+        self.mean += (error - self.mean) / self.steps.min(window) as f64;
+        if let Some(measured) = measured {
+            self.mean = measured;
+        }
+        if self.steps == window {
+            (self.start, self.best, self.best_time) = (self.mean, self.mean, time);
+        }
+    }
+
+    /// Whether `exit` lets the stage end. Never before every view (or a hundred) has been seen.
+    pub fn ends(&mut self, exit: &Exit, views: u64, time: f64) -> bool {
+        if self.steps < views.clamp(1, LONGEST) {
+            return false;
+        }
+        match *exit {
+            Exit::Threshold { tau } => self.mean < tau,
+            Exit::Relative { ratio } => self.mean < ratio * self.start,
+            Exit::Plateau { drop, window } => {
+                if self.mean < self.best * (1.0 - drop) {
+                    (self.best, self.best_time) = (self.mean, time);
+                }
+                time - self.best_time >= window as f64
+            }
+        }
+    }
+}

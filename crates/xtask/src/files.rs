@@ -6,8 +6,8 @@ const LONGEST: usize = 800;
 /// Names that say nothing about what is inside.
 const NAMELESS: [&str; 4] = ["utils", "helpers", "misc", "common"];
 
-/// The one file that may ask which step it is.
-const SCHEDULE: &str = "schedule.rs";
+/// The one module that may ask which step it is.
+const SCHEDULE: &str = "crates/train/src/schedule/";
 
 /// One line for each rule that the file at `path` (relative, forward slashes) breaks.
 pub fn broken(path: &str, text: &str) -> Vec<String> {
@@ -21,7 +21,7 @@ pub fn broken(path: &str, text: &str) -> Vec<String> {
     if let Some(name) = folders.split('/').chain([stem]).find(|name| NAMELESS.contains(name)) {
         lines.push(format!("{path}: `{name}` names no idea; name it for what it holds"));
     }
-    if file != SCHEDULE {
+    if !path.starts_with(SCHEDULE) {
         for (number, line) in text.lines().enumerate() {
             if asks_the_step(line) {
                 let number = number + 1;
@@ -84,7 +84,7 @@ mod tests {
                 lines.len() == 1 && lines[0].starts_with("crates/train/src/trainer.rs:2: "),
                 "{lines:?}"
             );
-            assert!(broken("crates/train/src/schedule.rs", &text).is_empty());
+            assert!(broken("crates/train/src/schedule/mod.rs", &text).is_empty());
         }
         for text in [
             "// every step % 100",

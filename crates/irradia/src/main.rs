@@ -23,6 +23,10 @@ enum Command {
     Demo(command::demo::Args),
     /// Train a scene from posed photographs
     Train(command::train::Args),
+    /// Train several recipes under the same conditions and say how they did
+    Compare(command::compare::Args),
+    /// List the recipes, or show what one does when
+    Recipe(command::recipe::Args),
     /// Measure a scene against photographs: PSNR, SSIM, LPIPS
     Eval(command::eval::Args),
     /// Render a scene into PNG frames
@@ -51,6 +55,8 @@ fn main() -> ExitCode {
     let result = match Cli::parse().command {
         Command::Demo(args) => command::demo::run(&args),
         Command::Train(args) => command::train::run(&args),
+        Command::Compare(args) => command::compare::run(&args),
+        Command::Recipe(args) => command::recipe::run(&args),
         Command::Eval(args) => command::eval::run(&args),
         Command::Render(args) => command::render::run(&args),
         Command::Info(args) => command::files::info(&args),

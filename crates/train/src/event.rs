@@ -85,6 +85,8 @@ pub struct StepReport {
     pub step: u64,
     /// Seconds of training so far.
     pub seconds: f64,
+    /// Seconds of training still to come, as far as is known.
+    pub seconds_left: f64,
     /// Index of the view in the dataset.
     pub view: usize,
     /// The loss, weighted.

@@ -2,8 +2,10 @@
 #![forbid(unsafe_code)]
 
 pub mod checkpoint;
+pub mod compare;
 pub mod eval;
 pub mod event;
+mod forecast;
 mod objective;
 mod photos;
 pub mod recipe;

@@ -1,7 +1,8 @@
 //! The loop around [`Trainer::step`]: when to stop, when to look, whom to tell.
 
 use crate::eval::{Metrics, evaluate_views};
-use crate::event::{Event, Observer, Signal};
+use crate::event::{Event, Observer, Signal, StepReport};
+use crate::forecast::Forecast;
 use crate::schedule::{is_due, plan};
 use crate::trainer::{TrainError, Trainer};
 
@@ -40,16 +41,21 @@ pub fn run(
             seconds: 0.0,
         });
     }
-    let mut pacer = limits.budget.map(Pacer::new);
+    let mut forecast = Forecast::default();
     let mut signal = tell(trainer, &mut events, observers);
     let mut reason = None;
     while reason.is_none() && signal != Signal::Stop && !trainer.finished() {
-        if let Some(pacer) = &mut pacer {
-            pacer.adjust(trainer);
+        forecast.observe(trainer);
+        if let Some(budget) = limits.budget {
+            trainer.pace = forecast.pace(trainer, budget - trainer.seconds);
         }
         let due = plan(&trainer.recipe, &trainer.clock);
         let looks = due.evaluate || (limits.until_psnr.is_some() && is_due(&trainer.clock, UNTIL_PSNR_EVERY));
-        let report = trainer.step(&mut events)?;
+        let left = forecast.seconds_left(trainer);
+        let report = StepReport {
+            seconds_left: left,
+            ..trainer.step(&mut events)?
+        };
         events.insert(0, Event::Step(report));
         if looks && !trainer.dataset.test.is_empty() {
             let (step, seconds, splats) = (trainer.clock.step, trainer.seconds, trainer.state.len());
@@ -122,36 +128,4 @@ fn held_out_psnr(trainer: &Trainer) -> Result<f64, TrainError> {
         },
     )?;
     Ok(psnr.iter().sum::<f64>() / psnr.len() as f64)
-}
-
-/// Fits the recipe into a time: the pace of each step is what is left of the recipe over the steps that still fit.
-struct Pacer {
-    budget: f64,
-    /// The trainer's seconds before the last step.
-    before: Option<f64>,
-    seconds_a_step: Option<f64>,
-}
-
-impl Pacer {
-    fn new(budget: f64) -> Self {
-        Self {
-            budget,
-            before: None,
-            seconds_a_step: None,
-        }
-    }
-
-    fn adjust(&mut self, trainer: &mut Trainer) {
-        if let Some(before) = self.before {
-            let step = trainer.seconds - before;
-            // A moving mean over some 50 steps; the first step also warms caches and is let in at full weight.
-            self.seconds_a_step = Some(self.seconds_a_step.map_or(step, |mean| 0.98 * mean + 0.02 * step));
-        }
-        self.before = Some(trainer.seconds);
-        let left = (self.budget - trainer.seconds).max(0.0);
-        let recipe_left = trainer.recipe.total_steps() as f64 - trainer.clock.time;
-        // Before anything was measured: 10 ms, the order of a step on two cores.
-        let steps = (left / self.seconds_a_step.unwrap_or(0.01)).max(1.0);
-        trainer.pace = recipe_left / steps;
-    }
 }

@@ -269,6 +269,7 @@ impl Trainer {
         Ok(StepReport {
             step: self.clock.step,
             seconds: self.seconds,
+            seconds_left: 0.0,
             view: coming[0],
             loss: loss.total,
             mse: loss.mse,

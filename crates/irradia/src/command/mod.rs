@@ -1,10 +1,12 @@
 //! One file a command, and what several of them ask of the command line.
 
+pub mod compare;
 pub mod demo;
 pub mod eval;
 pub mod files;
 mod journal;
 mod progress;
+pub mod recipe;
 pub mod render;
 pub mod train;
 

@@ -1,7 +1,7 @@
 //! What a run shows on the terminal: a bar, or plain lines where there is no terminal.
 
 use crate::terminal::note;
-use indicatif::{ProgressBar, ProgressStyle};
+use indicatif::{HumanDuration, ProgressBar, ProgressStyle};
 use irradia_train::Trainer;
 use irradia_train::event::{Event, Observer, Signal, StepReport};
 use std::io::IsTerminal;
@@ -31,7 +31,7 @@ impl Progress {
     pub fn new(stop: Arc<AtomicBool>) -> Self {
         Self {
             bar: std::io::stderr().is_terminal().then(|| {
-                let style = "{bar:16} {pos}/{len} eta {eta} {wide_msg}";
+                let style = "{bar:16} {pos}/{len} {wide_msg}";
                 ProgressBar::new(0).with_style(ProgressStyle::with_template(style).expect("a valid template"))
             }),
             stop,
@@ -67,14 +67,15 @@ impl Progress {
             Some(bar) => {
                 bar.set_length(trainer.total_steps());
                 bar.set_position(report.step);
-                bar.set_message(message);
+                let left = HumanDuration(Duration::from_secs(report.seconds_left.round() as u64));
+                bar.set_message(format!("eta {left:#} {message}"));
             }
             None if self.last_line.elapsed() >= LINE_EVERY => {
-                let left = (trainer.total_steps() - report.step) as f64 / rate;
                 note(format_args!(
-                    "step {}/{} {message} eta {left:.0} s",
+                    "step {}/{} {message} eta {:.0} s",
                     report.step,
-                    trainer.total_steps()
+                    trainer.total_steps(),
+                    report.seconds_left
                 ));
                 self.last_line = Instant::now();
             }
@@ -96,10 +97,8 @@ impl Observer for Progress {
                 self.first_step = *step;
                 self.stage = trainer.stage_name().to_owned();
                 if let Some(bar) = &self.bar {
-                    // What an earlier session did must not count as done in no time.
                     bar.set_length(*total_steps);
                     bar.set_position(*step);
-                    bar.reset_eta();
                 }
                 self.say(&format!(
                     "{recipe}: {splats} splats, {views} views, {total_steps} steps"

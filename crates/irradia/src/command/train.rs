@@ -14,7 +14,9 @@ use irradia_measure::{Evaluation, Lpips};
 use irradia_scene::{Image, sh};
 use irradia_train::eval::{EvaluatedView, Metrics, evaluate_views, mean};
 use irradia_train::event::Observer;
-use irradia_train::report::{Report, ViewReport, machine, peak_rss_bytes, to_html};
+use irradia_train::recipe::Param;
+use irradia_train::report::{Report, ViewReport, machine, peak_rss_bytes, schedule, to_html};
+use irradia_train::schedule::{Moment, outline};
 use irradia_train::{Recipe, RunLimits, TrainOptions, Trainer, checkpoint};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -67,7 +69,7 @@ pub struct Args {
 }
 
 /// `90`, `90s`, `5m` or `1.5h` in seconds.
-fn parse_seconds(text: &str) -> Result<f64, String> {
+pub fn parse_seconds(text: &str) -> Result<f64, String> {
     let (number, unit) = match text.char_indices().last() {
         Some((at, 's')) => (&text[..at], 1.0),
         Some((at, 'm')) => (&text[..at], 60.0),
@@ -88,7 +90,7 @@ pub fn run(args: &Args) -> Result<()> {
 /// Trains on the threads that there are.
 pub fn train(args: &Args) -> Result<()> {
     let started = Instant::now();
-    let lpips = lpips(args.lpips.as_ref())?;
+    let lpips = lpips(args.lpips.as_ref())?.map(Arc::new);
     let (folder, config, trainer) = match &args.resume {
         Some(run) => {
             let (folder, config) = RunFolder::open(run)?;
@@ -99,37 +101,35 @@ pub fn train(args: &Args) -> Result<()> {
                     folder.file("report.html").display()
                 ));
             }
-            resume(folder, config, args)?
+            resume(folder, config, args, lpips.clone())?
         }
-        None => begin(args)?,
+        None => begin(args, lpips.clone())?,
     };
     let hint = format!(
         "; when that is put right, go on with: irradia train --resume {}",
         folder.path().display()
     );
-    finish(folder, config, trainer, lpips.as_ref(), started).map_err(|error| anyhow!("{}{hint}", one_line(&error)))
+    finish(folder, config, trainer, lpips.as_deref(), started).map_err(|error| anyhow!("{}{hint}", one_line(&error)))
 }
 
 /// The recipe of `--recipe`, `--set` and `--max-splats`.
 fn resolve_recipe(args: &Args) -> Result<Recipe> {
-    let (origin, text) = if args.recipe.ends_with(".toml") {
-        let text = std::fs::read_to_string(&args.recipe)
-            .map_err(|e| Usage(format!("cannot read recipe {}: {e}", args.recipe)))?;
-        (args.recipe.as_str(), text)
-    } else {
-        (
-            args.recipe.as_str(),
-            Recipe::built_in(&args.recipe)
-                .map_err(|e| Usage(e.to_string()))?
-                .to_owned(),
-        )
-    };
     let mut overrides = args.set.clone();
     overrides.extend(args.max_splats.map(|n| format!("max_splats={n}")));
-    Ok(Recipe::parse(origin, &text, &overrides).map_err(|e| Usage(e.to_string()))?)
+    read_recipe(&args.recipe, &overrides)
 }
 
-fn begin(args: &Args) -> Result<(RunFolder, RunConfig, Trainer)> {
+/// The built-in recipe or file `name`, changed by `overrides`.
+pub fn read_recipe(name: &str, overrides: &[String]) -> Result<Recipe> {
+    let text = if name.ends_with(".toml") {
+        std::fs::read_to_string(name).map_err(|e| Usage(format!("cannot read recipe {name}: {e}")))?
+    } else {
+        Recipe::built_in(name).map_err(|e| Usage(e.to_string()))?.to_owned()
+    };
+    Ok(Recipe::parse(name, &text, overrides).map_err(|e| Usage(e.to_string()))?)
+}
+
+fn begin(args: &Args, lpips: Option<Arc<Lpips>>) -> Result<(RunFolder, RunConfig, Trainer)> {
     let (data, out) = (
         args.data.as_ref().expect("clap asks for it"),
         args.out.as_ref().expect("clap asks for it"),
@@ -140,6 +140,7 @@ fn begin(args: &Args) -> Result<(RunFolder, RunConfig, Trainer)> {
     let options = TrainOptions {
         seed: args.seed,
         steps: args.steps,
+        lpips,
         ..TrainOptions::default()
     };
     let trainer = Trainer::new(Arc::new(dataset), recipe, options)?;
@@ -161,7 +162,12 @@ fn begin(args: &Args) -> Result<(RunFolder, RunConfig, Trainer)> {
     Ok((folder, config, trainer))
 }
 
-fn resume(folder: RunFolder, mut config: RunConfig, args: &Args) -> Result<(RunFolder, RunConfig, Trainer)> {
+fn resume(
+    folder: RunFolder,
+    mut config: RunConfig,
+    args: &Args,
+    lpips: Option<Arc<Lpips>>,
+) -> Result<(RunFolder, RunConfig, Trainer)> {
     if let Some(data) = &args.data {
         config.data = std::path::absolute(data).unwrap_or_else(|_| data.clone());
     }
@@ -178,6 +184,7 @@ fn resume(folder: RunFolder, mut config: RunConfig, args: &Args) -> Result<(RunF
     let options = TrainOptions {
         seed: config.seed,
         steps: config.steps,
+        lpips,
         ..TrainOptions::default()
     };
     let trainer = match folder.newest_checkpoint()? {
@@ -215,6 +222,10 @@ fn finish(
     let mut progress = Progress::new(stop.clone());
     let mut journal = Journal::open(&folder, trainer.clock.step)?;
     journal.warnings.extend(trainer.dataset.warnings.iter().cloned());
+    if let Some(warning) = missing_weights(&trainer) {
+        note(format_args!("warning: {warning}"));
+        journal.warnings.push(warning);
+    }
     let limits = RunLimits {
         until_psnr: config.until_psnr,
         budget: config.budget,
@@ -277,6 +288,13 @@ fn finish(
         ssim: mean.ssim,
         lpips: mean.lpips,
         views,
+        schedule: schedule(
+            &trainer.recipe,
+            &journal.stages,
+            &trainer.clock,
+            config.steps,
+            config.budget.is_some(),
+        ),
         stages: journal.stages,
         curve: journal.curve,
         machine: machine(),
@@ -301,6 +319,19 @@ fn finish(
         ))?;
     }
     say(format_args!("look at {}", folder.file("report.html").display()))
+}
+
+/// What is left out of the recipe because LPIPS has no weights.
+fn missing_weights(trainer: &Trainer) -> Option<String> {
+    let weighs = |moment: &Moment| moment.values[Param::PerceptualWeight as usize] > 0.0;
+    let missing = trainer.options.lpips.is_none() && outline(&trainer.recipe, 1000).iter().any(weighs);
+    missing.then(|| {
+        format!(
+            "recipe {} is trained without its perceptual loss, for no weights of LPIPS were found: give \
+             lpips_squeeze.safetensors with --lpips FILE or name it in IRRADIA_LPIPS",
+            trainer.recipe.name
+        )
+    })
 }
 
 /// Writes truth, render and error of a held-out view under `eval/`.

@@ -1,7 +1,9 @@
 //! The program `irradia` as its users meet it: a process with arguments, folders, an exit code and two streams.
 
 mod bad_input;
+mod compare;
 mod outputs;
 mod process;
 mod real_data;
+mod recipe;
 mod reproducible;

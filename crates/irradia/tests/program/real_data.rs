@@ -72,3 +72,16 @@ fn fox_takes_less_than_400_megabytes_and_lpips_finds_its_weights() {
         report["lpips"]
     );
 }
+
+#[test]
+fn a_perceptual_loss_finds_the_weights_of_the_evaluation() {
+    let Some(shared) = shared() else { return };
+    let folder = tempfile::tempdir_in(env!("CARGO_TARGET_TMPDIR")).expect("a folder");
+    let data = shared.join("chair").display().to_string();
+    let weights = shared.join("lpips/lpips_squeeze.safetensors").display().to_string();
+    let line = "train --steps 20 --max-side 100 --set params.perceptual_weight=0.1 --out";
+    irradia_with(folder.path(), &format!("{line} without"), &[&data]).well();
+    let with = irradia_with(folder.path(), &format!("{line} with"), &[&data, "--lpips", &weights]).well();
+    assert!(!with.stderr.contains("warning:"), "{with:?}");
+    assert!(scene(&folder.path().join("with")) != scene(&folder.path().join("without")));
+}

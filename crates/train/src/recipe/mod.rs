@@ -1,21 +1,24 @@
 //! A recipe: one way of training, as a file. Raw TOML, then overrides, then this validated value.
 
+mod ablation;
 mod density;
 mod param;
 
+pub use ablation::Ingredients;
 pub use density::{ClassicKnobs, Density, FastKnobs, McmcKnobs, MergeKnobs, TamingKnobs};
 use param::check_knob;
 pub use param::{Knob, Param, Params, Shape};
 use serde::{Deserialize, Serialize};
 
 /// The recipes that come with the program: name and text.
-pub const BUILT_IN: [(&str, &str); 6] = [
+pub const BUILT_IN: [(&str, &str); 7] = [
     ("classic", include_str!("../../../../recipes/classic.toml")),
     ("absgrad", include_str!("../../../../recipes/absgrad.toml")),
     ("mcmc", include_str!("../../../../recipes/mcmc.toml")),
     ("taming", include_str!("../../../../recipes/taming.toml")),
     ("fast", include_str!("../../../../recipes/fast.toml")),
     ("curriculum", include_str!("../../../../recipes/curriculum.toml")),
+    ("curriculum-paper", include_str!("../../../../recipes/curriculum-paper.toml")),
 ];
 
 /// Why a recipe was refused: one line that names the key.
@@ -70,6 +73,9 @@ pub struct Recipe {
     pub init: InitKnobs,
     /// Adam's constants.
     pub adam: AdamKnobs,
+    /// What of a curriculum is in force.
+    #[serde(default, skip_serializing_if = "Ingredients::are_all")]
+    pub ingredients: Ingredients,
     /// Knobs over the whole run; a stage may overrule them.
     pub params: Params,
     /// What happens, in order.
@@ -194,7 +200,7 @@ impl Recipe {
                 message,
             })?;
         }
-        let recipe = Self::deserialize(root).map_err(|e| {
+        let mut recipe = Self::deserialize(root).map_err(|e| {
             let message = format!("{}{}", suggest(&one_line(&e)), place(&e));
             let given: Vec<String> = overrides.iter().map(|o| format!("--set {o}")).collect();
             match &given[..] {
@@ -203,6 +209,8 @@ impl Recipe {
             }
         })?;
         recipe.validate().map_err(invalid)?;
+        let ingredients = recipe.ingredients;
+        ingredients.apply(&mut recipe);
         Ok(recipe)
     }
 

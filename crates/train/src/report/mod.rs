@@ -3,9 +3,13 @@
 //! The page is one file: style, script and data are inside it, pictures are named relative to it. It opens from disk
 //! with no network.
 
+mod columns;
 mod machine;
+mod schedule;
 
+pub use columns::columns;
 pub use machine::{Machine, machine, peak_rss_bytes};
+pub use schedule::{KnobCurve, Schedule, schedule};
 
 use serde::{Deserialize, Deserializer, Serialize};
 
@@ -53,6 +57,9 @@ pub struct Report {
     pub views: Vec<ViewReport>,
     /// The stages of the recipe, in order.
     pub stages: Vec<StageReport>,
+    /// The knobs over the run; empty in reports of versions that did not write it.
+    #[serde(default)]
+    pub schedule: Schedule,
     /// How the run went, in order of steps.
     pub curve: Vec<CurvePoint>,
     /// Where it ran.

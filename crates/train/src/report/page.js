@@ -1,4 +1,3 @@
-"use strict";
 (() => {
   const report = JSON.parse(document.getElementById("data").textContent);
   document.title = `${report.dataset || "Report"} – Irradia`;
@@ -29,7 +28,6 @@
   // Held-out views: a selector, truth and render with a divider, the error beside them.
   let chosen = 0;
   const views = report.views;
-  const address = (path) => path.split("/").map(encodeURIComponent).join("/");
   const show = (index) => {
     chosen = (index + views.length) % views.length;
     const view = views[chosen];
@@ -127,6 +125,38 @@
   at("over-steps").addEventListener("click", () => curves("step"));
   at("over-seconds").addEventListener("click", () => curves("seconds"));
   curves("step");
+
+  // The knobs over steps, those of a kind in one chart; a kind that never changes is said in words.
+  const { schedule } = report;
+  if (schedule && schedule.steps.length > 1) {
+    at("schedule-part").hidden = false;
+    const brief = (y) => (y !== 0 && Math.abs(y) < 1e-3 ? y.toExponential(1) : String(+y.toPrecision(3)));
+    const marks = report.stages.slice(1).map((stage) => stage.first_step - 1);
+    const still = [];
+    for (const [kind, title, options] of [
+      ["scale", "Image scale", { zero: true }],
+      ["count", "Splats allowed and trained, shares", { zero: true }],
+      ["degree", "Degree of spherical harmonics", { zero: true }],
+      ["rate", "Learning rates", { log: true }],
+      ["loss", "Weights of losses", { zero: true }],
+    ]) {
+      const knobs = schedule.knobs.filter((knob) => knob.name.startsWith(`${kind}.`));
+      const named = knobs.map(({ name, values }) => ({ name: name.slice(kind.length + 1), values }));
+      const moving = named.filter(({ values }) => values.some((value) => value !== values[0]));
+      if (!moving.length) {
+        if (named.length) still.push(`${title}: ${named.map(({ name, values }) => `${name} ${brief(values[0])}`).join(", ")}`);
+        continue;
+      }
+      const lines = named.map(({ name, values }, i) => ({ name, color: color(i),
+        points: values.map((y, j) => ({ x: schedule.steps[j], y })).filter((p) => !options.log || p.y > 0) }));
+      at("schedule").append(chart(title, lines, { ...options, marks, legend: lines.length > 1, tell: brief }));
+    }
+    const source = schedule.done ? "As it was done, over steps" :
+      "As planned, laid over the steps that each stage took: how early stages ended is not known of a run fitted into a time";
+    const names = report.stages.map((stage) => stage.name).join(", ");
+    at("schedule-note").textContent =
+      `${source}; lines part the stages ${names}.${still.length ? ` Unchanged: ${still.join("; ")}.` : ""}`;
+  }
 
   // Machine, stages, recipe.
   const machine = report.machine;

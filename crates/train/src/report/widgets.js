@@ -52,6 +52,10 @@ const slider = (frame) => {
   slide(50);
 };
 
+// Apart in hue and in lightness; what is beyond the eighth is lighter.
+const HUES = [18, 198, 75, 275, 145, 330, 235, 45];
+const color = (i) => `hsl(${HUES[i % HUES.length]} 62% ${i < HUES.length ? 46 : 66}%)`;
+
 const svg = (name, attributes, text) => {
   const element = document.createElementNS("http://www.w3.org/2000/svg", name);
   for (const [key, value] of Object.entries(attributes)) element.setAttribute(key, value);
@@ -64,9 +68,9 @@ const short = (x) => {
   if (size >= 1e4) return `${+(x / 1e3).toFixed(1)}k`;
   return String(+x.toPrecision(3));
 };
-// Round numbers that part low..high into about four.
-const ticks = (low, high) => {
-  const rough = (high - low) / 4, power = 10 ** Math.floor(Math.log10(rough));
+// Round numbers that part low..high into as many parts or fewer.
+const ticks = (low, high, parts = 4) => {
+  const rough = (high - low) / parts, power = 10 ** Math.floor(Math.log10(rough));
   const step = [1, 2, 5, 10].map((m) => m * power).find((s) => s >= rough);
   const list = [];
   for (let number = Math.ceil(low / step - 1e-9); number * step <= high + step * 1e-9; number++) list.push(number * step);
@@ -74,12 +78,13 @@ const ticks = (low, high) => {
 };
 
 // Lines { color, points: [{ x, y }], name } in a box of width x height units that scales with the page.
-const chart = (title, lines, { smooth = false, zero = false, digits = 0, unit = "", width = 340, height = 190 } = {}) => {
+const chart = (title, lines, { smooth = false, zero = false, digits = 0, unit = "", width = 340, height = 190,
+  log = false, marks = [], legend = false, tell = (y) => `${fixed(y, digits)}${unit}` } = {}) => {
   const LEFT = 46, RIGHT = 8, TOP = 8, BOTTOM = 22;
   const box = make("div", undefined, { class: "curve" });
   const head = make("h3", title);
   const lone = lines.length === 1 ? lines[0].points : [];
-  const last = lone.length ? `${fixed(lone[lone.length - 1].y, digits)}${unit}` : lines.length === 1 ? "–" : "";
+  const last = lone.length ? tell(lone[lone.length - 1].y) : lines.length === 1 ? "–" : "";
   const output = make("output", last);
   head.append(output);
   box.append(head);
@@ -93,19 +98,24 @@ const chart = (title, lines, { smooth = false, zero = false, digits = 0, unit = 
   const [xs, ys] = [all.map((p) => p.x), all.map((p) => p.y)];
   const span = (list) => [list.reduce((a, b) => Math.min(a, b)), list.reduce((a, b) => Math.max(a, b))];
   const [x0, x1] = span(xs);
-  let [y0, y1] = span(ys);
+  const place = log ? (y) => Math.log10(y) : (y) => y;
+  let [y0, y1] = span(ys.map(place));
   // One wild first value must not flatten the rest.
   if (smooth) y1 = Math.min(y1, [...ys].sort((a, b) => a - b)[Math.floor(0.99 * (ys.length - 1))] * 1.25);
   if (zero) y0 = 0;
   if (y1 <= y0) y1 = y0 + (Math.abs(y0) || 1);
   const px = (x) => LEFT + ((x - x0) / (x1 - x0 || 1)) * (width - LEFT - RIGHT);
-  const py = (y) => height - BOTTOM - ((Math.min(y, y1) - y0) / (y1 - y0)) * (height - TOP - BOTTOM);
-  for (const y of ticks(y0, y1)) {
-    picture.append(svg("line", { x1: LEFT, x2: width - RIGHT, y1: py(y), y2: py(y), class: "grid" }));
-    picture.append(svg("text", { x: LEFT - 6, y: py(y) + 4, "text-anchor": "end" }, short(y)));
+  const py = (y) => height - BOTTOM - ((Math.min(place(y), y1) - y0) / (y1 - y0)) * (height - TOP - BOTTOM);
+  for (const x of marks.filter((x) => x > x0 && x < x1)) {
+    picture.append(svg("line", { x1: px(x), x2: px(x), y1: TOP, y2: height - BOTTOM, class: "mark" }));
   }
-  const marks = x1 > x0 ? ticks(x0, x1) : [x0];
-  marks.forEach((x) => {
+  const levels = ticks(y0, y1, height / 46).filter((y) => !log || Number.isInteger(+y.toFixed(6)));
+  for (const y of log ? levels.map((power) => 10 ** power) : levels) {
+    picture.append(svg("line", { x1: LEFT, x2: width - RIGHT, y1: py(y), y2: py(y), class: "grid" }));
+    picture.append(svg("text", { x: LEFT - 6, y: py(y) + 4, "text-anchor": "end" }, log ? y.toExponential(0) : short(y)));
+  }
+  const steps = x1 > x0 ? ticks(x0, x1, width / 70) : [x0];
+  steps.forEach((x) => {
     const anchor = px(x) > width - 24 ? "end" : "middle";
     picture.append(svg("text", { x: px(x), y: height - 6, "text-anchor": anchor }, short(x)));
   });
@@ -136,11 +146,20 @@ const chart = (title, lines, { smooth = false, zero = false, digits = 0, unit = 
     cursor.setAttribute("x2", px(near.x));
     cursor.setAttribute("visibility", "visible");
     const name = near.line.name ? `${near.line.name} ` : "";
-    output.textContent = `${name}${fixed(near.y, digits)}${unit} at ${short(near.x)}`;
+    output.textContent = `${name}${tell(near.y)} at ${short(near.x)}`;
   });
   picture.addEventListener("pointerleave", () => {
     cursor.setAttribute("visibility", "hidden");
     output.textContent = last;
   });
+  if (legend) {
+    const list = make("p", undefined, { class: "legend" });
+    for (const { name, color } of lines) {
+      const item = make("span");
+      item.append(make("span", undefined, { class: "swatch", style: `background: ${color}` }), name);
+      list.append(item);
+    }
+    box.append(list);
+  }
   return box;
 };

@@ -3,7 +3,7 @@
 mod outline;
 mod watch;
 
-pub use outline::{Moment, outline};
+pub use outline::{Ahead, Moment, ahead, outline};
 pub use watch::Watch;
 
 use crate::recipe::{Density, Exit, Knob, MergeKnobs, Param, Recipe, Shape};
@@ -160,6 +160,19 @@ impl Clock {
         if exit.is_some_and(|exit| self.watch.ends(exit, signal.views, in_stage)) {
             self.leave_early(recipe);
         }
+        self.enter_stages(recipe, before)
+    }
+
+    /// Lets `time` pass without a step.
+    fn pass(&mut self, recipe: &Recipe, time: f64) {
+        let before = values(recipe, self);
+        self.time += time;
+        self.progress += time * self.stretch;
+        self.enter_stages(recipe, before);
+    }
+
+    /// Enters the stage that `time` is in; true where it is another. `before` are the values that were in force.
+    fn enter_stages(&mut self, recipe: &Recipe, before: [f64; Param::ALL.len()]) -> bool {
         // Half a thousandth of a step forgives the rounding of a sum of fractions.
         let mut ended = false;
         while self.stage < recipe.stage.len()

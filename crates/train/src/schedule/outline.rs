@@ -3,6 +3,42 @@
 use super::{Clock, Signal, values};
 use crate::recipe::{Param, Recipe};
 
+/// A stretch of what is still to come.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Ahead {
+    /// Index of the stage.
+    pub stage: usize,
+    /// Size of the training images relative to the data's.
+    pub image_scale: f64,
+    /// Splats there may be, as a share of the cap.
+    pub count_share: f64,
+    /// Whether splats are added.
+    pub grows: bool,
+    /// Recipe steps that it lasts.
+    pub duration: f64,
+}
+
+/// What is left of `recipe` after `clock` in about `parts` parts, as if no stage ended early.
+pub fn ahead(recipe: &Recipe, clock: &Clock, parts: usize) -> Vec<Ahead> {
+    let mut clock = clock.clone();
+    let total = recipe.total_steps() as f64;
+    let pace = ((total - clock.time) / parts as f64).max(1e-3);
+    let mut stretches = Vec::new();
+    while let Some(stage) = recipe.stage.get(clock.stage) {
+        let values = values(recipe, &clock);
+        let duration = pace.min(clock.stage_time + stage.steps as f64 - clock.time).max(1e-3);
+        stretches.push(Ahead {
+            stage: clock.stage,
+            image_scale: values[Param::ImageScale as usize],
+            count_share: values[Param::CountShare as usize],
+            grows: stage.density.is_some(),
+            duration,
+        });
+        clock.pass(recipe, duration);
+    }
+    stretches
+}
+
 /// The knobs at one time.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Moment {

@@ -1,0 +1,258 @@
+//! `irradia recipe`
+
+use super::train::read_recipe;
+use crate::terminal::say;
+use anyhow::Result;
+use irradia_train::Recipe;
+use irradia_train::recipe::{BUILT_IN, Density, Exit, Param, Stage};
+use irradia_train::report::columns;
+use irradia_train::schedule::{Moment, outline};
+
+#[derive(clap::Args)]
+pub struct Args {
+    #[command(subcommand)]
+    action: Action,
+}
+
+#[derive(clap::Subcommand)]
+enum Action {
+    /// Name the built-in recipes
+    List,
+    /// Show what a recipe does when
+    Show(ShowArgs),
+}
+
+#[derive(clap::Args)]
+pub struct ShowArgs {
+    /// Built-in recipe or a .toml file
+    #[arg(value_name = "NAME|FILE")]
+    pub recipe: String,
+    /// Change one key of the recipe, such as stage.grow.params.ssim_weight=0.3
+    #[arg(long, value_name = "KEY=VALUE")]
+    pub set: Vec<String>,
+    /// Fit the recipe into so many steps
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
+    pub steps: Option<u64>,
+    /// Print the recipe itself instead, as a file to start from
+    #[arg(long, conflicts_with = "steps")]
+    pub toml: bool,
+}
+
+pub fn run(args: &Args) -> Result<()> {
+    match &args.action {
+        Action::List => list(),
+        Action::Show(args) => {
+            let recipe = read_recipe(&args.recipe, &args.set)?;
+            if args.toml {
+                say(recipe.to_toml().trim_end())
+            } else {
+                say(plan(&recipe, args.steps.unwrap_or(recipe.total_steps())).trim_end())
+            }
+        }
+    }
+}
+
+fn list() -> Result<()> {
+    let mut lines = Vec::new();
+    for (name, _) in BUILT_IN {
+        let recipe = read_recipe(name, &[])?;
+        lines.push(vec![
+            name.to_owned(),
+            format!("{} steps", recipe.total_steps()),
+            recipe.about,
+        ]);
+    }
+    say(columns(&lines, 3).trim_end())
+}
+
+/// Times at which the knobs are shown, beside the ends of stages.
+const MOMENTS: usize = 6;
+
+/// What `recipe` does in `steps` steps, as tables.
+fn plan(recipe: &Recipe, steps: u64) -> String {
+    let pace = recipe.total_steps() as f64 / steps as f64;
+    let moments = outline(recipe, MOMENTS);
+    let mut text = format!("{}: {}\n{steps} steps", recipe.name, recipe.about);
+    if steps != recipe.total_steps() {
+        text += &format!(" for the recipe's {}", recipe.total_steps());
+    }
+    text += &format!(", at most {} splats", recipe.max_splats);
+    if let Some(share) = recipe.splats_per_pixel {
+        text += &format!(" or {share} for each pixel of an image");
+    }
+    text += "\n\n";
+    text += &columns(&stages(recipe, &moments, pace), 6);
+
+    let (still, moving): (Vec<Param>, Vec<Param>) = Param::ALL.into_iter().partition(|param| {
+        let value = |moment: &Moment| moment.values[*param as usize];
+        moments.iter().all(|moment| value(moment) == value(&moments[0]))
+    });
+    let shown = distinct(&moments, pace);
+    if !moving.is_empty() {
+        let mut heads = vec!["step".to_owned()];
+        heads.extend(shown.iter().map(|moment| format!("{:.0}", moment.time / pace)));
+        let mut names = vec!["stage".to_owned()];
+        names.extend(shown.iter().map(|moment| recipe.stage[moment.stage].name.clone()));
+        let mut lines = vec![heads, names];
+        for param in moving {
+            let mut line = vec![param.name()];
+            line.extend(shown.iter().map(|moment| figure(moment.values[param as usize])));
+            lines.push(line);
+        }
+        text += &format!("\nWhat changes:\n{}", columns(&lines, 1));
+    }
+    let lines: Vec<Vec<String>> = still
+        .iter()
+        .filter(|param| moments[0].values[**param as usize] != 0.0)
+        .map(|param| vec![param.name(), figure(moments[0].values[*param as usize])])
+        .collect();
+    text + &format!("\nWhat stays:\n{}", columns(&lines, 1))
+}
+
+/// A line a stage: its steps, how splats come and go, what it is judged by, when it may end early.
+fn stages(recipe: &Recipe, moments: &[Moment], pace: f64) -> Vec<Vec<String>> {
+    let heads = ["stage", "steps", "image scale", "losses", "density", "ends early"];
+    let mut lines = vec![heads.map(str::to_owned).to_vec()];
+    let mut start = 0.0;
+    for (i, stage) in recipe.stage.iter().enumerate() {
+        let end = start + stage.steps as f64;
+        let within: Vec<&Moment> = moments.iter().filter(|moment| moment.stage == i).collect();
+        lines.push(vec![
+            stage.name.clone(),
+            format!("{:.0} - {:.0}", (start / pace).floor() + 1.0, end / pace),
+            course(&within, Param::ImageScale),
+            losses(&within),
+            density(stage),
+            stage.exit.map_or("-".into(), exit),
+        ]);
+        start = end;
+    }
+    lines
+}
+
+/// The value of a knob in a stage, or its first and its last.
+fn course(within: &[&Moment], param: Param) -> String {
+    let value = |moment: Option<&&Moment>| moment.map_or(0.0, |moment| moment.values[param as usize]);
+    let (first, last) = (value(within.first()), value(within.last()));
+    if first == last {
+        figure(first)
+    } else {
+        format!("{} to {}", figure(first), figure(last))
+    }
+}
+
+fn losses(within: &[&Moment]) -> String {
+    let names = [
+        (Param::PhotoWeight, "photo"),
+        (Param::MseWeight, "mse"),
+        (Param::CoarseWeight, "coarse"),
+        (Param::PerceptualWeight, "perceptual"),
+        (Param::AlphaWeight, "alpha"),
+        (Param::DepthWeight, "depth"),
+        (Param::SmoothWeight, "smooth"),
+    ];
+    let mut parts = Vec::new();
+    for (param, name) in names {
+        if within.iter().all(|moment| moment.values[param as usize] == 0.0) {
+            continue;
+        }
+        let ssim = match param {
+            Param::PhotoWeight => format!(" (SSIM {})", course(within, Param::SsimWeight)),
+            _ => String::new(),
+        };
+        parts.push(format!("{name} {}{ssim}", course(within, param)));
+    }
+    parts.join(", ")
+}
+
+fn density(stage: &Stage) -> String {
+    let strategy = stage.density.map(|density| {
+        let name = match density {
+            Density::Classic(knobs) if knobs.absolute => "classic, absolute",
+            Density::Classic(_) => "classic",
+            Density::Mcmc(_) => "mcmc",
+            Density::Taming(_) => "taming",
+            Density::Fast(_) => "fast",
+        };
+        format!("{name} every {}", density.every())
+    });
+    let merge = stage.merge.map(|merge| format!("merge every {}", merge.every));
+    let parts: Vec<String> = strategy.into_iter().chain(merge).collect();
+    if parts.is_empty() { "-".into() } else { parts.join(", ") }
+}
+
+fn exit(exit: Exit) -> String {
+    match exit {
+        Exit::Threshold { tau } => format!("error below {tau}"),
+        Exit::Relative { ratio } => format!("error below {ratio} of its first"),
+        Exit::Plateau { drop, window } => format!("error falls by less than {drop} of itself in {window} recipe steps"),
+    }
+}
+
+/// The moments without those at the end of a stage that the next one begins as.
+fn distinct(moments: &[Moment], pace: f64) -> Vec<&Moment> {
+    let step = |moment: &Moment| (moment.time / pace).round();
+    let equal = |(a, b): (&f64, &f64)| (a - b).abs() <= 1e-6 * a.abs();
+    let same = |a: &Moment, b: &Moment| step(a) == step(b) && a.values.iter().zip(&b.values).all(equal);
+    let shown = moments
+        .iter()
+        .enumerate()
+        .filter(|(i, moment)| moments.get(i + 1).is_none_or(|next| !same(moment, next)));
+    shown.map(|(_, moment)| moment).collect()
+}
+
+/// Three digits that count.
+fn figure(value: f64) -> String {
+    if value == 0.0 {
+        return "0".into();
+    }
+    if (1e-3..1e6).contains(&value.abs()) {
+        let digits = (2 - value.abs().log10().floor() as i32).max(0) as usize;
+        let text = format!("{value:.digits$}");
+        if text.contains('.') {
+            return text.trim_end_matches('0').trim_end_matches('.').to_owned();
+        }
+        return text;
+    }
+    let text = format!("{value:.2e}");
+    text.replace(".00e", "e").replace("0e", "e")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn figures_are_short_and_right() {
+        let cases = [
+            (0.0, "0"),
+            (1.0, "1"),
+            (0.2, "0.2"),
+            (0.001, "0.001"),
+            (0.1234, "0.123"),
+            (1234.0, "1234"),
+            (1.6e-4, "1.6e-4"),
+            (1e-15, "1e-15"),
+            (20.0, "20"),
+            (5e6, "5e6"),
+        ];
+        for (value, want) in cases {
+            assert_eq!(figure(value), want);
+        }
+    }
+
+    #[test]
+    fn every_built_in_recipe_has_a_plan_at_any_length() {
+        for (name, _) in BUILT_IN {
+            let recipe = read_recipe(name, &[]).unwrap();
+            for steps in [1, 7, recipe.total_steps(), 100_000] {
+                let text = plan(&recipe, steps);
+                assert!(
+                    text.contains("image scale") && text.contains("rate_means"),
+                    "{name}: {text}"
+                );
+                assert!(!text.contains("NaN") && !text.contains("inf"), "{text}");
+            }
+        }
+    }
+}

@@ -1,0 +1,131 @@
+//! `irradia compare`: runs side by side, kept and read again.
+
+use crate::process::*;
+use std::fs;
+
+const LINE: &str = "compare data --recipes classic,classic:params.ssim_weight=0.9 --seeds 2 --steps 20 --out both";
+
+#[test]
+fn a_comparison_sums_up_its_runs_and_reads_finished_ones_again() {
+    let folder = with_data();
+    let first = irradia(folder.path(), LINE).well();
+    assert!(
+        first.stdout.contains("classic:params.ssim_weight=0.9") && first.stdout.contains(" ± "),
+        "{first:?}"
+    );
+    let both = folder.path().join("both");
+    let json_before = json(&both.join("compare.json"));
+    let entries = json_before["scenes"][0]["entries"].as_array().expect("entries");
+    assert_eq!(entries.len(), 2);
+    for entry in entries {
+        for key in [
+            "psnr",
+            "ssim",
+            "seconds",
+            "cpu_seconds",
+            "splats",
+            "peak_memory",
+            "loss_rises",
+            "error_rises",
+        ] {
+            assert_eq!(entry[key]["runs"], 2, "{key}: {}", entry[key]);
+        }
+        assert!(entry["psnr"]["mean"].as_f64() > Some(8.0), "{entry}");
+        let looks = entry["runs"][0]["figures"]["looks"].as_array().expect("looks");
+        assert!(
+            looks.len() > 10 && looks.last().expect("a look")["step"] == 20,
+            "{looks:?}"
+        );
+        assert!(entry["reached"].as_array().is_some_and(|levels| !levels.is_empty()));
+    }
+    for seed in ["seed_0", "seed_1"] {
+        assert!(
+            both.join("data/classic_params.ssim_weight_0.9")
+                .join(seed)
+                .join("report.html")
+                .is_file()
+        );
+    }
+    // Pictures are in the page: nothing beside it is needed.
+    let page = fs::read_to_string(both.join("compare.html")).expect("a page");
+    assert!(page.contains("data:image/jpeg;base64,") && !page.contains("https://"));
+    let table = fs::read_to_string(both.join("compare.md")).expect("a table");
+    assert!(table.contains("| data | classic:params.ssim_weight=0.9 |"), "{table}");
+    assert_no_leftovers(&both);
+
+    // Nothing is trained again, but what is missing is.
+    fs::remove_dir_all(both.join("data/classic/seed_1")).expect("removed");
+    let scene = scene(&both.join("data/classic/seed_0"));
+    let again = irradia(folder.path(), LINE).well();
+    let trained: Vec<&str> = again.stderr.lines().filter(|line| line.ends_with("..")).collect();
+    assert_eq!(trained, ["[3/4] data, classic, seed 1 .."], "{again:?}");
+    assert!(scene == self::scene(&both.join("data/classic/seed_0")));
+    let psnr = |value: &serde_json::Value| value["scenes"][0]["entries"][0]["psnr"]["mean"].as_f64();
+    assert_eq!(psnr(&json(&both.join("compare.json"))), psnr(&json_before));
+
+    // Other conditions are another comparison, unless that is what is wanted.
+    let other = LINE.replace("--steps 20", "--steps 21");
+    irradia(folder.path(), &other).refused(2, &["other conditions", "--overwrite"]);
+    irradia(folder.path(), &(other + " --overwrite")).well();
+    assert_eq!(json(&both.join("data/classic/seed_0/report.json"))["steps"], 21);
+}
+
+#[test]
+fn a_run_that_fails_is_a_row_and_not_the_end() {
+    let folder = with_data();
+    fs::create_dir(folder.path().join("empty")).expect("a folder");
+    let line = "compare empty data --recipes classic --seeds 1 --steps 5 --out both";
+    let ended = irradia(folder.path(), line).well();
+    assert!(ended.stdout.contains("failed: empty, classic, seed 0: "), "{ended:?}");
+    let figures = json(&folder.path().join("both/compare.json"));
+    let run = &figures["scenes"][0]["entries"][0]["runs"][0];
+    assert!(
+        run["figures"].is_null() && run["error"].as_str().is_some_and(|e| e.contains("empty")),
+        "{run}"
+    );
+    assert!(figures["scenes"][1]["entries"][0]["psnr"]["mean"].as_f64().is_some());
+    let line = "compare empty --recipes classic --seeds 1 --steps 5 --out none";
+    irradia(folder.path(), line).refused(1, &["no run came to an end"]);
+}
+
+#[test]
+fn mistakes_are_found_before_anything_is_trained() {
+    let folder = with_data();
+    let cases = [
+        ("compare data --recipes nonsense --out both", "nonsense"),
+        ("compare data --recipes classic,classic:no.such=1 --out both", "no"),
+        ("compare nowhere --recipes classic --out both", "nowhere"),
+        ("compare data --recipes absent.toml --out both", "absent.toml"),
+    ];
+    for (line, word) in cases {
+        irradia(folder.path(), line).refused(2, &[word]);
+        assert!(!folder.path().join("both").exists(), "{line}");
+    }
+}
+
+#[cfg(unix)]
+#[test]
+fn an_interrupted_comparison_keeps_what_is_finished() {
+    use std::time::{Duration, Instant};
+    let folder = with_data();
+    let line = "compare data --recipes classic,classic:max_splats=4000 --seeds 1 --out both --threads 1";
+    // The first run is made beforehand; the second would take minutes.
+    let short = "compare data --recipes classic:stage.warmup.steps=1 --seeds 1 --steps 5 --out both";
+    irradia(folder.path(), short).well();
+    let mut command = program(folder.path());
+    let child = command.args(line.split_whitespace()).spawn().expect("it starts");
+    let events = folder.path().join("both/data/classic/seed_0/events.jsonl");
+    let started = Instant::now();
+    while !events.exists() {
+        assert!(started.elapsed() < Duration::from_secs(60), "no training began");
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    let interrupt = std::process::Command::new("kill")
+        .args(["-INT", &child.id().to_string()])
+        .status();
+    assert!(interrupt.expect("kill").success());
+    let ended: Ended = child.wait_with_output().expect("it ends").into();
+    let ended = ended.well();
+    assert!(ended.stdout.contains("stopped"), "{ended:?}");
+    assert!(folder.path().join("both/compare.json").is_file());
+}

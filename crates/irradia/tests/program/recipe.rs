@@ -1,0 +1,105 @@
+//! `irradia recipe`: what there is, and what it does when.
+
+use crate::process::*;
+use std::fs;
+
+#[test]
+fn recipes_are_listed_and_shown() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let list = irradia(folder.path(), "recipe list").well();
+    for name in ["classic", "mcmc", "fast", "curriculum"] {
+        assert!(list.stdout.lines().any(|line| line.starts_with(name)), "{list:?}");
+    }
+    let shown = irradia(folder.path(), "recipe show classic --steps 3000").well();
+    let line = |start: &str| {
+        let found = shown.stdout.lines().find(|line| line.starts_with(start));
+        found.unwrap_or_else(|| panic!("{start}: {shown:?}")).to_owned()
+    };
+    assert!(
+        line("grow").contains("51 - 1500") && line("grow").contains("classic every 100"),
+        "{shown:?}"
+    );
+    assert!(
+        line("rate_means").ends_with("1.6e-6") && line("sh_degree").ends_with('3'),
+        "{shown:?}"
+    );
+    assert!(line("rate_quats").ends_with("0.001"), "{shown:?}");
+    let changed = "recipe show classic --set stage.grow.params.image_scale=0.5 \
+                   --set stage.grow.exit={when='relative',ratio=0.5}";
+    let changed = irradia(folder.path(), changed).well();
+    let grow = changed.stdout.lines().find(|line| line.starts_with("grow"));
+    assert!(
+        grow.is_some_and(|line| line.contains("0.5") && line.ends_with("of its first")),
+        "{changed:?}"
+    );
+}
+
+#[test]
+fn a_shown_recipe_is_a_file_to_train_with() {
+    let folder = with_data();
+    let toml = irradia(folder.path(), "recipe show fast --toml --set max_splats=4321").well();
+    fs::write(folder.path().join("mine.toml"), &toml.stdout).expect("written");
+    let again = irradia(folder.path(), "recipe show mine.toml --toml").well();
+    assert!(
+        again.stdout == toml.stdout && toml.stdout.contains("max_splats = 4321"),
+        "{toml:?}"
+    );
+    irradia(folder.path(), "train data --recipe mine.toml --steps 3 --out run").well();
+    irradia(folder.path(), "recipe show nonsense").refused(2, &["nonsense", "classic"]);
+    irradia(folder.path(), "recipe show classic --set max_splat=3").refused(2, &["max_splats"]);
+}
+
+#[test]
+fn a_perceptual_loss_without_weights_is_left_out_and_said_once() {
+    let folder = with_data();
+    let change = "--set stage.grow.params.perceptual_weight={from=0.0,to=0.1}";
+    let line = "train data --recipe classic --steps 12";
+    let ended = irradia(folder.path(), &format!("{line} --out with {change}")).well();
+    let warnings: Vec<&str> = ended.stderr.lines().filter(|line| line.contains("LPIPS")).collect();
+    assert!(
+        matches!(warnings[..], [one] if one.starts_with("warning: ") && one.contains("--lpips FILE")),
+        "{ended:?}"
+    );
+    let report = json(&folder.path().join("with/report.json"));
+    assert!(
+        report["warnings"].as_array().is_some_and(|list| list.len() == 1),
+        "{}",
+        report["warnings"]
+    );
+    let ended = irradia(folder.path(), &format!("{line} --out without")).well();
+    assert!(!ended.stderr.contains("LPIPS"), "{ended:?}");
+    assert!(scene(&folder.path().join("with")) == scene(&folder.path().join("without")));
+}
+
+#[test]
+fn a_report_has_the_schedule_that_the_run_had() {
+    let folder = with_data();
+    // Any error is below 2: the stage ends when all of the 8 views were seen.
+    let change = "--set stage.warmup.steps=10000 --set stage.warmup.exit={when='threshold',tau=2.0}";
+    irradia(
+        folder.path(),
+        &format!("train data --recipe classic --steps 100 --out run {change}"),
+    )
+    .well();
+    let report = json(&folder.path().join("run/report.json"));
+    assert_eq!(report["stages"][0]["last_step"], 8, "{}", report["stages"]);
+    let schedule = &report["schedule"];
+    assert_eq!(schedule["done"], true);
+    let numbers = |value: &serde_json::Value| -> Vec<f64> {
+        let list = value.as_array().expect("numbers");
+        list.iter().map(|number| number.as_f64().expect("a number")).collect()
+    };
+    let steps = numbers(&schedule["steps"]);
+    assert!(steps.first() == Some(&0.0) && steps.last() == Some(&100.0), "{steps:?}");
+    let knobs = schedule["knobs"].as_array().expect("knobs");
+    let means = knobs.iter().find(|knob| knob["name"] == "rate.means").expect("a rate");
+    let means = numbers(&means["values"]);
+    // From 1.6e-4 to 1.6e-6 without a jump where the stage is left.
+    assert!(
+        means
+            .windows(2)
+            .all(|pair| pair[1] <= pair[0] && pair[1] > 0.8 * pair[0]),
+        "{means:?}"
+    );
+    assert!((means[means.len() - 1] / 1.6e-6 - 1.0).abs() < 0.01, "{means:?}");
+}

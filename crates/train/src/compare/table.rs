@@ -1,0 +1,195 @@
+//! The comparison as a plain table for a terminal and as Markdown.
+
+use super::{Comparison, Entry, Reached, Spread};
+use crate::report::columns;
+
+const HEADS: [&str; 12] = [
+    "scene",
+    "recipe",
+    "PSNR, dB",
+    "SSIM",
+    "LPIPS",
+    "train, s",
+    "CPU, s",
+    "splats",
+    "memory, MB",
+    "loss rises",
+    "error rises",
+    "runs",
+];
+
+/// The table with aligned columns; errors and what the figures mean stand below it.
+pub fn to_text(comparison: &Comparison) -> String {
+    let heads = HEADS.map(str::to_owned).to_vec();
+    let mut text = columns(&[vec![heads], rows(comparison)].concat(), 2);
+    if let Some(lines) = marks(comparison) {
+        text += &format!("\n{MARKS}:\n{}", columns(&lines, 1));
+    }
+    for line in errors(comparison) {
+        text += &format!("failed: {line}\n");
+    }
+    text
+}
+
+/// What [`marks`] shows.
+const MARKS: &str = "Seconds of training until a recipe reaches what the first one ends with; in brackets, over the seconds of \
+                     the first one's whole run";
+
+/// A row a scene and a column a recipe, below their heads; `None` where there is nothing to show.
+fn marks(comparison: &Comparison) -> Option<Vec<Vec<String>>> {
+    let first = comparison.scenes.first()?;
+    let name = &first.entries.first()?.recipe;
+    let mut heads = vec!["scene".to_owned(), format!("{name} ends with"), "after".to_owned()];
+    heads.extend(first.entries.iter().map(|entry| entry.recipe.clone()));
+    let mut lines = vec![heads];
+    for scene in &comparison.scenes {
+        let Some(mark) = scene.mark else { continue };
+        let mut cells = vec![
+            scene.name.clone(),
+            format!("{:.2} dB", mark.psnr),
+            format!("{:.1} s", mark.seconds),
+        ];
+        cells.extend(scene.entries.iter().map(|entry| {
+            let time = time(entry, entry.to_mark.as_ref());
+            entry
+                .mark_share
+                .map_or(time.clone(), |share| format!("{time} ({share:.2})"))
+        }));
+        lines.push(cells);
+    }
+    (lines.len() > 1).then_some(lines)
+}
+
+/// The tables for a page of results: one of figures, one of the times to each whole dB.
+pub fn to_markdown(comparison: &Comparison) -> String {
+    let mut text = format!("{}. {}.\n\n", comparison.conditions.join(", "), comparison.device);
+    text += &markdown(&[vec![HEADS.map(str::to_owned).to_vec()], rows(comparison)].concat(), 2);
+    text.push('\n');
+    for line in errors(comparison) {
+        text += &format!("- failed: {}\n", escaped(&line));
+    }
+    text += "Mean ± sample standard deviation over seeds. *Loss rises*: share of blocks of 25 logged steps (of fewer in \
+             short runs) whose mean training loss is above that of the block before; *error rises*: likewise of the mean \
+             squared error of the training views, which is the same measure for all recipes.\n";
+    if let Some(lines) = marks(comparison) {
+        text += &format!("\n{MARKS}:\n\n{}", markdown(&lines, 1));
+    }
+    for scene in &comparison.scenes {
+        let Some(first) = scene.entries.first() else { continue };
+        let whole: Vec<usize> = (0..first.reached.len())
+            .filter(|i| first.reached[*i].psnr.fract() == 0.0)
+            .collect();
+        if whole.is_empty() {
+            continue;
+        }
+        let heads = whole.iter().map(|i| format!("{:.0} dB", first.reached[*i].psnr));
+        let heads: Vec<String> = std::iter::once("recipe".to_owned()).chain(heads).collect();
+        text += &format!(
+            "\nSeconds of training until the held-out PSNR is reached, {}:\n\n",
+            escaped(&scene.name)
+        );
+        let rows = scene.entries.iter().map(|entry| {
+            let times = whole.iter().map(|i| time(entry, entry.reached.get(*i)));
+            std::iter::once(entry.recipe.clone()).chain(times).collect()
+        });
+        text += &markdown(&std::iter::once(heads).chain(rows).collect::<Vec<_>>(), 1);
+    }
+    text
+}
+
+/// Mean seconds to a level, and how many of the runs got there where not all did.
+fn time(entry: &Entry, level: Option<&Reached>) -> String {
+    let finished = entry.runs.iter().filter(|run| run.figures.is_some()).count();
+    match level.and_then(|reached| reached.seconds) {
+        None => "–".into(),
+        Some(s) if s.runs < finished => format!("{:.1} ({} of {finished})", s.mean, s.runs),
+        Some(s) => format!("{:.1}", s.mean),
+    }
+}
+
+fn rows(comparison: &Comparison) -> Vec<Vec<String>> {
+    let mut rows = Vec::new();
+    for scene in &comparison.scenes {
+        for entry in &scene.entries {
+            let done = entry.runs.iter().filter(|run| run.figures.is_some()).count();
+            rows.push(vec![
+                scene.name.clone(),
+                entry.recipe.clone(),
+                number(entry.psnr, 2, 1.0),
+                number(entry.ssim, 4, 1.0),
+                number(entry.lpips, 4, 1.0),
+                number(entry.seconds, 1, 1.0),
+                number(entry.cpu_seconds, 1, 1.0),
+                number(entry.splats, 0, 1.0),
+                number(entry.peak_memory, 0, 1e-6),
+                number(entry.loss_rises, 2, 1.0),
+                number(entry.error_rises, 2, 1.0),
+                format!("{done}/{}", entry.runs.len()),
+            ]);
+        }
+    }
+    if comparison.scenes.len() > 1 {
+        for o in &comparison.overall {
+            let dash = || "–".to_owned();
+            rows.push(vec![
+                format!("mean of {}", o.scenes),
+                o.recipe.clone(),
+                format!("{:.2}", o.psnr),
+                format!("{:.4}", o.ssim),
+                o.lpips.map_or_else(dash, |l| format!("{l:.4}")),
+                format!("{:.1}", o.seconds),
+                dash(),
+                format!("{:.0}", o.splats),
+                dash(),
+                dash(),
+                dash(),
+                dash(),
+            ]);
+        }
+    }
+    rows
+}
+
+/// `scene, recipe, seed: error` of every run that failed.
+fn errors(comparison: &Comparison) -> Vec<String> {
+    let mut lines = Vec::new();
+    for scene in &comparison.scenes {
+        for entry in &scene.entries {
+            for run in &entry.runs {
+                let error = run.error.as_ref();
+                lines.extend(error.map(|e| format!("{}, {}, seed {}: {e}", scene.name, entry.recipe, run.seed)));
+            }
+        }
+    }
+    lines
+}
+
+fn number(spread: Option<Spread>, digits: usize, unit: f64) -> String {
+    let Some(spread) = spread else { return "–".into() };
+    let mean = format!("{:.digits$}", spread.mean * unit);
+    spread
+        .deviation
+        .map_or(mean.clone(), |d| format!("{mean} ± {:.digits$}", d * unit))
+}
+
+/// A table whose first line holds the heads and whose first `left` columns are text.
+fn markdown(lines: &[Vec<String>], left: usize) -> String {
+    let mut text = String::new();
+    for (number, cells) in lines.iter().enumerate() {
+        text += &markdown_row(cells);
+        if number == 0 {
+            text += &format!("|{}{}\n", "---|".repeat(left), "---:|".repeat(cells.len() - left));
+        }
+    }
+    text
+}
+
+fn markdown_row(cells: &[String]) -> String {
+    let cells: Vec<String> = cells.iter().map(|cell| escaped(cell)).collect();
+    format!("| {} |\n", cells.join(" | "))
+}
+
+/// Text that stays text within a table.
+fn escaped(text: &str) -> String {
+    text.replace('|', "\\|").replace(['\n', '\r'], " ")
+}

@@ -1,0 +1,327 @@
+//! The knobs over a run's steps, to be drawn.
+//!
+//! What a run did follows from its recipe and from when it entered its stages: the schedule is gone through again.
+
+use super::StageReport;
+use crate::recipe::{Exit, Recipe};
+use crate::schedule::{Clock, Signal, StepPlan, ahead, plan};
+use serde::{Deserialize, Serialize};
+
+/// Knobs over the steps of a run.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Schedule {
+    /// True where it is what the run did. False where it is the plan alone, laid over the steps that each stage took: a
+    /// run fitted into a time whose stages may end early does not tell by how much they did. Within a stage recipe time is
+    /// taken to go evenly over the steps, as it does but for the drift of a budget's pace.
+    pub done: bool,
+    /// Steps gone by.
+    pub steps: Vec<f32>,
+    /// The knobs at those steps; those that are 0 throughout are left out.
+    pub knobs: Vec<KnobCurve>,
+}
+
+/// A knob's values.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct KnobCurve {
+    /// What it is, such as `loss.ssim`; the part before the dot is shared by those that are drawn together.
+    pub name: String,
+    /// At [`Schedule::steps`].
+    pub values: Vec<f32>,
+}
+
+/// Samples of a run, about.
+const SAMPLES: f64 = 160.0;
+
+/// The schedule of a run of `recipe` that stands at `clock` and entered the stages as `stages` say. `steps` is how many it
+/// was fitted into, `timed` whether it was fitted into a time instead.
+pub fn schedule(recipe: &Recipe, stages: &[StageReport], clock: &Clock, steps: Option<u64>, timed: bool) -> Schedule {
+    let spans = spans(recipe, stages, clock, steps, timed);
+    let mut run = Clock::new(recipe);
+    let mut quiet = recipe.clone();
+    quiet.stage.iter_mut().for_each(|stage| stage.exit = None);
+    let total: f64 = spans.iter().map(|span| span.lasted).sum();
+    let mut schedule = Schedule {
+        done: spans.iter().all(|span| span.known),
+        ..Schedule::default()
+    };
+    let signal = Signal {
+        error: 0.0,
+        measured: None,
+        views: 1,
+    };
+    for (i, span) in spans.iter().enumerate() {
+        let full = recipe.stage[i].steps as f64;
+        let parts = (SAMPLES * span.lasted / total.max(1.0)).ceil().clamp(1.0, SAMPLES) as usize;
+        // Just before its end the stage is still in force.
+        let last = (span.lasted - 1e-3).max(0.0);
+        let mut before = 0.0;
+        for part in 0..=parts {
+            let time = last * part as f64 / parts as f64;
+            if part > 0 {
+                run.tick(&quiet, time - before, signal);
+            }
+            before = time;
+            if run.stage == i {
+                let step = span.entered as f64 + span.steps as f64 * part as f64 / parts as f64;
+                schedule.push(step, &quiet, &run);
+            }
+        }
+        if span.lasted < full {
+            // An error of 0 is below this limit, so that the stage ends as it did in the run.
+            let mut leaving = quiet.clone();
+            leaving.stage[i].exit = Some(Exit::Threshold { tau: f64::INFINITY });
+            run.tick(&leaving, span.lasted - last, signal);
+        } else if run.stage == i {
+            run.tick(&quiet, full - last, signal);
+        }
+    }
+    schedule
+        .knobs
+        .retain(|knob| knob.values.iter().any(|value| *value != 0.0));
+    schedule
+}
+
+/// How long a run was in a stage.
+struct Span {
+    /// Steps made when it was entered.
+    entered: u64,
+    /// Steps made in it.
+    steps: u64,
+    /// Recipe steps that went by in it.
+    lasted: f64,
+    /// Whether that is certain.
+    known: bool,
+}
+
+/// Of the stages that the run came to.
+fn spans(recipe: &Recipe, stages: &[StageReport], clock: &Clock, steps: Option<u64>, timed: bool) -> Vec<Span> {
+    let total = recipe.total_steps() as f64;
+    let (mut spans, mut entered, mut time) = (Vec::new(), 0, 0.0);
+    for (i, stage) in recipe.stage.iter().enumerate().take(clock.stage + 1) {
+        let full = stage.steps as f64;
+        // A stage of less than a step was never entered.
+        let report = stages.iter().find(|report| report.name == stage.name);
+        let end = report.map_or(entered, |report| report.last_step.max(entered));
+        let made = end - entered;
+        let pace = steps.map_or(1.0, |steps| {
+            (total - time) / steps.saturating_sub(entered).max(1) as f64
+        });
+        let (lasted, known) = if i == clock.stage {
+            (clock.time - clock.stage_time, true)
+        } else if stage.exit.is_none() {
+            (full, true)
+        } else if timed {
+            (full, false)
+        } else {
+            let lasted = made as f64 * pace;
+            // The step in which a stage would have ended by itself counts as its end.
+            let whole = report.is_none() || lasted > full - 1.01 * pace;
+            (if whole { full } else { lasted }, true)
+        };
+        spans.push(Span {
+            entered,
+            steps: made,
+            lasted: lasted.clamp(0.0, full),
+            known,
+        });
+        (entered, time) = (end, time + full);
+    }
+    if spans.last().is_some_and(|span| span.lasted <= 0.0) {
+        spans.pop();
+    }
+    spans
+}
+
+impl Schedule {
+    fn push(&mut self, step: f64, recipe: &Recipe, clock: &Clock) {
+        let values = knobs(recipe, clock);
+        if self.knobs.is_empty() {
+            self.knobs = values
+                .iter()
+                .map(|(name, _)| KnobCurve {
+                    name: (*name).to_owned(),
+                    values: Vec::new(),
+                })
+                .collect();
+        }
+        self.steps.push(step as f32);
+        for (knob, (_, value)) in self.knobs.iter_mut().zip(values) {
+            knob.values.push(value);
+        }
+    }
+}
+
+/// What is drawn.
+fn knobs(recipe: &Recipe, clock: &Clock) -> Vec<(&'static str, f32)> {
+    let StepPlan {
+        image_scale,
+        sh_degree,
+        losses,
+        regularizers,
+        trained_share,
+        rates,
+        ..
+    } = plan(recipe, clock);
+    let count_share = ahead(recipe, clock, 1).first().map_or(1.0, |ahead| ahead.count_share);
+    vec![
+        ("scale.image", image_scale),
+        ("count.allowed", count_share as f32),
+        ("count.trained", trained_share),
+        ("degree.SH", sh_degree as f32),
+        ("rate.means", rates.means),
+        ("rate.quaternions", rates.quats),
+        ("rate.scales", rates.log_scales),
+        ("rate.opacities", rates.opacities),
+        ("rate.SH, base", rates.sh_dc),
+        ("rate.SH, rest", rates.sh_rest),
+        ("loss.L1", losses.photometric.l1),
+        ("loss.SSIM", losses.photometric.ssim),
+        ("loss.squared", losses.photometric.mse),
+        ("loss.coarse", losses.coarse),
+        ("loss.perceptual", losses.perceptual),
+        ("loss.alpha", losses.alpha),
+        ("loss.depth", losses.depth),
+        ("loss.smooth", losses.smooth),
+        ("loss.opacity", regularizers.opacity),
+        ("loss.opacity squared", regularizers.opacity_square),
+        ("loss.size", regularizers.scale),
+        ("loss.covariance", regularizers.covariance),
+    ]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Three stages: a rate over the run, a scale over the first, a weight in the second.
+    fn recipe(exit: &str) -> Recipe {
+        let overrides = [
+            "stage.warmup.steps=100",
+            "stage.grow.steps=100",
+            "stage.refine.steps=200",
+            "params.rate_means={ from = 4.0, to = 0.0 }",
+            "stage.warmup.params.image_scale={ from = 0.5, to = 1.0 }",
+            "stage.grow.params.depth_weight=0.25",
+            exit,
+        ];
+        let overrides: Vec<String> = overrides
+            .iter()
+            .filter(|o| !o.is_empty())
+            .map(|o| (*o).to_owned())
+            .collect();
+        Recipe::parse("classic", Recipe::built_in("classic").unwrap(), &overrides).unwrap()
+    }
+
+    fn stage(name: &str, first_step: u64, last_step: u64) -> StageReport {
+        StageReport {
+            name: name.into(),
+            first_step,
+            last_step,
+            seconds: 1.0,
+        }
+    }
+
+    fn at(schedule: &Schedule, name: &str, step: f32) -> f32 {
+        let knob = schedule.knobs.iter().find(|knob| knob.name == name).unwrap();
+        let near = schedule.steps.iter().position(|s| *s >= step - 1e-3).unwrap();
+        knob.values[near]
+    }
+
+    fn ended(recipe: &Recipe) -> Clock {
+        Clock {
+            stage: recipe.stage.len(),
+            ..Clock::new(recipe)
+        }
+    }
+
+    #[test]
+    fn a_run_without_early_ends_shows_the_plan() {
+        let recipe = recipe("");
+        let stages = [
+            stage("warmup", 1, 50),
+            stage("grow", 51, 100),
+            stage("refine", 101, 200),
+        ];
+        let schedule = schedule(&recipe, &stages, &ended(&recipe), Some(200), false);
+        assert!(schedule.done && schedule.steps.windows(2).all(|w| w[0] <= w[1]));
+        assert_eq!(schedule.steps.last(), Some(&200.0));
+        assert!((at(&schedule, "rate.means", 100.0) - 2.0).abs() < 1e-3);
+        assert!((at(&schedule, "scale.image", 25.0) - 0.75).abs() < 0.01);
+        assert_eq!(
+            (at(&schedule, "loss.depth", 25.0), at(&schedule, "loss.depth", 75.0)),
+            (0.0, 0.25)
+        );
+        assert!(schedule.knobs.iter().all(|knob| knob.name != "loss.coarse"));
+        assert!(
+            schedule
+                .knobs
+                .iter()
+                .all(|knob| knob.values.len() == schedule.steps.len())
+        );
+    }
+
+    #[test]
+    fn a_stage_left_early_shows_what_was_done() {
+        // As the clock itself goes when the first stage ends after 40 steps.
+        let recipe = recipe("stage.warmup.exit={ when = 'threshold', tau = 0.1 }");
+        let mut clock = Clock::new(&recipe);
+        let mut truth = Vec::new();
+        let mut entered = Vec::new();
+        while !clock.finished(&recipe) {
+            truth.push(plan(&recipe, &clock));
+            let error = if clock.step + 1 < 40 { 1.0 } else { 0.0 };
+            let signal = Signal {
+                error,
+                measured: Some(error),
+                views: 1,
+            };
+            if clock.tick(&recipe, 1.0, signal) {
+                entered.push(clock.step);
+            }
+        }
+        assert_eq!(entered, [40, 140, 340]);
+        let stages = [
+            stage("warmup", 1, 40),
+            stage("grow", 41, 140),
+            stage("refine", 141, 340),
+        ];
+        let schedule = schedule(&recipe, &stages, &clock, None, false);
+        assert!(schedule.done);
+        for (step, name, of) in [
+            (20.0, "scale.image", truth[20].image_scale),
+            (41.0, "scale.image", truth[41].image_scale),
+            (100.0, "loss.depth", 0.25),
+        ] {
+            assert!((at(&schedule, name, step) - of).abs() < 0.02, "{name} at {step}");
+        }
+        let rates = schedule.knobs.iter().find(|knob| knob.name == "rate.means").unwrap();
+        for (step, value) in schedule.steps.iter().zip(&rates.values) {
+            let want = truth[(*step as usize).min(339)].rates.means;
+            assert!((value - want).abs() < 0.03, "{value}, not {want}, at {step}");
+        }
+    }
+
+    #[test]
+    fn a_run_that_was_stopped_ends_where_it_stands_and_a_timed_one_says_what_it_is() {
+        let recipe = recipe("stage.warmup.exit={ when = 'threshold', tau = 0.1 }");
+        let clock = Clock {
+            stage: 1,
+            step: 150,
+            stage_step: 100,
+            time: 150.0,
+            stage_time: 100.0,
+            ..Clock::new(&recipe)
+        };
+        let stages = [stage("warmup", 1, 100), stage("grow", 101, 150)];
+        let half = schedule(&recipe, &stages, &clock, None, false);
+        assert!(half.done && half.steps.last() == Some(&150.0));
+        assert!(!schedule(&recipe, &stages, &clock, None, true).done);
+        assert_eq!(
+            schedule(&recipe, &[], &Clock::new(&recipe), None, false),
+            Schedule {
+                done: true,
+                ..Schedule::default()
+            }
+        );
+    }
+}

@@ -58,7 +58,11 @@ impl Ingredients {
         if !self.loss_schedule {
             // A knob that the last stage does not name holds from the last stage that does.
             for param in LOSSES {
-                let last = recipe.stage.iter().rev().find_map(|stage| stage.params.get(&param).cloned());
+                let last = recipe
+                    .stage
+                    .iter()
+                    .rev()
+                    .find_map(|stage| stage.params.get(&param).cloned());
                 if let Some(knob) = last {
                     forget(recipe, &[param]);
                     recipe.params.insert(param, knob);
@@ -112,6 +116,10 @@ mod tests {
         assert_eq!(found(&without("loss_schedule")), [true, true, false, true]);
         assert_eq!(found(&without("adaptive_transitions")), [true, true, true, false]);
         let again = Recipe::parse("again", &without("data_schedule").to_toml(), &[]).unwrap();
-        assert_eq!(again, without("data_schedule"), "what a run writes down is read as the same");
+        assert_eq!(
+            again,
+            without("data_schedule"),
+            "what a run writes down is read as the same"
+        );
     }
 }

@@ -18,7 +18,10 @@ pub const BUILT_IN: [(&str, &str); 7] = [
     ("taming", include_str!("../../../../recipes/taming.toml")),
     ("fast", include_str!("../../../../recipes/fast.toml")),
     ("curriculum", include_str!("../../../../recipes/curriculum.toml")),
-    ("curriculum-paper", include_str!("../../../../recipes/curriculum-paper.toml")),
+    (
+        "curriculum-paper",
+        include_str!("../../../../recipes/curriculum-paper.toml"),
+    ),
 ];
 
 /// Why a recipe was refused: one line that names the key.

@@ -46,11 +46,25 @@ pub trait Simd: Copy + Send + Sync + 'static {
 }
 
 /// The scalar in a lane.
-pub trait Scalar: Copy + Default + Debug + PartialOrd + Send + Sync + Add<Output = Self> + 'static {
+pub trait Scalar:
+    Copy
+    + Default
+    + Debug
+    + PartialOrd
+    + Send
+    + Sync
+    + Add<Output = Self>
+    + Sub<Output = Self>
+    + Mul<Output = Self>
+    + Div<Output = Self>
+    + 'static
+{
     /// From double precision, rounded.
     fn from_f64(value: f64) -> Self;
     /// To double precision.
     fn to_f64(self) -> f64;
+    /// Of a whole number from 0 to 2^22: no test and no saturation, so that loops over arrays become vectors.
+    fn to_u32(self) -> u32;
 }
 
 impl Scalar for f32 {
@@ -62,6 +76,11 @@ impl Scalar for f32 {
     fn to_f64(self) -> f64 {
         f64::from(self)
     }
+    #[inline(always)]
+    fn to_u32(self) -> u32 {
+        // Adding 2^23 leaves the whole number in the mantissa.
+        (self + 8_388_608.0).to_bits() & 0x7f_ffff
+    }
 }
 
 impl Scalar for f64 {
@@ -72,6 +91,10 @@ impl Scalar for f64 {
     #[inline(always)]
     fn to_f64(self) -> f64 {
         self
+    }
+    #[inline(always)]
+    fn to_u32(self) -> u32 {
+        self as u32
     }
 }
 

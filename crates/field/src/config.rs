@@ -1,0 +1,195 @@
+//! What a field's shape depends on.
+
+use crate::FieldError;
+use crate::encoding::{DirectionEncoding, Frequency, HashGrid, PositionEncoding};
+use crate::net::{Activation, ColorShape, NetShape};
+use crate::sample::march::Steps;
+
+/// Where along a ray samples lie.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Sampler {
+    /// Steps through the occupied cells of a grid (Instant-NGP).
+    Occupancy(Occupancy),
+    /// NeRF: a coarse network over even intervals, a fine one over these and more, drawn from the coarse weights.
+    Hierarchy {
+        /// Even intervals: 64.
+        coarse: usize,
+        /// More for the fine network: 128.
+        fine: usize,
+    },
+    /// mip-NeRF 360: small networks propose where the last one looks.
+    Proposal {
+        /// Each proposal network with its number of intervals.
+        rounds: Vec<(NetShape, usize)>,
+        /// Intervals of the last network.
+        last: usize,
+    },
+}
+
+/// What is to be said about an occupancy grid.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Occupancy {
+    /// Cells a side; 128 in Instant-NGP.
+    pub side: usize,
+    /// How long steps are.
+    pub steps: Steps,
+    /// A cell is occupied where a step in it has this optical thickness; 0.01 in Instant-NGP.
+    pub thickness: f32,
+    /// What is left of a remembered density at each look; 0.95 in Instant-NGP.
+    pub decay: f32,
+}
+
+/// Everything that a field's shape depends on.
+#[derive(Clone, Debug, PartialEq)]
+pub struct FieldConfig {
+    /// The network that gives out colour (both of them, where the sampler is a hierarchy).
+    pub net: NetShape,
+    /// Where samples lie.
+    pub sampler: Sampler,
+    /// Photographs with an appearance code each, where [`ColorShape::appearance`] is not 0.
+    pub images: usize,
+}
+
+impl FieldConfig {
+    /// Instant-NGP's shape at sizes for processors: 8 levels of 4 features in tables of 2^15 corners, hidden layers of 32.
+    pub fn hash_grid() -> Self {
+        Self {
+            net: NetShape {
+                encoding: PositionEncoding::HashGrid(HashGrid {
+                    levels: 8,
+                    features: 4,
+                    log2_table: 15,
+                    coarsest: 16,
+                    finest: 512,
+                }),
+                width: 32,
+                depth: 1,
+                skip: None,
+                geometry: 15,
+                activation: Activation::Exp,
+                density_bias: -1.0,
+                color: Some(ColorShape {
+                    direction: DirectionEncoding::Harmonics,
+                    width: 32,
+                    depth: 2,
+                    appearance: 0,
+                }),
+            },
+            sampler: Sampler::Occupancy(Occupancy {
+                side: 128,
+                steps: Steps {
+                    shortest: 2.0 * 3.0f32.sqrt() / 512.0,
+                    cone: 0.0,
+                },
+                thickness: 0.01,
+                decay: 0.8,
+            }),
+            images: 0,
+        }
+    }
+
+    /// NeRF's shape: `width` is 256 as published, half of it in the head for colour.
+    pub fn nerf(width: usize, coarse: usize, fine: usize) -> Self {
+        Self {
+            net: NetShape {
+                encoding: PositionEncoding::Frequency(Frequency { octaves: 10 }),
+                width,
+                depth: 8,
+                skip: Some(5),
+                geometry: width,
+                activation: Activation::Relu,
+                density_bias: 0.0,
+                color: Some(ColorShape {
+                    direction: DirectionEncoding::Frequency(Frequency { octaves: 4 }),
+                    width: width / 2,
+                    depth: 1,
+                    appearance: 0,
+                }),
+            },
+            sampler: Sampler::Hierarchy { coarse, fine },
+            images: 0,
+        }
+    }
+
+    /// Numbers of an appearance code.
+    pub fn appearance(&self) -> usize {
+        self.net.color.map_or(0, |color| color.appearance)
+    }
+
+    /// The shapes of all networks, the last one last.
+    pub fn nets(&self) -> Vec<NetShape> {
+        match &self.sampler {
+            Sampler::Occupancy(_) => vec![self.net],
+            Sampler::Hierarchy { .. } => vec![self.net; 2],
+            Sampler::Proposal { rounds, .. } => rounds.iter().map(|(net, _)| *net).chain([self.net]).collect(),
+        }
+    }
+
+    /// Whether all sizes can be.
+    ///
+    /// # Errors
+    /// The first that cannot.
+    pub fn check(&self) -> Result<(), FieldError> {
+        let wrong = |what, value: String, hint| Err(FieldError::Config { what, value, hint });
+        for net in self.nets() {
+            if let PositionEncoding::HashGrid(g) = &net.encoding {
+                if ![1, 2, 4, 8].contains(&g.features) {
+                    return wrong("features of a level", g.features.to_string(), "say 1, 2, 4 or 8");
+                }
+                if !(1..=32).contains(&g.levels) {
+                    return wrong("levels", g.levels.to_string(), "say 1 to 32");
+                }
+                if !(4..=24).contains(&g.log2_table) {
+                    return wrong("log2 of a table", g.log2_table.to_string(), "say 4 to 24");
+                }
+                if g.coarsest < 1 || g.finest < g.coarsest || g.finest > 1 << 20 {
+                    let range = format!("{}..{}", g.coarsest, g.finest);
+                    return wrong("resolution of the grid", range, "say ascending sizes of 1 to 2^20");
+                }
+            }
+            if net.width == 0 || !net.width.is_multiple_of(8) {
+                return wrong("width of a hidden layer", net.width.to_string(), "say a multiple of 8");
+            }
+            if let Some(color) = net.color {
+                if color.width == 0 || !color.width.is_multiple_of(8) {
+                    return wrong(
+                        "width of a colour layer",
+                        color.width.to_string(),
+                        "say a multiple of 8",
+                    );
+                }
+                if color.appearance > 0 && self.images == 0 {
+                    return wrong("number of images", "0".into(), "appearance codes need one an image");
+                }
+            }
+        }
+        if self.net.color.is_none() {
+            return wrong("colour part", "absent".into(), "the last network must know colour");
+        }
+        match &self.sampler {
+            Sampler::Occupancy(o) => {
+                if !(4..=512).contains(&o.side) {
+                    return wrong("side of the occupancy grid", o.side.to_string(), "say 4 to 512");
+                }
+                if !(o.steps.shortest > 1e-5 && o.steps.cone >= 0.0 && o.steps.cone < 1.0) {
+                    return wrong(
+                        "step",
+                        o.steps.shortest.to_string(),
+                        "say more than 1e-5, and a cone of 0 to 1",
+                    );
+                }
+            }
+            Sampler::Hierarchy { coarse, fine } => {
+                if *coarse < 2 || *fine < 1 {
+                    return wrong("samples", format!("{coarse} + {fine}"), "say at least 2 and 1");
+                }
+            }
+            Sampler::Proposal { rounds, last } => {
+                if *last < 2 || rounds.is_empty() || rounds.iter().any(|(_, n)| *n < 2) {
+                    return wrong("samples of a round", last.to_string(), "say a round and at least 2");
+                }
+            }
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,313 @@
+//! Multi-resolution hash tables with trilinear interpolation (Mueller et al. 2022, section 3).
+//!
+//! A level of N cells a side has its features at the (N + 1)^3 corners: where they fit the table they lie there directly,
+//! else the corner's hash says where (equation 4). All features of a corner lie together, so that a corner is one access.
+
+use crate::Num;
+use crate::mlp::PANEL;
+use irradia_compute::each;
+use irradia_compute::simd::{Lanes, Scalar, Simd};
+
+/// Most features a level can have.
+pub const MAX_FEATURES: usize = 8;
+
+/// The encoding's sizes.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct HashGrid {
+    /// L, resolutions.
+    pub levels: usize,
+    /// F, features of a corner: 1, 2, 4 or 8.
+    pub features: usize,
+    /// log2 of T, the most corners a level stores.
+    pub log2_table: u32,
+    /// N_min, cells a side of the coarsest level.
+    pub coarsest: u32,
+    /// N_max, cells a side of the finest level.
+    pub finest: u32,
+}
+
+/// One level: where it lies and how corners find their entry.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct GridLevel {
+    /// Cells a side.
+    pub cells: u32,
+    /// Entries stored.
+    pub entries: usize,
+    /// Number of the first entry in the whole table.
+    pub first: usize,
+    /// Corners lie directly, x fastest.
+    pub dense: bool,
+}
+
+impl HashGrid {
+    /// The levels, coarsest first (equations 2 and 3).
+    pub fn level_table(&self) -> Vec<GridLevel> {
+        let steps = (self.levels.max(2) - 1) as f64;
+        let growth = ((f64::from(self.finest).ln() - f64::from(self.coarsest).ln()) / steps).exp();
+        let mut levels: Vec<GridLevel> = Vec::new();
+        for l in 0..self.levels {
+            // A hair more than the product, which should give `finest` itself at the last level.
+            let cells = (f64::from(self.coarsest) * growth.powi(l as i32) + 1e-6).floor() as u32;
+            let corners = (u64::from(cells) + 1).pow(3);
+            let dense = corners <= 1 << self.log2_table;
+            levels.push(GridLevel {
+                cells,
+                entries: if dense { corners as usize } else { 1 << self.log2_table },
+                first: levels.last().map_or(0, |l| l.first + l.entries),
+                dense,
+            });
+        }
+        levels
+    }
+
+    /// Numbers in all tables.
+    pub fn parameters(&self) -> usize {
+        self.level_table().last().map_or(0, |l| l.first + l.entries) * self.features
+    }
+}
+
+/// The eight corners around each sample of a panel: entry numbers and weights.
+struct Corners<T> {
+    index: [[u32; PANEL]; 8],
+    weight: [[T; PANEL]; 8],
+}
+
+/// Primes of equation 4; x is left as it is, so that neighbours along x are neighbours in memory.
+const PRIMES: [u32; 2] = [2_654_435_761, 805_459_861];
+
+#[inline(always)]
+fn corners<S: Simd>(simd: S, level: &GridLevel, points: &[Num<S>], out: &mut Corners<Num<S>>) {
+    let mut whole = [[0u32; PANEL]; 3];
+    let (zero, one) = (simd.splat(0.0), simd.splat(1.0));
+    let cells = simd.splat(f64::from(level.cells));
+    // A point on the far face belongs to the last cell.
+    let last = simd.splat(f64::from(level.cells - 1));
+    for s in (0..PANEL).step_by(S::LANES) {
+        let mut fraction = [zero; 3];
+        for c in 0..3 {
+            let p = simd.load(&points[c * PANEL + s..]).max(zero).min(one) * cells;
+            let floor = p.floor().min(last);
+            fraction[c] = p - floor;
+            let mut floors = [Num::<S>::default(); PANEL];
+            floor.store(&mut floors);
+            for i in 0..S::LANES {
+                whole[c][s + i] = floors[i].to_u32();
+            }
+        }
+        let [x, y, z] = fraction;
+        let (x0, y0, z0) = (one - x, one - y, one - z);
+        let plane = [y0 * z0, y * z0, y0 * z, y * z];
+        for k in 0..4 {
+            (x0 * plane[k]).store(&mut out.weight[2 * k][s..]);
+            (x * plane[k]).store(&mut out.weight[2 * k + 1][s..]);
+        }
+    }
+    let [x, y, z] = whole;
+    if level.dense {
+        let side = level.cells + 1;
+        for s in 0..PANEL {
+            let at = x[s] + side * (y[s] + side * z[s]);
+            let rows = [at, at + side, at + side * side, at + side * side + side];
+            for k in 0..4 {
+                out.index[2 * k][s] = rows[k];
+                out.index[2 * k + 1][s] = rows[k] + 1;
+            }
+        }
+    } else {
+        let mask = level.entries as u32 - 1;
+        for s in 0..PANEL {
+            let y0 = y[s].wrapping_mul(PRIMES[0]);
+            let z0 = z[s].wrapping_mul(PRIMES[1]);
+            let (y1, z1) = (y0.wrapping_add(PRIMES[0]), z0.wrapping_add(PRIMES[1]));
+            let rows = [y0 ^ z0, y1 ^ z0, y0 ^ z1, y1 ^ z1];
+            for k in 0..4 {
+                out.index[2 * k][s] = (x[s] ^ rows[k]) & mask;
+                out.index[2 * k + 1][s] = ((x[s] + 1) ^ rows[k]) & mask;
+            }
+        }
+    }
+}
+
+impl<T: Scalar> Corners<T> {
+    #[inline(always)]
+    fn new() -> Self {
+        Self {
+            index: [[0; PANEL]; 8],
+            weight: [[T::default(); PANEL]; 8],
+        }
+    }
+}
+
+/// Features of one level for panels of points: `points [panels, 3, 32]` in \[0, 1\] (clamped) to rows `row..row + F` of
+/// `to [panels, rows, 32]`.
+#[inline(always)]
+pub fn encode_level<S: Simd>(
+    simd: S,
+    grid: &HashGrid,
+    level: &GridLevel,
+    table: &[Num<S>],
+    points: &[Num<S>],
+    row: usize,
+    rows: usize,
+    to: &mut [Num<S>],
+) {
+    match grid.features {
+        1 => encode_features::<S, 1>(simd, level, table, points, row, rows, to),
+        2 => encode_features::<S, 2>(simd, level, table, points, row, rows, to),
+        4 => encode_features::<S, 4>(simd, level, table, points, row, rows, to),
+        _ => encode_features::<S, 8>(simd, level, table, points, row, rows, to),
+    }
+}
+
+#[inline(always)]
+fn encode_features<S: Simd, const F: usize>(
+    simd: S,
+    level: &GridLevel,
+    table: &[Num<S>],
+    points: &[Num<S>],
+    row: usize,
+    rows: usize,
+    to: &mut [Num<S>],
+) {
+    let table = &table.as_chunks::<F>().0[level.first..level.first + level.entries];
+    let mut at = Corners::new();
+    for (points, to) in points.chunks_exact(3 * PANEL).zip(to.chunks_exact_mut(rows * PANEL)) {
+        corners(simd, level, points, &mut at);
+        let to = &mut to.as_chunks_mut::<PANEL>().0[row..row + F];
+        for s in 0..PANEL {
+            let mut sum = [Num::<S>::default(); F];
+            for k in 0..8 {
+                let entry = &table[at.index[k][s] as usize];
+                let weight = at.weight[k][s];
+                for f in 0..F {
+                    sum[f] = sum[f] + entry[f] * weight;
+                }
+            }
+            for f in 0..F {
+                to[f][s] = sum[f];
+            }
+        }
+    }
+}
+
+/// Adds to the gradient of one level's `grads [entries, F]`, sample after sample, so that the order is the samples' own.
+///
+/// `v [panels, F, 32]` holds this level's rows only. A sample whose gradient is zero costs one test.
+#[inline(always)]
+pub fn encode_level_vjp<S: Simd>(
+    simd: S,
+    grid: &HashGrid,
+    level: &GridLevel,
+    points: &[Num<S>],
+    v: &[Num<S>],
+    row: usize,
+    rows: usize,
+    grads: &mut [Num<S>],
+) {
+    match grid.features {
+        1 => features_vjp::<S, 1>(simd, level, points, v, row, rows, grads),
+        2 => features_vjp::<S, 2>(simd, level, points, v, row, rows, grads),
+        4 => features_vjp::<S, 4>(simd, level, points, v, row, rows, grads),
+        _ => features_vjp::<S, 8>(simd, level, points, v, row, rows, grads),
+    }
+}
+
+#[inline(always)]
+fn features_vjp<S: Simd, const F: usize>(
+    simd: S,
+    level: &GridLevel,
+    points: &[Num<S>],
+    v: &[Num<S>],
+    row: usize,
+    rows: usize,
+    grads: &mut [Num<S>],
+) {
+    let grads = &mut grads.as_chunks_mut::<F>().0[..level.entries];
+    let mut at = Corners::new();
+    for (points, v) in points.chunks_exact(3 * PANEL).zip(v.chunks_exact(rows * PANEL)) {
+        corners(simd, level, points, &mut at);
+        let v = &v.as_chunks::<PANEL>().0[row..row + F];
+        for s in 0..PANEL {
+            let mut g = [Num::<S>::default(); F];
+            for f in 0..F {
+                g[f] = v[f][s];
+            }
+            if g == [Num::<S>::default(); F] {
+                continue;
+            }
+            for k in 0..8 {
+                let entry = &mut grads[at.index[k][s] as usize];
+                let weight = at.weight[k][s];
+                for f in 0..F {
+                    entry[f] = entry[f] + g[f] * weight;
+                }
+            }
+        }
+    }
+}
+
+/// Adds the gradient of the points, `v_points [panels, 3, 32]`, through one level (for normals).
+#[inline(always)]
+pub fn encode_level_point_vjp<S: Simd>(
+    simd: S,
+    grid: &HashGrid,
+    level: &GridLevel,
+    table: &[Num<S>],
+    points: &[Num<S>],
+    v: &[Num<S>],
+    row: usize,
+    rows: usize,
+    v_points: &mut [Num<S>],
+) {
+    let features = grid.features;
+    let table = &table[level.first * features..(level.first + level.entries) * features];
+    let cells = simd.splat(f64::from(level.cells));
+    let (zero, one) = (simd.splat(0.0), simd.splat(1.0));
+    let last = simd.splat(f64::from(level.cells - 1));
+    let mut at = Corners::new();
+    let panels = points.chunks_exact(3 * PANEL).zip(v.chunks_exact(rows * PANEL));
+    for ((points, v), v_points) in panels.zip(v_points.chunks_exact_mut(3 * PANEL)) {
+        corners(simd, level, points, &mut at);
+        // What each corner's weight is worth to the loss.
+        let mut worth = [[Num::<S>::default(); PANEL]; 8];
+        for k in 0..8 {
+            for s in 0..PANEL {
+                let entry = &table[at.index[k][s] as usize * features..][..features];
+                for f in 0..features {
+                    worth[k][s] = worth[k][s] + entry[f] * v[(row + f) * PANEL + s];
+                }
+            }
+        }
+        for s in (0..PANEL).step_by(S::LANES) {
+            let mut fraction = [zero; 3];
+            let mut inside = [zero; 3];
+            for c in 0..3 {
+                let p = simd.load(&points[c * PANEL + s..]);
+                inside[c] = cells.zero_where_not(mask_between(zero, p, one));
+                let p = p.max(zero).min(one) * cells;
+                fraction[c] = p - p.floor().min(last);
+            }
+            let high = fraction;
+            let low = each!(c in 3 => one - high[c]);
+            for c in 0..3 {
+                let (d, e) = ((c + 1) % 3, (c + 2) % 3);
+                let mut slope = zero;
+                for k in 0..8 {
+                    let side = |axis: usize| (k >> axis) & 1 == 1;
+                    let w_d = if side(d) { high[d] } else { low[d] };
+                    let w_e = if side(e) { high[e] } else { low[e] };
+                    let term = w_d * w_e * simd.load(&worth[k][s..]);
+                    slope = if side(c) { slope + term } else { slope - term };
+                }
+                let to = &mut v_points[c * PANEL + s..];
+                slope.mul_add(inside[c], simd.load(to)).store(to);
+            }
+        }
+    }
+}
+
+#[inline(always)]
+fn mask_between<F: Lanes>(low: F, p: F, high: F) -> F::Mask {
+    use irradia_compute::simd::Mask;
+    low.le(p).and(p.le(high))
+}

@@ -1,0 +1,36 @@
+//! What turns a position or a direction into features that a small network can use.
+
+pub mod direction;
+pub mod frequency;
+pub mod hash_grid;
+
+pub use direction::DirectionEncoding;
+pub use frequency::Frequency;
+pub use hash_grid::HashGrid;
+
+/// How positions are encoded.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum PositionEncoding {
+    /// Sines and cosines (NeRF).
+    Frequency(Frequency),
+    /// Interpolated tables (Instant-NGP).
+    HashGrid(HashGrid),
+}
+
+impl PositionEncoding {
+    /// Rows of features, unpadded.
+    pub fn features(&self) -> usize {
+        match self {
+            Self::Frequency(f) => f.features(),
+            Self::HashGrid(g) => g.levels * g.features,
+        }
+    }
+
+    /// Numbers that are trained.
+    pub fn parameters(&self) -> usize {
+        match self {
+            Self::Frequency(_) => 0,
+            Self::HashGrid(g) => g.parameters(),
+        }
+    }
+}

@@ -1,0 +1,145 @@
+//! A radiance field and its numbers.
+
+use crate::config::{FieldConfig, Sampler};
+use crate::net::{Net, NetParameters};
+use crate::sample::OccupancyGrid;
+use crate::space::Space;
+use crate::tensors::{Tensors, fill, fill_one, named};
+use irradia_scene::Rng;
+
+/// What a [`FieldConfig`] or a list of tensors has wrong.
+#[derive(Debug, thiserror::Error)]
+pub enum FieldError {
+    /// A size that cannot be.
+    #[error("field: {what} is {value}; {hint}")]
+    Config {
+        /// Which.
+        what: &'static str,
+        /// What it is.
+        value: String,
+        /// What to do.
+        hint: &'static str,
+    },
+    /// A tensor that is missing or has another size than the configuration says.
+    #[error("field: tensor {name} has {found} values and not {expected}; was it written with another configuration?")]
+    Tensor {
+        /// Its name.
+        name: String,
+        /// Values found, 0 where it is missing.
+        found: usize,
+        /// Values wanted.
+        expected: usize,
+    },
+}
+
+/// A radiance field.
+#[derive(Clone, Debug)]
+pub struct Field {
+    /// What it was built from.
+    pub config: FieldConfig,
+    /// Where it lives.
+    pub space: Space,
+    /// Its networks, the last one last.
+    pub nets: Vec<Net>,
+    /// Their numbers.
+    pub parameters: Vec<NetParameters<f32>>,
+    /// Appearance codes `[images, appearance]`.
+    pub codes: Vec<f32>,
+    /// Where something is, for [`Sampler::Occupancy`].
+    pub occupancy: Option<OccupancyGrid>,
+}
+
+impl Field {
+    /// A field with random numbers.
+    ///
+    /// # Errors
+    /// When the configuration cannot be.
+    pub fn new(config: FieldConfig, space: Space, seed: u64) -> Result<Self, FieldError> {
+        config.check()?;
+        let nets: Vec<Net> = config.nets().into_iter().map(Net::new).collect();
+        let parameters = nets
+            .iter()
+            .enumerate()
+            .map(|(i, net)| net.init(&mut Rng::new(seed, 0xf1e1d + i as u64)))
+            .collect();
+        let codes = config.images * config.appearance();
+        let occupancy = match &config.sampler {
+            Sampler::Occupancy(o) => Some(OccupancyGrid::new(o.side)),
+            _ => None,
+        };
+        Ok(Self {
+            config,
+            space,
+            nets,
+            parameters,
+            codes: vec![0.0; codes],
+            occupancy,
+        })
+    }
+
+    /// Numbers that are trained.
+    pub fn len(&self) -> usize {
+        let net = |p: &NetParameters<f32>| p.table.len() + p.density.len() + p.color.len();
+        self.parameters.iter().map(net).sum::<usize>() + self.codes.len()
+    }
+
+    /// Whether there are none; never so.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// Names and values of everything that makes the field: enough to render it again with its configuration and space.
+    pub fn tensors(&self) -> Tensors<'_> {
+        let mut list = named("", &self.parameters, &self.codes);
+        if let Some(grid) = &self.occupancy {
+            list.push(("occupancy".into(), vec![grid.side; 3], &grid.density));
+        }
+        list
+    }
+
+    /// The field of [`Self::tensors`].
+    ///
+    /// # Errors
+    /// When the configuration cannot be, or a tensor is missing or has another size.
+    pub fn from_tensors(
+        config: FieldConfig,
+        space: Space,
+        mut get: impl FnMut(&str) -> Option<Vec<f32>>,
+    ) -> Result<Self, FieldError> {
+        let mut field = Self::new(config, space, 0)?;
+        fill("", &mut field.parameters, &mut field.codes, &mut get)?;
+        if let Some(grid) = &mut field.occupancy {
+            let mut density = grid.density.clone();
+            fill_one("occupancy", &mut density, &mut get)?;
+            grid.density = density;
+            field.mark_occupied();
+        }
+        Ok(field)
+    }
+
+    /// The appearance code of a photograph; zeros, the mean, of none and of one that was not trained on.
+    pub(crate) fn code(&self, image: Option<u32>) -> Vec<f32> {
+        let size = self.config.appearance();
+        let at = image.map_or(usize::MAX, |image| image as usize * size);
+        self.codes
+            .get(at..at.saturating_add(size))
+            .map_or_else(|| vec![0.0; size], <[f32]>::to_vec)
+    }
+
+    /// The networks' weights turned over, for going back.
+    pub(crate) fn turned(&self) -> Vec<NetParameters<f32>> {
+        self.nets
+            .iter()
+            .zip(&self.parameters)
+            .map(|(net, parameters)| net.transposed(parameters))
+            .collect()
+    }
+
+    /// Makes the occupancy bits from the remembered densities.
+    pub(crate) fn mark_occupied(&mut self) {
+        if let (Some(grid), Sampler::Occupancy(o)) = (&mut self.occupancy, &self.config.sampler) {
+            let space = &self.space;
+            grid.threshold(o.thickness, |u| o.steps.near(space.from_unit(u)));
+        }
+    }
+}

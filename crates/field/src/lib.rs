@@ -1,0 +1,41 @@
+//! Radiance fields on processors: NeRF (Mildenhall et al. 2020) and the hash grid (Mueller et al. 2022) as two configurations
+//! of one [`Field`], with the proposal sampling and contraction of mip-NeRF 360 (Barron et al. 2022).
+//!
+//! A run: [`Space::around`] or [`Space::ndc`] from the cameras, [`Field::new`], [`FieldState::new`], then [`train_views`] a step;
+//! [`render_view`] shows, [`to_points`] hands surfaces on, [`FieldState::tensors`] with the step and the number of rays is a
+//! checkpoint from which the run goes on bit by bit.
+#![forbid(unsafe_code)]
+
+mod batch;
+mod config;
+pub mod contraction;
+pub mod encoding;
+mod field;
+mod look;
+pub mod mlp;
+pub mod net;
+mod optimise;
+mod pass;
+pub mod render;
+mod rows;
+pub mod sample;
+mod space;
+mod state;
+mod tensors;
+mod to_points;
+mod train;
+
+pub use batch::{Background, RayBatch, TrainView};
+pub use config::{FieldConfig, Occupancy, Sampler};
+pub use field::{Field, FieldError};
+pub use look::{color_at, density_at, update_occupancy};
+pub use render::view::{FieldView, RenderOptions, camera_ray, render_view};
+pub use rows::Rows;
+pub use space::{Frustum, Measure, Outside, Ray, Space};
+pub use state::FieldState;
+pub use tensors::Tensors;
+pub use to_points::{FieldPoints, PointsOptions, to_points};
+pub use train::{StepLoss, StepOptions, train_step, train_views};
+
+/// The scalar in a lane of `S`.
+pub(crate) type Num<S> = <<S as irradia_compute::simd::Simd>::F as irradia_compute::simd::Lanes>::Scalar;

@@ -1,0 +1,438 @@
+//! One network of a field: encoded position to density and geometry features, and these with the direction to colour.
+//!
+//! A block of samples goes through in three steps, so that those which nobody sees need not go on:
+//! [`Net::density`], [`Block::keep`], [`Net::color`]; then back through [`Net::backward`].
+
+use crate::encoding::hash_grid::{GridLevel, encode_level, encode_level_point_vjp, encode_level_vjp};
+use crate::encoding::{DirectionEncoding, PositionEncoding};
+use crate::mlp::{Mlp, MlpShape, PANEL};
+use crate::{Num, Rows};
+use irradia_compute::simd::{Lanes, Scalar, Simd};
+use irradia_scene::Rng;
+
+mod block;
+
+pub use block::{Block, get3, place, set3};
+
+/// How a network's first output becomes a density, one over field units.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Activation {
+    /// e^x, cut off at x = 10 (Instant-NGP).
+    Exp,
+    /// ln(1 + e^x) (mip-NeRF).
+    Softplus,
+    /// max(x, 0) (NeRF).
+    Relu,
+}
+
+/// The half of a network that knows colour.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ColorShape {
+    /// How the viewing direction comes in.
+    pub direction: DirectionEncoding,
+    /// Features of a hidden layer.
+    pub width: usize,
+    /// Hidden layers: 2 in Instant-NGP, 1 of half the width in NeRF.
+    pub depth: usize,
+    /// Numbers of a photograph's own appearance code; 0 for none.
+    pub appearance: usize,
+}
+
+/// The sizes of a network.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct NetShape {
+    /// How positions come in.
+    pub encoding: PositionEncoding,
+    /// Features of a hidden layer of the density part: 64 in Instant-NGP, 256 in NeRF.
+    pub width: usize,
+    /// Hidden layers of the density part: 1 in Instant-NGP, 8 in NeRF.
+    pub depth: usize,
+    /// The hidden layer (from 0) that sees the encoded position again; NeRF: 5.
+    pub skip: Option<usize>,
+    /// Features handed from density to colour: 15 in Instant-NGP, 256 in NeRF.
+    pub geometry: usize,
+    /// How the density is made positive.
+    pub activation: Activation,
+    /// What is added to the raw density.
+    pub density_bias: f32,
+    /// `None` for a proposal network, which knows densities alone.
+    pub color: Option<ColorShape>,
+}
+
+/// A network laid out; [`NetParameters`] are its numbers.
+#[derive(Clone, Debug)]
+pub struct Net {
+    /// The sizes.
+    pub shape: NetShape,
+    /// The tables' levels, none for frequencies.
+    pub levels: Vec<GridLevel>,
+    density: Mlp,
+    color: Option<Mlp>,
+}
+
+/// What is trained: also the shape of gradients and moments.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct NetParameters<T> {
+    /// All levels' tables, `[entries, F]`.
+    pub table: Vec<T>,
+    /// The density part, flat.
+    pub density: Vec<T>,
+    /// The colour part, flat.
+    pub color: Vec<T>,
+}
+
+impl<T: Scalar> NetParameters<T> {
+    /// Zeros of the same shape.
+    pub fn zeros_like(&self) -> Self {
+        Self {
+            table: vec![T::default(); self.table.len()],
+            ..self.without_table()
+        }
+    }
+
+    /// Zeros for the networks, and no table.
+    pub fn without_table(&self) -> Self {
+        Self {
+            table: Vec::new(),
+            density: vec![T::default(); self.density.len()],
+            color: vec![T::default(); self.color.len()],
+        }
+    }
+}
+
+/// e^x.
+#[inline(always)]
+pub(crate) fn exp<F: Lanes>(x: F) -> F {
+    (x * x.splat(std::f64::consts::LOG2_E)).exp2()
+}
+
+impl Net {
+    /// Lays a network out.
+    pub fn new(shape: NetShape) -> Self {
+        let levels = match &shape.encoding {
+            PositionEncoding::HashGrid(grid) => grid.level_table(),
+            PositionEncoding::Frequency(_) => Vec::new(),
+        };
+        let density = Mlp::new(MlpShape {
+            inputs: shape.encoding.features(),
+            outputs: 1 + shape.color.map_or(0, |_| shape.geometry),
+            width: shape.width,
+            depth: shape.depth,
+            skip: shape.skip,
+        });
+        let color = shape.color.map(|color| {
+            Mlp::new(MlpShape {
+                inputs: shape.geometry + color.direction.features() + color.appearance,
+                outputs: 3,
+                width: color.width,
+                depth: color.depth,
+                skip: None,
+            })
+        });
+        Self {
+            shape,
+            levels,
+            density,
+            color,
+        }
+    }
+
+    /// Random parameters: tables uniform within 1e-4 (Instant-NGP), weights as [`Mlp::init`] has them.
+    pub fn init(&self, rng: &mut Rng) -> NetParameters<f32> {
+        NetParameters {
+            table: (0..self.shape.encoding.parameters())
+                .map(|_| rng.range(-1e-4, 1e-4))
+                .collect(),
+            density: self.density.init(rng),
+            color: self.color.as_ref().map_or_else(Vec::new, |mlp| mlp.init(rng)),
+        }
+    }
+
+    /// How many numbers table, density and colour part have.
+    pub fn sizes(&self) -> [usize; 3] {
+        [
+            self.shape.encoding.parameters(),
+            self.density.parameters(),
+            self.color.as_ref().map_or(0, Mlp::parameters),
+        ]
+    }
+
+    /// Multiplications of a sample in the networks, forward.
+    pub fn products(&self) -> usize {
+        self.density.products() + self.color.as_ref().map_or(0, Mlp::products)
+    }
+
+    /// Rows of an encoded position, padded.
+    pub fn encoded_rows(&self) -> usize {
+        self.density.inputs()
+    }
+
+    /// The weights turned over, for going back; no table.
+    pub fn transposed<T: Scalar>(&self, parameters: &NetParameters<T>) -> NetParameters<T> {
+        NetParameters {
+            table: Vec::new(),
+            density: self.density.transposed(&parameters.density),
+            color: self
+                .color
+                .as_ref()
+                .map_or_else(Vec::new, |mlp| mlp.transposed(&parameters.color)),
+        }
+    }
+
+    /// Encodes `block.points`.
+    #[inline(always)]
+    fn encode<S: Simd>(&self, simd: S, table: &[Num<S>], block: &mut Block<Num<S>>) {
+        let rows = self.encoded_rows();
+        block.encoded.clear();
+        block.encoded.resize(block.panels() * rows * PANEL, Default::default());
+        match &self.shape.encoding {
+            PositionEncoding::HashGrid(grid) => {
+                for (l, level) in self.levels.iter().enumerate() {
+                    let row = l * grid.features;
+                    encode_level(simd, grid, level, table, &block.points, row, rows, &mut block.encoded);
+                }
+            }
+            PositionEncoding::Frequency(frequency) => {
+                let mut about_zero = [Num::<S>::default(); 3 * PANEL];
+                for (points, to) in block
+                    .points
+                    .chunks_exact(3 * PANEL)
+                    .zip(block.encoded.chunks_exact_mut(rows * PANEL))
+                {
+                    for s in (0..3 * PANEL).step_by(S::LANES) {
+                        let p = simd.load(&points[s..]);
+                        (p + p - simd.splat(1.0)).store(&mut about_zero[s..]);
+                    }
+                    frequency.encode(simd, &about_zero, to);
+                }
+            }
+        }
+    }
+
+    /// `block.points` to `block.density`.
+    #[inline(always)]
+    pub fn density<S: Simd>(&self, simd: S, parameters: &NetParameters<Num<S>>, block: &mut Block<Num<S>>) {
+        self.encode(simd, &parameters.table, block);
+        self.density
+            .forward(simd, &parameters.density, &block.encoded, &mut block.density_tape);
+        let panels = block.panels();
+        block.density.resize(panels * PANEL, Default::default());
+        block.slope.resize(panels * PANEL, Default::default());
+        let rows = self.density.outputs();
+        let bias = simd.splat(f64::from(self.shape.density_bias));
+        let (zero, one) = (simd.splat(0.0), simd.splat(1.0));
+        for p in 0..panels {
+            for s in (0..PANEL).step_by(S::LANES) {
+                let x = simd.load(&block.density_tape.output()[p * rows * PANEL + s..]) + bias;
+                let (density, slope) = match self.shape.activation {
+                    Activation::Exp => {
+                        let cap = simd.splat(10.0);
+                        let y = exp(x.min(cap));
+                        (y, y)
+                    }
+                    Activation::Softplus => {
+                        let e = exp(-x.abs());
+                        let slope = one / (one + e);
+                        (
+                            x.max(zero) + (one + e).map(ln),
+                            slope.or_where_not(zero.le(x), one - slope),
+                        )
+                    }
+                    Activation::Relu => (x.max(zero), one.zero_where_not(zero.lt(x))),
+                };
+                density.store(&mut block.density[p * PANEL + s..]);
+                slope.store(&mut block.slope[p * PANEL + s..]);
+            }
+        }
+    }
+
+    /// `block.directions` (and codes) with what [`Net::density`] left, to `block.rgb`.
+    ///
+    /// # Panics
+    /// Where the network knows no colour.
+    #[inline(always)]
+    pub fn color<S: Simd>(&self, simd: S, parameters: &NetParameters<Num<S>>, block: &mut Block<Num<S>>) {
+        let (mlp, shape) = self.color_parts();
+        let panels = block.panels();
+        let (rows, from_rows) = (mlp.inputs(), self.density.outputs());
+        let geometry = self.shape.geometry;
+        block.color_in.clear();
+        block.color_in.resize(panels * rows * PANEL, Default::default());
+        for (p, to) in block.color_in.chunks_exact_mut(rows * PANEL).enumerate() {
+            let from = &block.density_tape.output()[p * from_rows * PANEL..];
+            to[..geometry * PANEL].copy_from_slice(&from[PANEL..][..geometry * PANEL]);
+            let directions = &block.directions[p * 3 * PANEL..][..3 * PANEL];
+            shape.direction.encode(simd, directions, &mut to[geometry * PANEL..]);
+            if shape.appearance > 0 {
+                let at = (geometry + shape.direction.features()) * PANEL;
+                let length = shape.appearance * PANEL;
+                to[at..][..length].copy_from_slice(&block.codes[p * length..][..length]);
+            }
+        }
+        mlp.forward(simd, &parameters.color, &block.color_in, &mut block.color_tape);
+        block.rgb.resize(panels * 3 * PANEL, Default::default());
+        let out_rows = mlp.outputs();
+        let one = simd.splat(1.0);
+        for p in 0..panels {
+            for s in (0..3 * PANEL).step_by(S::LANES) {
+                let x = simd.load(&block.color_tape.output()[p * out_rows * PANEL + s..]);
+                // The sigmoid by the side on which nothing overflows.
+                let e = exp(-x.abs());
+                let right = one / (one + e);
+                let y = right.or_where_not(simd.splat(0.0).le(x), one - right);
+                y.store(&mut block.rgb[p * 3 * PANEL + s..]);
+            }
+        }
+    }
+
+    fn color_parts(&self) -> (&Mlp, &ColorShape) {
+        match (&self.color, &self.shape.color) {
+            (Some(mlp), Some(shape)) => (mlp, shape),
+            _ => panic!("this network knows no colour"),
+        }
+    }
+
+    /// From `block.v_density` and, where `with_color`, `block.v_rgb`: adds to the networks' `grads` and leaves
+    /// `block.v_encoded`, from which tables and positions get theirs.
+    #[inline(always)]
+    pub fn backward<S: Simd>(
+        &self,
+        simd: S,
+        turned: &NetParameters<Num<S>>,
+        block: &mut Block<Num<S>>,
+        grads: &mut NetParameters<Num<S>>,
+        with_color: bool,
+    ) {
+        let panels = block.panels();
+        let rows = self.density.outputs();
+        let v_out = block.density_tape.output_gradient();
+        v_out.clear();
+        v_out.resize(panels * rows * PANEL, Default::default());
+        if with_color {
+            let (mlp, _) = self.color_parts();
+            let out_rows = mlp.outputs();
+            let v = block.color_tape.output_gradient();
+            v.clear();
+            v.resize(panels * out_rows * PANEL, Default::default());
+            let one = simd.splat(1.0);
+            for p in 0..panels {
+                for s in (0..3 * PANEL).step_by(S::LANES) {
+                    let y = simd.load(&block.rgb[p * 3 * PANEL + s..]);
+                    let v_y = simd.load(&block.v_rgb[p * 3 * PANEL + s..]);
+                    (v_y * y * (one - y)).store(&mut v[p * out_rows * PANEL + s..]);
+                }
+            }
+            let v_in = Some(&mut block.v_color_in);
+            mlp.backward(
+                simd,
+                &turned.color,
+                &block.color_in,
+                &mut block.color_tape,
+                &mut grads.color,
+                v_in,
+            );
+            let v_out = block.density_tape.output_gradient();
+            let length = self.shape.geometry * PANEL;
+            for p in 0..panels {
+                let from = &block.v_color_in[p * mlp.inputs() * PANEL..][..length];
+                v_out[(p * rows + 1) * PANEL..][..length].copy_from_slice(from);
+            }
+        }
+        let v_out = block.density_tape.output_gradient();
+        for p in 0..panels {
+            for s in (0..PANEL).step_by(S::LANES) {
+                let at = p * PANEL + s;
+                let v = simd.load(&block.v_density[at..]) * simd.load(&block.slope[at..]);
+                v.store(&mut v_out[p * rows * PANEL + s..]);
+            }
+        }
+        self.density.backward(
+            simd,
+            &turned.density,
+            &block.encoded,
+            &mut block.density_tape,
+            &mut grads.density,
+            Some(&mut block.v_encoded),
+        );
+    }
+
+    /// The gradient of appearance code number `k` of sample `i`, after [`Net::backward`].
+    pub fn code_gradient<T: Copy>(&self, block: &Block<T>, i: usize, k: usize) -> T {
+        let (mlp, shape) = self.color_parts();
+        let row = self.shape.geometry + shape.direction.features() + k;
+        block.v_color_in[place(mlp.inputs(), i) + row * PANEL]
+    }
+
+    /// Adds to the tables' gradient from `points` and `v_encoded` of a block, sample after sample.
+    #[inline(always)]
+    pub fn table_gradient<S: Simd>(&self, simd: S, points: &[Num<S>], v_encoded: &[Num<S>], grads: &mut [Num<S>]) {
+        let PositionEncoding::HashGrid(grid) = &self.shape.encoding else {
+            return;
+        };
+        for (l, level) in self.levels.iter().enumerate() {
+            let grads = &mut grads[level.first * grid.features..];
+            let (row, rows) = (l * grid.features, self.encoded_rows());
+            encode_level_vjp(simd, grid, level, points, v_encoded, row, rows, grads);
+        }
+    }
+
+    /// The derivative of each sample's density by its point, `[panels, 3, 32]`, after [`Net::density`].
+    #[inline(always)]
+    pub fn density_slope<S: Simd>(
+        &self,
+        simd: S,
+        parameters: &NetParameters<Num<S>>,
+        turned: &NetParameters<Num<S>>,
+        block: &mut Block<Num<S>>,
+        slope: &mut Rows<Num<S>>,
+    ) {
+        let (panels, rows) = (block.panels(), self.density.outputs());
+        let v_out = block.density_tape.output_gradient();
+        v_out.clear();
+        v_out.resize(panels * rows * PANEL, Default::default());
+        for p in 0..panels {
+            v_out[p * rows * PANEL..][..PANEL].copy_from_slice(&block.slope[p * PANEL..][..PANEL]);
+        }
+        let v_encoded = Some(&mut block.v_encoded);
+        self.density
+            .pull_back(simd, &turned.density, &mut block.density_tape, v_encoded);
+        self.point_gradient(simd, &parameters.table, block, slope);
+    }
+
+    /// The gradient of `block.points` from `block.v_encoded`, `[panels, 3, 32]`.
+    #[inline(always)]
+    pub fn point_gradient<S: Simd>(
+        &self,
+        simd: S,
+        table: &[Num<S>],
+        block: &Block<Num<S>>,
+        v_points: &mut Rows<Num<S>>,
+    ) {
+        v_points.clear();
+        v_points.resize(block.panels() * 3 * PANEL, Default::default());
+        let rows = self.encoded_rows();
+        match &self.shape.encoding {
+            PositionEncoding::HashGrid(grid) => {
+                for (l, level) in self.levels.iter().enumerate() {
+                    let (points, v) = (&block.points, &block.v_encoded);
+                    encode_level_point_vjp(simd, grid, level, table, points, v, l * grid.features, rows, v_points);
+                }
+            }
+            PositionEncoding::Frequency(frequency) => {
+                let panels = block.encoded.chunks_exact(rows * PANEL);
+                let panels = panels.zip(block.v_encoded.chunks_exact(rows * PANEL));
+                for ((encoded, v), v_points) in panels.zip(v_points.chunks_exact_mut(3 * PANEL)) {
+                    frequency.encode_vjp(simd, encoded, v, v_points);
+                    for s in (0..3 * PANEL).step_by(S::LANES) {
+                        let v = simd.load(&v_points[s..]);
+                        (v + v).store(&mut v_points[s..]);
+                    }
+                }
+            }
+        }
+    }
+}
+
+fn ln<T: Scalar>(x: T) -> T {
+    T::from_f64(x.to_f64().ln())
+}

@@ -1,0 +1,329 @@
+//! A few rays on their way through a field: samples, densities, weights, colours. Training and rendering share it.
+//!
+//! A chunk is as many rays as give a block of samples that stays in the cache: everything from encoding to compositing (and
+//! back) happens there before the next chunk begins.
+
+use crate::Rows;
+use crate::config::Sampler;
+use crate::field::Field;
+use crate::mlp::PANEL;
+use crate::net::{Block, Net, NetParameters, exp, get3, place, set3};
+use crate::render::quadrature::weights;
+use crate::sample::importance::importance;
+use crate::sample::march::march;
+use crate::sample::stratified::stratified;
+use crate::space::Ray;
+use irradia_compute::Level;
+use irradia_compute::simd::{Kernel, Lanes, Simd};
+use irradia_scene::Rng;
+
+/// Samples at which a chunk is full: 16 panels, whose activations fit the second cache.
+const CHUNK: usize = 512;
+
+/// One network's samples on a chunk of rays.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Pass {
+    /// Where each ray's samples begin, and the end.
+    pub starts: Vec<usize>,
+    /// Distances of the samples, field units.
+    pub middles: Vec<f32>,
+    /// Lengths of their intervals, field units; padded with zeros to whole panels.
+    pub lengths: Vec<f32>,
+    /// Edges of the intervals from 0 to 1, ray after ray, where the sampler works with them.
+    pub edges: Vec<f32>,
+    pub block: Block<f32>,
+    pub through: Vec<f32>,
+    pub weights: Vec<f32>,
+    /// What each ray lets through in all.
+    pub behind: Vec<f32>,
+    /// `[panels, 3, 32]`, after [`Self::slope`].
+    pub slopes: Rows<f32>,
+    kept: Vec<u32>,
+}
+
+impl Pass {
+    fn clear(&mut self) {
+        self.starts.clear();
+        self.starts.push(0);
+        self.middles.clear();
+        self.lengths.clear();
+        self.edges.clear();
+        self.behind.clear();
+    }
+
+    /// Ray `r`'s samples.
+    pub fn of(&self, r: usize) -> std::ops::Range<usize> {
+        self.starts[r]..self.starts[r + 1]
+    }
+
+    /// Colour, alpha and mean distance of ray `r`, before any background.
+    pub fn composite(&self, r: usize) -> ([f32; 3], f32, f32) {
+        let (mut color, mut distance) = ([0.0; 3], 0.0);
+        for i in self.of(r) {
+            let w = self.weights[i];
+            let rgb = get3(&self.block.rgb, i);
+            for c in 0..3 {
+                color[c] += w * rgb[c];
+            }
+            distance += w * self.middles[i];
+        }
+        (color, 1.0 - self.behind[r], distance)
+    }
+
+    /// The sample at which half of ray `r` is covered.
+    pub fn median(&self, r: usize) -> Option<usize> {
+        let mut covered = 0.0;
+        self.of(r).find(|i| {
+            covered += self.weights[*i];
+            covered >= 0.5
+        })
+    }
+
+    /// The derivative of each sample's density by its point of the unit cube, to [`Self::slopes`].
+    pub fn slope(&mut self, level: Level, field: &Field, net: usize, turned: &NetParameters<f32>) {
+        level.run(Slopes {
+            net: &field.nets[net],
+            parameters: &field.parameters[net],
+            turned,
+            block: &mut self.block,
+            slopes: &mut self.slopes,
+        });
+    }
+
+    /// Positions to densities to weights; where `last`, samples behind the end of their rays are forgotten.
+    fn look(&mut self, level: Level, field: &Field, net: usize, rays: &[Ray], last: bool) {
+        let n = self.middles.len();
+        self.block.reset(n);
+        for (r, ray) in rays.iter().enumerate() {
+            for i in self.of(r) {
+                set3(&mut self.block.points, i, field.space.unit(ray.at(self.middles[i])));
+            }
+        }
+        self.lengths.resize(self.block.panels() * PANEL, 0.0);
+        level.run(Densities {
+            net: &field.nets[net],
+            parameters: &field.parameters[net],
+            lengths: &self.lengths,
+            through: &mut self.through,
+            block: &mut self.block,
+        });
+        self.weights.resize(n, 0.0);
+        self.kept.clear();
+        for r in 0..rays.len() {
+            let range = self.of(r);
+            let (counted, behind) = weights(&self.through[range.clone()], &mut self.weights[range.clone()]);
+            self.behind.push(behind);
+            self.kept.extend((range.start..range.start + counted).map(|i| i as u32));
+        }
+        if last && self.kept.len() < n {
+            self.block.keep(&self.kept);
+            let mut at = 0;
+            for r in 0..rays.len() {
+                let end = self.starts[r + 1];
+                self.starts[r + 1] = at;
+                while at < self.kept.len() && (self.kept[at] as usize) < end {
+                    at += 1;
+                }
+                self.starts[r + 1] = at;
+            }
+            for (to, from) in self.kept.iter().map(|k| *k as usize).enumerate() {
+                self.middles[to] = self.middles[from];
+                self.lengths[to] = self.lengths[from];
+                self.through[to] = self.through[from];
+                self.weights[to] = self.weights[from];
+            }
+            for list in [&mut self.middles, &mut self.lengths, &mut self.weights] {
+                list.truncate(at);
+            }
+        }
+    }
+
+    /// Colours of all samples.
+    fn paint(&mut self, level: Level, field: &Field, net: usize, rays: &[Ray], images: &[u32]) {
+        let panels = self.block.panels();
+        self.block.directions.clear();
+        self.block.directions.resize(panels * 3 * PANEL, 0.0);
+        let size = field.config.appearance();
+        self.block.codes.clear();
+        self.block.codes.resize(panels * size * PANEL, 0.0);
+        for (r, ray) in rays.iter().enumerate() {
+            let code = if size > 0 {
+                field.code(images.get(r).copied())
+            } else {
+                Vec::new()
+            };
+            for i in self.starts[r]..self.starts[r + 1] {
+                set3(&mut self.block.directions, i, ray.view);
+                for (k, value) in code.iter().enumerate() {
+                    self.block.codes[place(size, i) + k * PANEL] = *value;
+                }
+            }
+        }
+        level.run(Colors {
+            net: &field.nets[net],
+            parameters: &field.parameters[net],
+            block: &mut self.block,
+        });
+    }
+
+    /// Fills middles and lengths from edges, `n` intervals a ray.
+    fn place_intervals(&mut self, field: &Field, rays: &[Ray], n: usize) {
+        for (r, ray) in rays.iter().enumerate() {
+            let (near, far) = (field.space.spread(ray.near), field.space.spread(ray.far.max(ray.near)));
+            let distance = |s: f32| field.space.unspread(near + s * (far - near));
+            for pair in self.edges[r * (n + 1)..][..n + 1].windows(2) {
+                let (a, b) = (distance(pair[0]), distance(pair[1]));
+                self.middles.push(0.5 * (a + b));
+                self.lengths.push(b - a);
+            }
+            self.starts.push(self.middles.len());
+        }
+    }
+}
+
+/// Takes as many of `rays` as make a chunk through the field, one [`Pass`] for each network; returns how many. `rng` moves the
+/// samples; without it they lie in the middle of their intervals.
+pub(crate) fn trace(
+    level: Level,
+    field: &Field,
+    rays: &[Ray],
+    images: &[u32],
+    mut rng: Option<&mut Rng>,
+    passes: &mut Vec<Pass>,
+) -> usize {
+    passes.resize_with(field.nets.len(), Pass::default);
+    passes.iter_mut().for_each(Pass::clear);
+    let rounds = match &field.config.sampler {
+        Sampler::Occupancy(options) => {
+            let pass = &mut passes[0];
+            let grid = field.occupancy.as_ref().expect("made with the field");
+            let mut taken = 0;
+            while taken < rays.len() && pass.middles.len() < CHUNK {
+                let offset = rng.as_mut().map_or(0.5, |rng| rng.uniform());
+                let ray = &rays[taken];
+                let (middles, lengths) = (&mut pass.middles, &mut pass.lengths);
+                march(&field.space, grid, &options.steps, ray, offset, middles, lengths);
+                pass.starts.push(pass.middles.len());
+                taken += 1;
+            }
+            pass.look(level, field, 0, &rays[..taken], true);
+            pass.paint(level, field, 0, &rays[..taken], images);
+            return taken;
+        }
+        Sampler::Hierarchy { coarse, fine } => vec![(*coarse, false), (*fine, true)],
+        Sampler::Proposal { rounds, last } => {
+            let rounds = rounds.iter().map(|(_, n)| (*n, false));
+            rounds.chain([(*last, false)]).collect()
+        }
+    };
+    let most = rounds.iter().map(|(n, _)| *n).max().unwrap_or(1);
+    let taken = rays.len().min((CHUNK / most).max(1));
+    let rays = &rays[..taken];
+    let mut edges = Vec::new();
+    let mut before = 0;
+    for (net, (drawn, union)) in rounds.iter().copied().enumerate() {
+        let (earlier, later) = passes.split_at_mut(net);
+        let pass = &mut later[0];
+        let n = if union { before + drawn } else { drawn };
+        for r in 0..taken {
+            match earlier.last() {
+                None => stratified(n, rng.as_deref_mut(), &mut edges),
+                Some(old) => {
+                    let old_edges = &old.edges[r * (before + 1)..][..before + 1];
+                    let histogram = blurred(&old.weights[r * before..][..before]);
+                    if union {
+                        importance(old_edges, &histogram, drawn, rng.as_deref_mut(), &mut edges);
+                        edges.extend_from_slice(old_edges);
+                        edges.sort_by(f32::total_cmp);
+                    } else {
+                        importance(old_edges, &histogram, drawn - 1, rng.as_deref_mut(), &mut edges);
+                        edges.insert(0, 0.0);
+                        edges.push(1.0);
+                    }
+                }
+            }
+            pass.edges.extend_from_slice(&edges);
+        }
+        pass.place_intervals(field, rays, n);
+        pass.look(level, field, net, rays, net + 1 == rounds.len());
+        if field.nets[net].shape.color.is_some() {
+            pass.paint(level, field, net, rays, images);
+        }
+        before = n;
+    }
+    taken
+}
+
+/// The larger of two neighbours' maxima, averaged, and a little everywhere: samples then surround what was found and nowhere is
+/// out of reach (mip-NeRF, section 3.3).
+fn blurred(weights: &[f32]) -> Vec<f32> {
+    let n = weights.len();
+    let at = |i: usize| weights[i.min(n - 1)];
+    (0..n)
+        .map(|i| 0.5 * (at(i.saturating_sub(1)).max(at(i)) + at(i).max(at(i + 1))) + 0.01 / n as f32)
+        .collect()
+}
+
+struct Densities<'a> {
+    net: &'a Net,
+    parameters: &'a NetParameters<f32>,
+    lengths: &'a [f32],
+    through: &'a mut Vec<f32>,
+    block: &'a mut Block<f32>,
+}
+
+impl Kernel for Densities<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<S: Simd>(self, simd: S)
+    where
+        S::F: Lanes<Scalar = f32>,
+    {
+        self.net.density(simd, self.parameters, self.block);
+        self.through.resize(self.lengths.len(), 0.0);
+        for s in (0..self.lengths.len()).step_by(S::LANES) {
+            let thickness = simd.load(&self.block.density[s..]) * simd.load(&self.lengths[s..]);
+            exp(-thickness).store(&mut self.through[s..]);
+        }
+    }
+}
+
+pub(crate) struct Colors<'a> {
+    pub net: &'a Net,
+    pub parameters: &'a NetParameters<f32>,
+    pub block: &'a mut Block<f32>,
+}
+
+impl Kernel for Colors<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<S: Simd>(self, simd: S)
+    where
+        S::F: Lanes<Scalar = f32>,
+    {
+        self.net.color(simd, self.parameters, self.block);
+    }
+}
+
+struct Slopes<'a> {
+    net: &'a Net,
+    parameters: &'a NetParameters<f32>,
+    turned: &'a NetParameters<f32>,
+    block: &'a mut Block<f32>,
+    slopes: &'a mut Rows<f32>,
+}
+
+impl Kernel for Slopes<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<S: Simd>(self, simd: S)
+    where
+        S::F: Lanes<Scalar = f32>,
+    {
+        self.net
+            .density_slope(simd, self.parameters, self.turned, self.block, self.slopes);
+    }
+}

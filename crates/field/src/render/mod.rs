@@ -1,0 +1,4 @@
+//! From samples to pixels and back.
+
+pub mod quadrature;
+pub mod view;

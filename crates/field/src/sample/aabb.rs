@@ -1,0 +1,20 @@
+//! Where a ray meets a box (Kay and Kajiya 1986, slabs).
+
+/// The distances along the ray at which it enters and leaves the box, not before 0; `None` where it misses.
+pub fn intersect(origin: [f32; 3], direction: [f32; 3], low: [f32; 3], high: [f32; 3]) -> Option<[f32; 2]> {
+    let (mut near, mut far) = (0.0f32, f32::INFINITY);
+    for c in 0..3 {
+        if direction[c] == 0.0 {
+            // Along the slab: all of the ray lies in it or none.
+            if origin[c] < low[c] || origin[c] > high[c] {
+                return None;
+            }
+            continue;
+        }
+        let inverse = 1.0 / direction[c];
+        let (a, b) = ((low[c] - origin[c]) * inverse, (high[c] - origin[c]) * inverse);
+        near = near.max(a.min(b));
+        far = far.min(a.max(b));
+    }
+    (near < far).then_some([near, far])
+}

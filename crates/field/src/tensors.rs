@@ -1,0 +1,62 @@
+//! A field's numbers by name, as files want them.
+
+use crate::field::FieldError;
+use crate::net::NetParameters;
+
+/// Name, shape and values, row after row.
+pub type Tensors<'a> = Vec<(String, Vec<usize>, &'a [f32])>;
+
+pub(crate) fn named<'a>(prefix: &str, nets: &'a [NetParameters<f32>], codes: &'a [f32]) -> Tensors<'a> {
+    let mut list = Vec::new();
+    for (i, net) in nets.iter().enumerate() {
+        for (part, values) in [("table", &net.table), ("density", &net.density), ("color", &net.color)] {
+            if !values.is_empty() {
+                list.push((format!("{prefix}net{i}.{part}"), vec![values.len()], &values[..]));
+            }
+        }
+    }
+    if !codes.is_empty() {
+        list.push((format!("{prefix}codes"), vec![codes.len()], codes));
+    }
+    list
+}
+
+pub(crate) fn fill(
+    prefix: &str,
+    nets: &mut [NetParameters<f32>],
+    codes: &mut [f32],
+    get: &mut impl FnMut(&str) -> Option<Vec<f32>>,
+) -> Result<(), FieldError> {
+    for (i, net) in nets.iter_mut().enumerate() {
+        let parts = [
+            ("table", &mut net.table),
+            ("density", &mut net.density),
+            ("color", &mut net.color),
+        ];
+        for (part, values) in parts {
+            fill_one(&format!("{prefix}net{i}.{part}"), values, get)?;
+        }
+    }
+    fill_one(&format!("{prefix}codes"), codes, get)
+}
+
+pub(crate) fn fill_one(
+    name: &str,
+    values: &mut [f32],
+    get: &mut impl FnMut(&str) -> Option<Vec<f32>>,
+) -> Result<(), FieldError> {
+    if values.is_empty() {
+        return Ok(());
+    }
+    match get(name) {
+        Some(found) if found.len() == values.len() => values.copy_from_slice(&found),
+        found => {
+            return Err(FieldError::Tensor {
+                name: name.into(),
+                found: found.map_or(0, |f| f.len()),
+                expected: values.len(),
+            });
+        }
+    }
+    Ok(())
+}

@@ -1,0 +1,162 @@
+//! A trained field's surfaces as points: where a Gaussian cloud may start.
+
+use crate::field::Field;
+use crate::pass::{Pass, trace};
+use crate::render::view::camera_ray;
+use irradia_compute::Level;
+use irradia_scene::{Camera, Rng};
+use rayon::prelude::*;
+
+/// How surfaces are sampled.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct PointsOptions {
+    /// The most points to give.
+    pub count: usize,
+    /// A ray has met a surface where the field covers this much of it.
+    pub alpha: f32,
+    /// Everything random follows from it.
+    pub seed: u64,
+}
+
+impl Default for PointsOptions {
+    /// 100,000 points where half of the ray is covered.
+    fn default() -> Self {
+        Self {
+            count: 100_000,
+            alpha: 0.5,
+            seed: 0,
+        }
+    }
+}
+
+/// Points on a field's surfaces. All columns have the same length.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct FieldPoints {
+    /// World positions.
+    pub positions: Vec<[f32; 3]>,
+    /// sRGB in \[0, 1\], the mean over the cameras that met the point.
+    pub colors: Vec<[f32; 3]>,
+    /// How much a ray through the point is covered, 0 to 1.
+    pub opacities: Vec<f32>,
+    /// Half the distance to the neighbours, world units: a standard deviation with which Gaussians join.
+    pub sizes: Vec<f32>,
+}
+
+/// Rays that meet something for each point wanted: a surface's cells are then met more than once on average.
+const HITS_A_POINT: usize = 2;
+/// Rounds of as many rays after which what was met must do: most of a picture may be empty.
+const ROUNDS: u64 = 16;
+/// Rays of one task.
+const CHUNK: usize = 1024;
+/// The finest thinning, cells a side of the unit cube.
+const FINEST: u32 = 4096;
+
+/// What one ray met.
+#[derive(Clone, Copy)]
+struct Hit {
+    unit: [f32; 3],
+    color: [f32; 3],
+    alpha: f32,
+}
+
+/// Sends rays through random pixels of `cameras` and keeps one point a cell of the finest even grid (in the field's own space,
+/// so that far things are thinned as the field knows them) that has no more than `options.count` cells with points.
+pub fn to_points(field: &Field, cameras: &[Camera], options: &PointsOptions) -> FieldPoints {
+    if cameras.is_empty() || options.count == 0 {
+        return FieldPoints::default();
+    }
+    let wanted = HITS_A_POINT * options.count;
+    let chunks = wanted.div_ceil(CHUNK) as u64;
+    let mut hits: Vec<Hit> = Vec::new();
+    for round in 0..ROUNDS {
+        let met: Vec<Vec<Hit>> = (round * chunks..(round + 1) * chunks)
+            .into_par_iter()
+            .map_init(Vec::new, |passes, chunk| meet(field, cameras, options, chunk, passes))
+            .collect();
+        hits.extend(met.into_iter().flatten());
+        if hits.len() >= wanted {
+            break;
+        }
+    }
+    let (mut low, mut high) = (1, FINEST);
+    while low < high {
+        let side = (low + high).div_ceil(2);
+        let mut cells: Vec<u64> = hits.iter().map(|hit| cell(hit.unit, side)).collect();
+        cells.par_sort_unstable();
+        cells.dedup();
+        (low, high) = if cells.len() <= options.count {
+            (side, high)
+        } else {
+            (low, side - 1)
+        };
+    }
+    thin(field, &hits, low)
+}
+
+fn meet(field: &Field, cameras: &[Camera], options: &PointsOptions, chunk: u64, passes: &mut Vec<Pass>) -> Vec<Hit> {
+    let mut rng = Rng::new(options.seed, chunk);
+    let rays: Vec<_> = (0..CHUNK)
+        .map(|_| {
+            let camera = &cameras[rng.below(cameras.len() as u32) as usize];
+            let (w, h) = (camera.intrinsics.width as f32, camera.intrinsics.height as f32);
+            camera_ray(field, camera, rng.uniform() * w, rng.uniform() * h).0
+        })
+        .collect();
+    let (mut hits, mut at) = (Vec::new(), 0);
+    while at < rays.len() {
+        let taken = trace(Level::detect(), field, &rays[at..], &[], None, passes);
+        let pass = &passes[passes.len() - 1];
+        for r in 0..taken {
+            let (color, alpha, _) = pass.composite(r);
+            if let (Some(i), true) = (pass.median(r), alpha >= options.alpha) {
+                hits.push(Hit {
+                    unit: field.space.unit(rays[at + r].at(pass.middles[i])),
+                    color: color.map(|c| c / alpha),
+                    alpha,
+                });
+            }
+        }
+        at += taken;
+    }
+    hits
+}
+
+/// The number of the cell of a grid of `side` cells a side.
+fn cell(unit: [f32; 3], side: u32) -> u64 {
+    let [x, y, z] = unit.map(|u| ((u * side as f32) as u64).min(u64::from(side) - 1));
+    x | y << 20 | z << 40
+}
+
+/// One point for each cell: the mean of what was met there.
+fn thin(field: &Field, hits: &[Hit], side: u32) -> FieldPoints {
+    let mut order: Vec<(u64, u32)> = (0u32..).zip(hits).map(|(i, hit)| (cell(hit.unit, side), i)).collect();
+    order.par_sort_unstable();
+    let half = 0.5 / side as f32;
+    let mut points = FieldPoints::default();
+    for members in order.chunk_by(|a, b| a.0 == b.0) {
+        let mut sum = Hit {
+            unit: [0.0; 3],
+            color: [0.0; 3],
+            alpha: 0.0,
+        };
+        for (_, i) in members {
+            let hit = &hits[*i as usize];
+            (0..3).for_each(|c| sum.unit[c] += hit.unit[c]);
+            (0..3).for_each(|c| sum.color[c] += hit.color[c]);
+            sum.alpha += hit.alpha;
+        }
+        let mean = 1.0 / members.len() as f32;
+        let unit = sum.unit.map(|v| v * mean);
+        let world = |unit: [f32; 3]| glam::Vec3::from(field.space.to_world(field.space.from_unit(unit)));
+        let widths = (0..3).map(|c| {
+            let [mut low, mut high] = [unit; 2];
+            (low[c], high[c]) = ((unit[c] - half).max(0.0), (unit[c] + half).min(1.0));
+            world(low).distance(world(high))
+        });
+        points.sizes.push(widths.sum::<f32>() / 6.0);
+        points.positions.push(world(unit).to_array());
+        points.colors.push(sum.color.map(|v| v * mean));
+        points.opacities.push(sum.alpha * mean);
+    }
+    points
+}

@@ -1,0 +1,186 @@
+//! One step of training: rays in, better numbers out.
+//!
+//! The rays of a batch are cut into a fixed number of groups, whatever the number of threads. A group goes through its chunks
+//! one after the other and keeps sums of its own for the networks' gradients, which are then added in the groups' order. The
+//! tables' gradients are scattered afterwards, each level by one task that walks all samples in their order: no locks, no
+//! atomics, and the same bits for any number of threads.
+
+use crate::batch::{Background, RayBatch, TrainView};
+use crate::field::Field;
+use crate::look::update_occupancy;
+use crate::state::FieldState;
+use irradia_compute::Level;
+use irradia_compute::adam::AdamStep;
+use irradia_scene::Rng;
+use rayon::prelude::*;
+use worker::{Task, Worker};
+
+mod update;
+mod worker;
+
+/// Groups of a batch: threads that can work at once.
+const GROUPS: usize = 32;
+/// Streams of a step's seed beside the groups'.
+const STREAM_RAYS: u64 = 0xfe;
+pub(crate) const STREAM_LOOK: u64 = 0xff;
+
+/// What one step does.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct StepOptions {
+    /// Learning rate of tables; 0.01 in Instant-NGP.
+    pub table_rate: f32,
+    /// Learning rate of networks; 0.01 in Instant-NGP, 0.0005 in NeRF.
+    pub net_rate: f32,
+    /// Learning rate of appearance codes.
+    pub code_rate: f32,
+    /// Decay of Adam's second moment; 0.99 in Instant-NGP, 0.999 in NeRF.
+    pub beta2: f32,
+    /// Weight of the interlevel loss; 1 in mip-NeRF 360.
+    pub interlevel: f32,
+    /// Weight of the distortion loss; 0.01 in mip-NeRF 360.
+    pub distortion: f32,
+    /// Weight of the squared error of distance, field units, where a ray's is known.
+    pub depth: f32,
+    /// What lies behind a photograph that has alpha.
+    pub background: Background,
+    /// Samples that [`train_views`] chooses the number of rays for; 2^18 in Instant-NGP.
+    pub samples: usize,
+    /// Everything random follows from it and the number of the step.
+    pub seed: u64,
+}
+
+impl Default for StepOptions {
+    fn default() -> Self {
+        Self {
+            table_rate: 1e-2,
+            net_rate: 1e-2,
+            code_rate: 1e-3,
+            beta2: 0.99,
+            interlevel: 1.0,
+            distortion: 0.0,
+            depth: 0.0,
+            background: Background::Random,
+            samples: 1 << 16,
+            seed: 0,
+        }
+    }
+}
+
+/// What a step found, means over its rays.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct StepLoss {
+    /// Mean squared error of the last network's colour.
+    pub color: f64,
+    /// Everything with its weights.
+    pub total: f64,
+    /// Rays of the batch.
+    pub rays: usize,
+    /// Samples whose colour was computed, all networks: what the next batch's size can be chosen by.
+    pub samples: usize,
+}
+
+/// Buffers of a step.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Scratch {
+    workers: Vec<Worker>,
+    /// Gradients of the tables, zero between steps.
+    tables: Vec<Vec<f32>>,
+    /// The rays that [`train_views`] draws.
+    batch: RayBatch,
+}
+
+/// Steps between two looks at an occupancy grid (Instant-NGP).
+const LOOK_EVERY: u64 = 16;
+/// One in so many empty cells is looked at.
+const LOOK_ONE_IN: u32 = 16;
+/// The fewest and the most rays of a batch.
+const RAYS: [usize; 2] = [64, 16_384];
+
+/// One whole step on photographs: draws [`FieldState::rays`] rays, trains on them, keeps the occupancy grid up to date and sets
+/// the number of rays for next time such that they make about `options.samples` samples.
+pub fn train_views(state: &mut FieldState, views: &[TrainView], options: &StepOptions) -> StepLoss {
+    let mut batch = std::mem::take(&mut state.scratch.batch);
+    let mut rng = Rng::new(options.seed, (state.step << 8) + STREAM_RAYS);
+    batch.draw(views, state.rays, options.background, &state.field.space, &mut rng);
+    let loss = train_step(state, &batch, options);
+    state.scratch.batch = batch;
+    if state.step.is_multiple_of(LOOK_EVERY) {
+        update_occupancy(state, false, LOOK_ONE_IN, options.seed);
+    }
+    let wanted = options.samples as f64 * loss.rays as f64 / loss.samples.max(1) as f64;
+    state.rays = ((0.8 * state.rays as f64 + 0.2 * wanted) as usize).clamp(RAYS[0], RAYS[1]);
+    loss
+}
+
+/// Makes one step on `batch`.
+pub fn train_step(state: &mut FieldState, batch: &RayBatch, options: &StepOptions) -> StepLoss {
+    let level = Level::detect();
+    state.step += 1;
+    let mut scratch = std::mem::take(&mut state.scratch);
+    scratch.workers.resize_with(GROUPS, Worker::default);
+    let loss = gradients(level, &state.field, batch, options, state.step, &mut scratch);
+    let step = AdamStep {
+        beta1: 0.9,
+        beta2: options.beta2,
+        epsilon: 1e-15,
+        step: state.step,
+    };
+    update::update(level, state, &mut scratch, options, step);
+    state.scratch = scratch;
+    loss
+}
+
+/// Leaves every gradient in `scratch`: the networks' and the codes' in its first worker, the tables' with their points.
+fn gradients(
+    level: Level,
+    field: &Field,
+    batch: &RayBatch,
+    options: &StepOptions,
+    step: u64,
+    scratch: &mut Scratch,
+) -> StepLoss {
+    let turned = field.turned();
+    let task = Task {
+        level,
+        field,
+        turned: &turned,
+        batch,
+        options,
+    };
+    let n = batch.rays.len();
+    scratch.workers.par_iter_mut().enumerate().for_each(|(group, worker)| {
+        let range = n * group / GROUPS..n * (group + 1) / GROUPS;
+        let mut rng = Rng::new(options.seed, (step << 8) + group as u64);
+        worker.rays(&task, range, &mut rng);
+    });
+    let (first, others) = scratch.workers.split_at_mut(1);
+    let (sum, mut loss) = (&mut first[0], StepLoss::default());
+    loss.add(&sum.loss);
+    for worker in others {
+        loss.add(&worker.loss);
+        for (to, from) in sum.grads.iter_mut().zip(&worker.grads) {
+            add(&mut to.density, &from.density);
+            add(&mut to.color, &from.color);
+        }
+        add(&mut sum.codes, &worker.codes);
+    }
+    let mean = 1.0 / n.max(1) as f64;
+    StepLoss {
+        color: loss.color * mean,
+        total: loss.total * mean,
+        rays: n,
+        samples: loss.samples,
+    }
+}
+
+fn add(to: &mut [f32], from: &[f32]) {
+    to.iter_mut().zip(from).for_each(|(to, from)| *to += from);
+}
+
+impl StepLoss {
+    fn add(&mut self, other: &Self) {
+        self.color += other.color;
+        self.total += other.total;
+        self.samples += other.samples;
+    }
+}

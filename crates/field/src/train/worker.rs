@@ -1,0 +1,215 @@
+//! What one group of a batch's rays goes through: forward, losses, and the way back.
+
+use super::{StepLoss, StepOptions};
+use crate::batch::RayBatch;
+use crate::config::Sampler;
+use crate::encoding::PositionEncoding;
+use crate::field::Field;
+use crate::net::{Block, Net, NetParameters, get3, set3};
+use crate::pass::{Pass, trace};
+use crate::render::quadrature::weights_vjp;
+use crate::sample::proposal::{distortion, interlevel};
+use irradia_compute::Level;
+use irradia_compute::simd::{Kernel, Lanes, Simd};
+use irradia_scene::Rng;
+
+/// One group's sums and buffers.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Worker {
+    passes: Vec<Pass>,
+    pub grads: Vec<NetParameters<f32>>,
+    pub codes: Vec<f32>,
+    /// For each network the points and the gradients of their encodings, panel after panel.
+    pub stored: Vec<[Vec<f32>; 2]>,
+    v_weights: Vec<f32>,
+    v_thickness: Vec<f32>,
+    pub loss: StepLoss,
+}
+
+/// What [`Worker::rays`] needs of the outside.
+pub(super) struct Task<'a> {
+    pub level: Level,
+    pub field: &'a Field,
+    pub turned: &'a [NetParameters<f32>],
+    pub batch: &'a RayBatch,
+    pub options: &'a StepOptions,
+}
+
+impl Worker {
+    /// Forward and backward over the rays `range` of the batch.
+    pub fn rays(&mut self, task: &Task, mut range: std::ops::Range<usize>, rng: &mut Rng) {
+        let field = task.field;
+        self.loss = StepLoss::default();
+        self.stored.resize_with(field.nets.len(), Default::default);
+        self.stored.iter_mut().flatten().for_each(Vec::clear);
+        self.codes.clear();
+        self.codes.resize(field.codes.len(), 0.0);
+        if self.grads.len() == field.nets.len() {
+            for grads in &mut self.grads {
+                grads.density.fill(0.0);
+                grads.color.fill(0.0);
+            }
+        } else {
+            self.grads = field.parameters.iter().map(NetParameters::without_table).collect();
+        }
+        while !range.is_empty() {
+            let rays = &task.batch.rays[range.clone()];
+            let images = &task.batch.images[range.clone()];
+            let taken = trace(task.level, field, rays, images, Some(rng), &mut self.passes);
+            for net in 0..field.nets.len() {
+                self.back(task, net, range.start..range.start + taken);
+            }
+            range.start += taken;
+        }
+    }
+
+    /// Losses of one network's pass over the rays `range`, and the way back through it.
+    fn back(&mut self, task: &Task, net: usize, range: std::ops::Range<usize>) {
+        let (field, batch) = (task.field, task.batch);
+        let last = net + 1 == field.nets.len();
+        let with_color = field.nets[net].shape.color.is_some();
+        let (earlier, later) = self.passes.split_at_mut(net + 1);
+        let pass = &mut earlier[net];
+        let n = pass.block.len;
+        if n == 0 {
+            if with_color {
+                self.score_empty(batch, range, last);
+            }
+            return;
+        }
+        let share = 1.0 / batch.rays.len() as f32;
+        self.v_weights.clear();
+        self.v_weights.resize(n, 0.0);
+        let v_weights = &mut self.v_weights;
+        let padded = pass.block.panels() * crate::mlp::PANEL;
+        self.v_thickness.clear();
+        self.v_thickness.resize(padded, 0.0);
+        pass.block.v_rgb.clear();
+        pass.block.v_rgb.resize(3 * padded, 0.0);
+        for (r, ray) in range.clone().enumerate() {
+            let samples = pass.of(r);
+            if with_color {
+                let (color, _, distance) = pass.composite(r);
+                let background = batch.backgrounds[ray];
+                let mut v_color = [0.0; 3];
+                let mut squares = 0.0;
+                for c in 0..3 {
+                    let error = color[c] + pass.behind[r] * background[c] - batch.targets[ray][c];
+                    squares += error * error / 3.0;
+                    v_color[c] = 2.0 / 3.0 * error * share;
+                }
+                // What is known of the distance counts as far as the ray ends in the field.
+                let known = batch.depths.get(ray).copied().unwrap_or(0.0);
+                let mut v_distance = 0.0;
+                let mut depth = 0.0;
+                if known > 0.0 && task.options.depth > 0.0 {
+                    let error = distance + pass.behind[r] * known - known;
+                    depth = task.options.depth * error * error;
+                    v_distance = 2.0 * task.options.depth * error * share;
+                }
+                for i in samples.clone() {
+                    let rgb = get3(&pass.block.rgb, i);
+                    let mut v = v_distance * (pass.middles[i] - known);
+                    for c in 0..3 {
+                        v += v_color[c] * (rgb[c] - background[c]);
+                    }
+                    v_weights[i] = v;
+                    set3(&mut pass.block.v_rgb, i, v_color.map(|v| v * pass.weights[i]));
+                }
+                self.loss.color += if last { f64::from(squares) } else { 0.0 };
+                self.loss.total += f64::from(squares + depth);
+            }
+            let Sampler::Proposal { rounds, last: count } = &field.config.sampler else {
+                continue;
+            };
+            let count_of = |net: usize| rounds.get(net).map_or(*count, |(_, n)| *n);
+            let edges = &pass.edges[r * (count_of(net) + 1)..][..samples.len() + 1];
+            if last && task.options.distortion > 0.0 {
+                let scale = task.options.distortion * share;
+                let v = &mut v_weights[samples.clone()];
+                let loss = distortion(edges, &pass.weights[samples.clone()], scale, v);
+                self.loss.total += f64::from(loss / share);
+            }
+            if let (false, Some(fine)) = (last, later.last()) {
+                let of = fine.of(r);
+                let stride = count_of(field.nets.len() - 1) + 1;
+                let fine_edges = &fine.edges[r * stride..][..of.len() + 1];
+                let scale = task.options.interlevel * share;
+                let v = &mut v_weights[samples.clone()];
+                let bound = &pass.weights[samples.clone()];
+                let loss = interlevel(fine_edges, &fine.weights[of], edges, bound, scale, v);
+                self.loss.total += f64::from(loss / share);
+            }
+        }
+        if with_color {
+            self.loss.samples += n;
+        }
+        for r in 0..range.len() {
+            let samples = pass.of(r);
+            let (through, weights) = (&pass.through[samples.clone()], &pass.weights[samples.clone()]);
+            let counted = samples.len();
+            let v = &mut self.v_thickness[samples.clone()];
+            weights_vjp(through, weights, &v_weights[samples], counted, v);
+        }
+        pass.block.v_density.resize(padded, 0.0);
+        let lengths = pass.lengths.iter().chain(std::iter::repeat(&0.0));
+        let thickness = self.v_thickness.iter().zip(lengths);
+        for (to, (v, length)) in pass.block.v_density.iter_mut().zip(thickness) {
+            *to = v * length;
+        }
+        task.level.run(Backward {
+            net: &field.nets[net],
+            turned: &task.turned[net],
+            block: &mut pass.block,
+            grads: &mut self.grads[net],
+            with_color,
+        });
+        let size = if with_color { field.config.appearance() } else { 0 };
+        for (r, ray) in range.enumerate() {
+            for i in pass.of(r) {
+                for k in 0..size {
+                    let at = batch.images[ray] as usize * size + k;
+                    if let Some(to) = self.codes.get_mut(at) {
+                        *to += field.nets[net].code_gradient(&pass.block, i, k);
+                    }
+                }
+            }
+        }
+        if let PositionEncoding::HashGrid(_) = field.nets[net].shape.encoding {
+            self.stored[net][0].extend_from_slice(&pass.block.points);
+            self.stored[net][1].extend_from_slice(&pass.block.v_encoded);
+        }
+    }
+
+    /// The loss of rays that meet nothing.
+    fn score_empty(&mut self, batch: &RayBatch, range: std::ops::Range<usize>, last: bool) {
+        for ray in range {
+            let squares: f32 = (0..3)
+                .map(|c| (batch.backgrounds[ray][c] - batch.targets[ray][c]).powi(2) / 3.0)
+                .sum();
+            self.loss.color += if last { f64::from(squares) } else { 0.0 };
+            self.loss.total += f64::from(squares);
+        }
+    }
+}
+
+struct Backward<'a> {
+    net: &'a Net,
+    turned: &'a NetParameters<f32>,
+    block: &'a mut Block<f32>,
+    grads: &'a mut NetParameters<f32>,
+    with_color: bool,
+}
+
+impl Kernel for Backward<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<S: Simd>(self, simd: S)
+    where
+        S::F: Lanes<Scalar = f32>,
+    {
+        self.net
+            .backward(simd, self.turned, self.block, self.grads, self.with_color);
+    }
+}

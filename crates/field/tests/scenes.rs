@@ -1,0 +1,209 @@
+//! Scenes whose answer can be said aloud: fog, a wall, nothing.
+
+use glam::{Quat, Vec3};
+use irradia_field::encoding::{DirectionEncoding, HashGrid, PositionEncoding};
+use irradia_field::net::{Activation, ColorShape, NetShape};
+use irradia_field::render::quadrature::{composite, weights};
+use irradia_field::sample::OccupancyGrid;
+use irradia_field::sample::march::{Steps, march};
+use irradia_field::{
+    Field, FieldConfig, Occupancy, PointsOptions, RenderOptions, Sampler, Space, density_at, render_view, to_points,
+};
+use irradia_scene::{Camera, Intrinsics, Pose};
+
+/// A camera at z = -3 that looks along +Z at the cube -1..1.
+fn camera() -> Camera {
+    let pose = Pose {
+        position: Vec3::new(0.0, 0.0, -3.0),
+        rotation: Quat::IDENTITY,
+    };
+    Camera::new(pose, Intrinsics::from_fov_x(16, 12, 0.5))
+}
+
+/// A field of density e^x, everywhere the same grey, in the cube -1..1 where `where_to` says.
+fn even(x: f32, where_to: impl Fn([usize; 3]) -> bool) -> Field {
+    let config = FieldConfig {
+        net: NetShape {
+            encoding: PositionEncoding::HashGrid(HashGrid {
+                levels: 1,
+                features: 1,
+                log2_table: 10,
+                coarsest: 4,
+                finest: 4,
+            }),
+            width: 8,
+            depth: 1,
+            skip: None,
+            geometry: 7,
+            activation: Activation::Exp,
+            density_bias: x,
+            color: Some(ColorShape {
+                direction: DirectionEncoding::Harmonics,
+                width: 8,
+                depth: 1,
+                appearance: 0,
+            }),
+        },
+        sampler: Sampler::Occupancy(Occupancy {
+            side: 32,
+            steps: Steps {
+                shortest: 0.005,
+                cone: 0.0,
+            },
+            thickness: 0.01,
+            decay: 0.95,
+        }),
+        images: 0,
+    };
+    let mut field = Field::new(config, Space::cube([0.0; 3], 1.0), 0).unwrap();
+    for parameters in &mut field.parameters {
+        parameters.table.fill(0.0);
+        parameters.density.fill(0.0);
+        parameters.color.fill(0.0);
+    }
+    let density = (0..32usize.pow(3)).map(|c| {
+        if where_to([c % 32, c / 32 % 32, c / 1024]) {
+            1e3
+        } else {
+            0.0
+        }
+    });
+    let mut grid = OccupancyGrid::from_density(32, density.collect()).unwrap();
+    grid.threshold(0.01, |_| 0.005);
+    field.occupancy = Some(grid);
+    field
+}
+
+fn with_black() -> RenderOptions {
+    RenderOptions {
+        normals: true,
+        ..RenderOptions::default()
+    }
+}
+
+#[test]
+fn uniform_fog_lets_through_what_beer_and_lambert_say() {
+    let field = even(0.3f32.ln(), |_| true);
+    let view = render_view(&field, &camera(), &with_black());
+    // The ray through the middle of the picture crosses 2 units; those of the middle pixels lie within 1e-4 of it.
+    let (middle, want) = (16 * 6 + 8, 1.0 - (-0.3f32 * 2.0).exp());
+    // The first and last step may stand half a step outside: 0.3 * 0.005.
+    assert!(
+        (view.alpha[middle] - want).abs() < 1.5e-3,
+        "{} and not {want}",
+        view.alpha[middle]
+    );
+    assert!((view.color[middle] - 0.5 * want).abs() < 1e-3, "grey of 0.5 a weight");
+    assert_eq!(view.median_depth[middle], 0.0, "half of it is never covered");
+    // Of an even density the slope is nothing.
+    assert!(view.normals.iter().all(|n| n.is_finite()));
+    let densities = density_at(&field, &[[0.1, 0.2, 0.3], [1.2, 0.0, 0.0], [f32::NAN; 3]]);
+    assert!((densities[0] - 0.3).abs() < 1e-6, "{}", densities[0]);
+    assert_eq!(densities[1..], [0.0; 2], "outside there is nothing");
+}
+
+#[test]
+fn an_opaque_wall_gives_its_depth_and_colour() {
+    // The wall begins at z = 0 of the world, 3 in front of the camera.
+    let field = even(8.0, |[_, _, z]| z >= 16);
+    let view = render_view(&field, &camera(), &with_black());
+    for pixel in 0..view.alpha.len() {
+        assert!(view.alpha[pixel] > 0.9999);
+        assert!((view.color[pixel] - 0.5).abs() < 1e-4);
+        // A step of 0.005 along the ray, and its middle.
+        assert!((view.depth[pixel] - 3.0).abs() < 0.006, "{}", view.depth[pixel]);
+        assert!(
+            (view.median_depth[pixel] - 3.0).abs() < 0.006,
+            "{}",
+            view.median_depth[pixel]
+        );
+    }
+    let options = PointsOptions {
+        count: 500,
+        ..PointsOptions::default()
+    };
+    let points = to_points(&field, &[camera()], &options);
+    let n = points.positions.len();
+    assert!((100..=500).contains(&n), "{n} points");
+    assert_eq!(
+        [points.colors.len(), points.opacities.len(), points.sizes.len()],
+        [n; 3]
+    );
+    for i in 0..n {
+        assert!(points.positions[i][2].abs() < 0.006 && points.opacities[i] > 0.999);
+        assert!((points.colors[i][0] - 0.5).abs() < 1e-3);
+        // The camera sees 1.53 x 1.15 units of the wall; 500 cells of it are 0.06 wide at least.
+        assert!((0.02..0.1).contains(&points.sizes[i]), "{}", points.sizes[i]);
+    }
+}
+
+#[test]
+fn an_empty_ray_is_transparent() {
+    let field = even(8.0, |[x, _, _]| x == 31);
+    let options = RenderOptions {
+        background: [0.2, 0.4, 0.6],
+        ..with_black()
+    };
+    let view = render_view(&field, &camera(), &options);
+    let (middle, pixels) = (16 * 6 + 8, 16 * 12);
+    assert_eq!((view.alpha[middle], view.depth[middle]), (0.0, 0.0));
+    assert_eq!([0, 1, 2].map(|c| view.color[c * pixels + middle]), [0.2, 0.4, 0.6]);
+    assert_eq!([0, 1, 2].map(|c| view.normals[c * pixels + middle]), [0.0; 3]);
+    assert!(to_points(&field, &[], &PointsOptions::default()).positions.is_empty());
+}
+
+#[test]
+fn transmittance_never_rises_and_weights_add_up_to_alpha() {
+    let mut rng = irradia_scene::Rng::new(1, 1);
+    for round in 0..50 {
+        let through: Vec<f64> = (0..40).map(|_| f64::from(rng.uniform()).powi(round % 4)).collect();
+        let mut w = vec![0.0; 40];
+        let (counted, behind) = weights(&through, &mut w);
+        let mut transmittance = 1.0;
+        for weight in &w {
+            assert!(*weight >= 0.0);
+            transmittance -= weight;
+        }
+        assert!((transmittance - behind).abs() < 1e-12 && behind >= 0.0);
+        assert!(w[counted..].iter().all(|w| *w == 0.0));
+    }
+}
+
+#[test]
+fn discrete_compositing_of_two_intervals() {
+    // Each lets a half through: 1/2 and 1/4 of the values, and 1/4 goes on.
+    let (value, alpha) = composite(&[2f64.ln(); 2], &[1.0; 2], &[10.0, 20.0]);
+    assert!((value - 10.0).abs() < 1e-12 && (alpha - 0.75).abs() < 1e-12);
+    assert_eq!(composite(&[], &[], &[]), (0.0, 0.0));
+}
+
+#[test]
+fn skipping_finds_every_occupied_cell_and_keeps_the_samples_places() {
+    let space = Space::cube([0.0; 3], 1.0);
+    let steps = Steps {
+        shortest: 0.01,
+        cone: 0.0,
+    };
+    let mut rng = irradia_scene::Rng::new(2, 1);
+    let density = (0..32usize.pow(3)).map(|_| if rng.below(40) == 0 { 1.0 } else { 0.0 });
+    let mut grid = OccupancyGrid::from_density(32, density.collect()).unwrap();
+    let full = OccupancyGrid::new(32);
+    grid.threshold(0.01, |_| 1.0);
+    let mut found = 0;
+    for _ in 0..100 {
+        let direction = Vec3::new(0.2 * rng.normal(), 0.2 * rng.normal(), 2.0).normalize();
+        let ray = space.ray([0.3 * rng.normal(), 0.3 * rng.normal(), -3.0], direction.to_array());
+        let (mut all, mut some) = ((Vec::new(), Vec::new()), (Vec::new(), Vec::new()));
+        march(&space, &full, &steps, &ray, 0.3, &mut all.0, &mut all.1);
+        march(&space, &grid, &steps, &ray, 0.3, &mut some.0, &mut some.1);
+        let occupied = |t: &&f32| grid.at(space.unit(ray.at(**t))) == irradia_field::sample::occupancy::Cell::Occupied;
+        let want = all.0.iter().filter(occupied).count();
+        found += want;
+        // Rounding may move a sample over a face it lies on.
+        assert!(some.0.len().abs_diff(want) <= 1, "{} and not {want}", some.0.len());
+        for t in &some.0 {
+            assert!(all.0.iter().any(|a| (a - t).abs() < 1e-4), "a sample at {t} has moved");
+        }
+    }
+    assert!(found > 50, "the test met {found} samples");
+}

@@ -1,0 +1,322 @@
+//! Small fields learn a small scene, every sampler; the same bits whatever the threads; a resumed run is the unbroken one.
+
+use glam::{Quat, Vec3};
+use irradia_field::encoding::{Frequency, HashGrid, PositionEncoding};
+use irradia_field::net::NetShape;
+use irradia_field::{
+    Background, Field, FieldConfig, FieldError, FieldState, RayBatch, RenderOptions, Sampler, Space, StepLoss,
+    StepOptions, TrainView, render_view, train_step, train_views,
+};
+use irradia_scene::{Camera, Intrinsics, Pose, Rng};
+
+const SIDE: u32 = 24;
+
+/// Cameras on a ring about the middle, three units away.
+fn cameras(n: usize) -> Vec<Camera> {
+    (0..n)
+        .map(|i| {
+            let rotation = Quat::from_rotation_y(i as f32 / n as f32 * std::f32::consts::TAU);
+            let pose = Pose {
+                position: rotation * Vec3::new(0.0, 0.0, -3.0),
+                rotation,
+            };
+            Camera::new(pose, Intrinsics::from_fov_x(SIDE, SIDE, 0.6))
+        })
+        .collect()
+}
+
+/// A ball of radius 0.6, its halves red and blue, over white, with its alpha and depth.
+struct Ball {
+    rgb: Vec<u8>,
+    alpha: Vec<u8>,
+    depth: Vec<f32>,
+}
+
+fn ball(camera: &Camera) -> Ball {
+    let mut ball = Ball {
+        rgb: Vec::new(),
+        alpha: Vec::new(),
+        depth: Vec::new(),
+    };
+    for pixel in 0..SIDE * SIDE {
+        let d = camera.ray_direction(glam::Vec2::new(
+            (pixel % SIDE) as f32 + 0.5,
+            (pixel / SIDE) as f32 + 0.5,
+        ));
+        let o = camera.pose.position;
+        let half = o.dot(d);
+        let root = half * half - o.dot(o) + 0.36;
+        let hit = (root > 0.0).then(|| -half - root.sqrt());
+        let color = match hit {
+            Some(t) if (o + t * d).x > 0.0 => [220, 40, 40],
+            Some(_) => [40, 40, 220],
+            None => [255; 3],
+        };
+        ball.rgb.extend(color);
+        ball.alpha.push(if hit.is_some() { 255 } else { 0 });
+        ball.depth
+            .push(hit.map_or(0.0, |t| t * d.dot(camera.pose.rotation * Vec3::Z)));
+    }
+    ball
+}
+
+fn views<'a>(cameras: &'a [Camera], balls: &'a [Ball], with_depth: bool) -> Vec<TrainView<'a>> {
+    let view = |i: usize| TrainView {
+        camera: &cameras[i],
+        rgb: &balls[i].rgb,
+        alpha: Some(&balls[i].alpha),
+        over: [1.0; 3],
+        mask: None,
+        depth: with_depth.then_some(&balls[i].depth[..]),
+        image: i as u32,
+    };
+    (0..cameras.len()).map(view).collect()
+}
+
+fn grid(finest: u32) -> PositionEncoding {
+    PositionEncoding::HashGrid(HashGrid {
+        levels: 4,
+        features: 2,
+        log2_table: 12,
+        coarsest: 4,
+        finest,
+    })
+}
+
+fn configs() -> Vec<(&'static str, FieldConfig)> {
+    let mut hash = FieldConfig::hash_grid();
+    hash.net.encoding = grid(32);
+    hash.net.width = 16;
+    if let Sampler::Occupancy(o) = &mut hash.sampler {
+        o.side = 32;
+        o.steps.shortest = 0.03;
+    }
+    let round = NetShape {
+        encoding: grid(16),
+        color: None,
+        ..hash.net
+    };
+    let proposal = FieldConfig {
+        sampler: Sampler::Proposal {
+            rounds: vec![(round, 24)],
+            last: 16,
+        },
+        ..hash.clone()
+    };
+    let mut nerf = FieldConfig::nerf(16, 16, 16);
+    nerf.net.depth = 3;
+    nerf.net.skip = Some(2);
+    nerf.net.encoding = PositionEncoding::Frequency(Frequency { octaves: 4 });
+    vec![("hash grid", hash), ("proposal", proposal), ("nerf", nerf)]
+}
+
+fn options() -> StepOptions {
+    StepOptions {
+        samples: 1 << 13,
+        distortion: 0.001,
+        ..StepOptions::default()
+    }
+}
+
+fn run(state: &mut FieldState, views: &[TrainView], options: &StepOptions, steps: usize) -> StepLoss {
+    (0..steps).fold(StepLoss::default(), |_, _| train_views(state, views, options))
+}
+
+fn start(config: &FieldConfig) -> FieldState {
+    FieldState::new(Field::new(config.clone(), Space::cube([0.0; 3], 1.0), 3).unwrap())
+}
+
+/// Every number of a state, as bits.
+fn bits(state: &FieldState) -> Vec<u32> {
+    state
+        .tensors()
+        .iter()
+        .flat_map(|(_, _, values)| values.iter().map(|v| v.to_bits()))
+        .collect()
+}
+
+#[test]
+fn every_sampler_learns_a_ball() {
+    let cameras = cameras(8);
+    let balls: Vec<Ball> = cameras.iter().map(ball).collect();
+    let views = views(&cameras[..7], &balls[..7], false);
+    for (name, config) in configs() {
+        let mut state = start(&config);
+        let rates = StepOptions {
+            net_rate: if name == "nerf" { 3e-3 } else { 1e-2 },
+            ..options()
+        };
+        let first = train_views(&mut state, &views, &rates).color;
+        run(&mut state, &views, &rates, if name == "nerf" { 250 } else { 150 });
+        let render = RenderOptions {
+            background: [1.0; 3],
+            ..RenderOptions::default()
+        };
+        let out = render_view(&state.field, &cameras[7], &render);
+        let pixels = out.alpha.len();
+        let squares: f64 = (0..3 * pixels)
+            .map(|i| f64::from(out.color[i % 3 * pixels + i / 3] - f32::from(balls[7].rgb[i]) / 255.0).powi(2))
+            .sum();
+        let psnr = -10.0 * (squares / (3 * pixels) as f64).log10();
+        eprintln!("{name}: loss {first:.4} at first, {psnr:.1} dB from a new side");
+        assert!(psnr > 18.0, "{name}: {psnr} dB");
+    }
+}
+
+#[test]
+fn threads_change_no_bit() {
+    let cameras = cameras(3);
+    let balls: Vec<Ball> = cameras.iter().map(ball).collect();
+    let views = views(&cameras, &balls, true);
+    for (name, config) in configs() {
+        let with = |threads: usize| {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            pool.install(|| {
+                let mut state = start(&config);
+                let loss = run(&mut state, &views, &options(), 18);
+                (bits(&state), loss.total.to_bits(), state.rays)
+            })
+        };
+        assert!(with(1) == with(2), "{name}");
+    }
+}
+
+#[test]
+fn a_resumed_run_is_the_unbroken_one() {
+    let cameras = cameras(3);
+    let balls: Vec<Ball> = cameras.iter().map(ball).collect();
+    let views = views(&cameras, &balls, false);
+    for (name, mut config) in configs() {
+        if let Some(color) = &mut config.net.color {
+            color.appearance = 4;
+        }
+        config.images = 3;
+        let mut unbroken = start(&config);
+        run(&mut unbroken, &views, &options(), 20);
+        let saved = unbroken.clone();
+        let get = |name: &str| {
+            let tensors = saved.tensors();
+            let (_, shape, values) = tensors.iter().find(|(n, ..)| n == name)?;
+            assert_eq!(shape.iter().product::<usize>(), values.len());
+            Some(values.to_vec())
+        };
+        let space = saved.field.space;
+        let mut resumed = FieldState::from_tensors(config.clone(), space, saved.step, saved.rays, get).unwrap();
+        let losses = [&mut unbroken, &mut resumed].map(|state| run(state, &views, &options(), 20));
+        assert_eq!(losses[0], losses[1], "{name}");
+        assert!(bits(&unbroken) == bits(&resumed), "{name}");
+        assert!(
+            unbroken.field.codes.iter().any(|c| *c != 0.0),
+            "{name}: codes are trained"
+        );
+        let field = Field::from_tensors(config.clone(), space, get).unwrap();
+        assert!(
+            render_view(&field, &cameras[0], &RenderOptions::default())
+                == render_view(&saved.field, &cameras[0], &RenderOptions::default())
+        );
+        // A tensor too many is not looked at; one too few or of another size is an error that names it.
+        let error = FieldState::from_tensors(config.clone(), space, 0, 1, |name| {
+            get(name).filter(|_| name != "second.net0.density")
+        });
+        let text = error.unwrap_err().to_string();
+        assert!(
+            text.contains("second.net0.density") && text.contains("0 values"),
+            "{text}"
+        );
+        assert!(matches!(
+            Field::from_tensors(config, space, |name| get(name).map(|mut v| {
+                v.pop();
+                v
+            })),
+            Err(FieldError::Tensor { .. })
+        ));
+    }
+}
+
+#[test]
+fn known_depth_pulls_surfaces_there() {
+    let cameras = cameras(1);
+    // Grey everywhere: one photograph of that tells nothing of depth.
+    let grey = Ball {
+        rgb: vec![128; (SIDE * SIDE * 3) as usize],
+        alpha: vec![255; (SIDE * SIDE) as usize],
+        depth: vec![3.3; (SIDE * SIDE) as usize],
+    };
+    let balls = [grey];
+    for (_, config) in configs() {
+        let error = |with_depth: bool| {
+            let mut state = start(&config);
+            let options = StepOptions {
+                depth: 1.0,
+                net_rate: 3e-3,
+                ..options()
+            };
+            run(&mut state, &views(&cameras, &balls, with_depth), &options, 150);
+            let out = render_view(&state.field, &cameras[0], &RenderOptions::default());
+            out.depth.iter().map(|d| (d - 3.3).abs()).sum::<f32>() / out.depth.len() as f32
+        };
+        let (with, without) = (error(true), error(false));
+        eprintln!("mean error of depth {with:.3} with and {without:.3} without supervision");
+        assert!(with < 0.1 && without > 2.0 * with, "{with} and {without}");
+    }
+}
+
+#[test]
+fn gradients_of_a_whole_step_follow_the_loss() {
+    // One step of plain descent along Adam's first direction, the gradient's sign, must lower the loss of the same batch by
+    // about the sum of the gradients' magnitudes: with rates so small that the loss is linear, twice the rate is twice the
+    // fall. Samples do not move: the seed of a step is its number.
+    let cameras = cameras(2);
+    let balls: Vec<Ball> = cameras.iter().map(ball).collect();
+    let views = views(&cameras, &balls, false);
+    for (name, config) in configs() {
+        let fall = |rate: f32| {
+            let mut state = start(&config);
+            let mut batch = RayBatch::default();
+            batch.draw(&views, 300, Background::Random, &state.field.space, &mut Rng::new(1, 1));
+            let options = StepOptions {
+                table_rate: rate,
+                net_rate: rate,
+                ..StepOptions::default()
+            };
+            let before = train_step(&mut state, &batch, &options).total;
+            state.step = 0;
+            before - train_step(&mut state, &batch, &options).total
+        };
+        let (once, twice) = (fall(2e-5), fall(4e-5));
+        assert!(
+            once > 0.0 && (1.7..2.3).contains(&(twice / once)),
+            "{name}: {once} and {twice}"
+        );
+    }
+}
+
+#[test]
+fn hostile_input_is_answered() {
+    let space = Space::cube([0.0; 3], 1.0);
+    let mut state = start(&configs()[0].1);
+    let before = bits(&state);
+    // No photographs, and one whose pixels are fewer than its camera says and all masked.
+    assert_eq!(train_views(&mut state, &[], &options()).rays, 0);
+    let camera = cameras(1)[0];
+    let view = TrainView {
+        camera: &camera,
+        rgb: &[1, 2],
+        alpha: Some(&[]),
+        over: [0.0; 3],
+        mask: Some(&[0]),
+        depth: Some(&[f32::NAN]),
+        image: 77,
+    };
+    assert_eq!(train_views(&mut state, &[view], &options()).rays, 0);
+    assert!(before == bits(&state), "no rays change nothing");
+    let rejected = |change: &dyn Fn(&mut FieldConfig)| {
+        let mut config = FieldConfig::hash_grid();
+        change(&mut config);
+        Field::new(config, space, 0).unwrap_err().to_string()
+    };
+    assert!(rejected(&|c| c.net.width = 12).contains("multiple of 8"));
+    assert!(rejected(&|c| c.net.color = None).contains("colour"));
+    assert!(rejected(&|c| c.net.encoding = grid(2)).contains("ascending"));
+    assert!(rejected(&|c| c.sampler = Sampler::Hierarchy { coarse: 1, fine: 0 }).contains("at least 2"));
+}

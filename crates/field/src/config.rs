@@ -4,9 +4,11 @@ use crate::FieldError;
 use crate::encoding::{DirectionEncoding, Frequency, HashGrid, PositionEncoding};
 use crate::net::{Activation, ColorShape, NetShape};
 use crate::sample::march::Steps;
+use serde::{Deserialize, Serialize};
 
 /// Where along a ray samples lie.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "kind", rename_all = "snake_case")]
 pub enum Sampler {
     /// Steps through the occupied cells of a grid (Instant-NGP).
     Occupancy(Occupancy),
@@ -27,7 +29,8 @@ pub enum Sampler {
 }
 
 /// What is to be said about an occupancy grid.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct Occupancy {
     /// Cells a side; 128 in Instant-NGP.
     pub side: usize,
@@ -40,7 +43,8 @@ pub struct Occupancy {
 }
 
 /// Everything that a field's shape depends on.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct FieldConfig {
     /// The network that gives out colour (both of them, where the sampler is a hierarchy).
     pub net: NetShape,

@@ -6,9 +6,11 @@
 use crate::contraction::{contract, contract_vjp, uncontract};
 use glam::{Mat3, Quat, Vec2, Vec3};
 use irradia_scene::Camera;
+use serde::{Deserialize, Serialize};
 
 /// What lies outside the cube -1..1.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
 pub enum Outside {
     /// Nothing.
     Nothing,
@@ -19,7 +21,7 @@ pub enum Outside {
 }
 
 /// The frustum that normalised device coordinates are taken from.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Frustum {
     /// World-from-camera rotation of the capture's mean camera (`x, y, z, w`).
     pub rotation: [f32; 4],
@@ -32,7 +34,8 @@ pub struct Frustum {
 }
 
 /// The way from the world to field space.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct Space {
     /// The world point that is 0 in field space.
     pub center: [f32; 3],

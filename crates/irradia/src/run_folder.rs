@@ -3,19 +3,24 @@
 use crate::Usage;
 use anyhow::{Context, Result};
 use glam::{Quat, Vec3};
-use irradia_formats::write_atomic;
+use irradia_formats::{read_splats, write_atomic};
 use irradia_scene::{Camera, Dataset, Intrinsics, Pose};
+use irradia_splat::Splats;
+use irradia_train::field_file;
+use irradia_train::model::Model;
 use serde::{Deserialize, Serialize};
+use std::borrow::Cow;
 use std::fs;
 use std::path::{Path, PathBuf};
 
 /// What a run may leave in its folder.
-const FILES: [&str; 7] = [
+const FILES: [&str; 8] = [
     "run.json",
     "recipe.toml",
     "cameras.json",
     "events.jsonl",
     "scene.ply",
+    "field.safetensors",
     "report.json",
     "report.html",
 ];
@@ -229,8 +234,22 @@ impl RunFolder {
 
 /// The scene's file where `path` is a run, `path` itself elsewhere.
 pub fn scene_of(path: &Path) -> PathBuf {
-    let scene = path.join("scene.ply");
-    if scene.is_file() { scene } else { path.to_owned() }
+    let files = ["scene.ply", "field.safetensors"].map(|name| path.join(name));
+    files.into_iter().find(|file| file.is_file()).unwrap_or(path.to_owned())
+}
+
+/// The scene in a file: a field's where its name ends so, splats elsewhere; and whether it wants its opacities scaled.
+///
+/// # Errors
+/// When it cannot be read.
+pub fn read_scene(path: &Path) -> Result<(Model<'static>, bool)> {
+    if path.extension().is_some_and(|extension| extension == "safetensors") {
+        let bytes = fs::read(path).with_context(|| format!("cannot read {}", path.display()))?;
+        let field = field_file::from_bytes(&bytes).with_context(|| path.display().to_string())?;
+        return Ok((Model::Field(Cow::Owned(field)), false));
+    }
+    let cloud = read_splats(path)?;
+    Ok((Model::Splats(Cow::Owned(Splats::from_cloud(&cloud))), cloud.antialiased))
 }
 
 /// The cameras of the run that `scene` lies in, if it lies in one.

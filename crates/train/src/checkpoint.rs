@@ -1,17 +1,21 @@
 //! A run on disk: everything that the next step depends on, so that a resumed run writes the bytes that an unbroken one
 //! would have written. Only bytes are made and read here; where they go is the caller's.
 
+use crate::field_file::floats;
 use crate::recipe::{Param, Recipe};
 use crate::schedule::{Clock, Watch};
 use crate::trainer::{TrainError, TrainOptions, Trainer};
 use irradia_compute::Planes;
+use irradia_field::FieldState;
 use irradia_scene::Dataset;
 use irradia_splat::{COLUMN_NAMES, SplatState, Splats};
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use std::collections::HashMap;
 use std::sync::Arc;
 
-const FORMAT: &str = "irradia-checkpoint-2";
+const FORMAT: &str = "irradia-checkpoint-3";
+/// What the names of a field's tensors begin with.
+const FIELD: &str = "field.";
 const OWNERS: [&str; 3] = ["splats", "first_moments", "second_moments"];
 
 /// `trainer` as a safetensors file: columns `[components, N]` of splats and moments, statistics, and the clock.
@@ -41,6 +45,15 @@ pub fn to_bytes(trainer: &Trainer) -> Vec<u8> {
         vec![1, state.filter.len()],
         plane_bytes(&state.filter),
     ));
+    if let Some(field) = &trainer.field {
+        for (name, shape, values) in field.tensors() {
+            let bytes = values.iter().flat_map(|v| v.to_le_bytes()).collect();
+            arrays.push((format!("{FIELD}{name}"), Dtype::F32, shape, bytes));
+        }
+        let whole = [field.step, field.rays as u64];
+        let bytes = whole.iter().flat_map(|v| v.to_le_bytes()).collect();
+        arrays.push((format!("{FIELD}whole"), Dtype::U64, vec![whole.len()], bytes));
+    }
     let clock = &trainer.clock;
     let whole = [
         clock.step,
@@ -204,8 +217,25 @@ pub fn from_bytes(bytes: &[u8], dataset: Arc<Dataset>, options: TrainOptions) ->
     let carried: [f64; Param::ALL.len()] = carried
         .try_into()
         .map_err(|_| wrong("its clock has the wrong length".into()))?;
-    let mut trainer = Trainer::without_splats(dataset, recipe, TrainOptions { seed, ..options })?;
+    let mut trainer = Trainer::unfilled(dataset, recipe, TrainOptions { seed, ..options })?;
     trainer.state = state;
+    if let Ok(whole) = file.tensor(&format!("{FIELD}whole")) {
+        let numbers: Vec<u64> = whole
+            .data()
+            .as_chunks()
+            .0
+            .iter()
+            .map(|b| u64::from_le_bytes(*b))
+            .collect();
+        let ([step, rays], Some(_)) = (&numbers[..], &trainer.recipe.field) else {
+            return Err(wrong("its field and its recipe do not agree".into()));
+        };
+        let fresh = trainer.first_field()?.field;
+        let state = FieldState::from_tensors(fresh.config, fresh.space, *step, *rays as usize, |name| {
+            floats(&file, &format!("{FIELD}{name}"))
+        })?;
+        trainer.field = Some(state);
+    }
     (trainer.pace, trainer.seconds, trainer.cpu_seconds) = (*pace, *seconds, *cpu_seconds);
     trainer.clock = Clock {
         step: *step,

@@ -1,10 +1,11 @@
 //! Looking at held-out views.
 
+use crate::model::{LookOptions, Model};
 use crate::photos::Prepared;
 use crate::trainer::TrainError;
 use irradia_measure::{Evaluation, Lpips, evaluate, psnr_masked};
 use irradia_scene::{Dataset, Image, Photo, View};
-use irradia_splat::{RenderOptions, Renderer, Splats, ViewParams};
+use irradia_splat::Renderer;
 
 /// One view's outcome with its pictures, `[H, W, 3]`.
 pub struct EvaluatedView {
@@ -20,15 +21,6 @@ pub struct EvaluatedView {
     pub mask: Option<Vec<u8>>,
 }
 
-/// Renders `splats` from `view`, `[H, W, 3]`.
-pub fn render_image(renderer: &mut Renderer, splats: &Splats, view: &ViewParams, options: &RenderOptions) -> Image {
-    renderer.render(splats, view, options);
-    let pixels = (view.width * view.height) as usize;
-    let color = renderer.color();
-    let data = (0..3 * pixels).map(|i| color[(i % 3) * pixels + i / 3]).collect();
-    Image::new(view.width, view.height, 3, data)
-}
-
 /// Which metrics to compute.
 #[derive(Clone, Copy)]
 pub enum Metrics<'a> {
@@ -38,15 +30,15 @@ pub enum Metrics<'a> {
     All(Option<&'a Lpips>),
 }
 
-/// Renders the views `indices` of `dataset` and compares; each is given to `see` when it is done.
+/// Looks at `model` from the views `indices` of `dataset` and compares; each is given to `see` when it is done.
 ///
 /// # Errors
 /// When a photograph cannot be read.
 pub fn evaluate_views(
-    splats: &Splats,
+    model: &Model,
     dataset: &Dataset,
     indices: &[usize],
-    options: &RenderOptions,
+    options: &LookOptions,
     metrics: Metrics,
     mut see: impl FnMut(EvaluatedView),
 ) -> Result<(), TrainError> {
@@ -55,7 +47,7 @@ pub fn evaluate_views(
         let view = &dataset.views[*index];
         let photo = view.photo.load()?;
         let truth = truth_image(&photo, view, options.background);
-        let render = render_image(&mut renderer, splats, &ViewParams::new(&view.camera), options);
+        let render = model.look(&mut renderer, &view.camera, options).color;
         let mask = photo.mask.as_deref();
         let metrics = match metrics {
             Metrics::All(lpips) => evaluate(&render, &truth, mask, lpips),

@@ -57,10 +57,12 @@ impl Forecast {
         let count = trainer.state.len() as f64;
         let start = trainer.clock.time;
         let (stage, entered, before) = self.entered.unwrap_or((trainer.clock.stage, start, count));
-        // Growth goes on as it has since the stage began. Without an example, a stage may double the number.
+        // Growth goes on as it has since the stage began. Without an example, and where the number has only fallen (random
+        // points that nothing needed), the stage may double it.
         let seen = start - entered;
         let length: f64 = ahead.iter().filter(|a| a.grows).map(|a| a.duration).sum();
-        let known = seen > 0.1 * length && ahead.first().is_some_and(|now| now.grows && now.stage == stage);
+        let known =
+            seen > 0.1 * length && count > before && ahead.first().is_some_and(|now| now.grows && now.stage == stage);
         let rate = if known {
             (count - before) / seen
         } else {
@@ -68,15 +70,15 @@ impl Forecast {
         };
         let (mut splats, mut sum) = (count, 0.0);
         for Ahead {
+            stage,
             image_scale,
             count_share,
             grows,
             duration,
-            ..
         } in ahead
         {
             if grows {
-                let limit = (trainer.cap as f64 * count_share).max(count);
+                let limit = (trainer.limit(stage, count_share) as f64).max(count);
                 splats = (splats + rate * duration).clamp(1.0, limit);
             }
             sum += duration * work(image_scale, splats);

@@ -19,7 +19,7 @@ pub struct Prepared {
     /// `[H, W]`, 0 where the pixel must not be trained on.
     pub mask: Option<Vec<u8>>,
     /// What `rgb` lies over.
-    background: [f32; 3],
+    pub background: [f32; 3],
 }
 
 impl Prepared {

@@ -1,12 +1,15 @@
 //! Read this first: [`Trainer::step`] is one step from batch to update.
 
 use crate::event::{Event, StepReport};
+use crate::field_step::{first_field, is_field};
+use crate::model::Model;
 use crate::objective::{Objective, Reference};
 use crate::photos::{PhotoCache, Prepared};
 use crate::recipe::{Density, Recipe};
 use crate::schedule::{Clock, Round, Signal, StepPlan, coming_views, plan};
 use cpu_time::ProcessTime;
 use irradia_compute::adam::AdamStep;
+use irradia_field::{FieldError, FieldState};
 use irradia_measure::{DepthSample, Lpips};
 use irradia_scene::{Camera, Dataset, LoadError, Rng, View, sh};
 use irradia_splat::densify::{DensityChange, classic, fast, mcmc, merge, taming};
@@ -32,6 +35,15 @@ pub enum TrainError {
         "there is nothing to start from: no points, and no space that the cameras share and the masks leave; check poses and masks"
     )]
     NoPoints,
+    /// There is no space for a field.
+    #[error("there is no space for a field: the cameras do not look at anything together; check poses")]
+    NoSpace,
+    /// A field has nothing to hand on.
+    #[error("the field shows no surface that splats could begin as: give its stage more steps")]
+    NoSurface,
+    /// A field cannot be.
+    #[error(transparent)]
+    Field(#[from] FieldError),
     /// A checkpoint does not fit.
     #[error("{0}")]
     Checkpoint(String),
@@ -76,8 +88,10 @@ pub struct Trainer {
     pub recipe: Recipe,
     /// The data.
     pub dataset: Arc<Dataset>,
-    /// What is being trained.
+    /// The splats; none while a field is trained.
     pub state: SplatState,
+    /// The field, in the stages that train one.
+    pub field: Option<FieldState>,
     /// Where the run stands.
     pub clock: Clock,
     /// As given.
@@ -92,7 +106,7 @@ pub struct Trainer {
     pub cpu_seconds: f64,
     /// Never more splats than this: the recipe's limits for this data.
     pub cap: usize,
-    photos: PhotoCache,
+    pub(crate) photos: PhotoCache,
     renderer: Renderer,
     objective: Objective,
     gradients: SplatGradients,
@@ -104,18 +118,18 @@ impl Trainer {
     /// # Errors
     /// When there is nothing to train on or to start from, or photographs needed for colours cannot be read.
     pub fn new(dataset: Arc<Dataset>, recipe: Recipe, options: TrainOptions) -> Result<Self, TrainError> {
-        let mut trainer = Self::without_splats(dataset, recipe, options)?;
-        let splats = trainer.first_splats()?;
-        trainer.state = SplatState::new(splats);
+        let mut trainer = Self::unfilled(dataset, recipe, options)?;
+        if is_field(&trainer.recipe, 0) {
+            trainer.field = Some(trainer.first_field()?);
+        } else {
+            let splats = trainer.first_splats()?;
+            trainer.state = SplatState::new(splats);
+        }
         Ok(trainer)
     }
 
     /// A trainer whose state is still to be filled, as a checkpoint does.
-    pub(crate) fn without_splats(
-        dataset: Arc<Dataset>,
-        recipe: Recipe,
-        options: TrainOptions,
-    ) -> Result<Self, TrainError> {
+    pub(crate) fn unfilled(dataset: Arc<Dataset>, recipe: Recipe, options: TrainOptions) -> Result<Self, TrainError> {
         if dataset.train.is_empty() {
             return Err(TrainError::NoViews(0));
         }
@@ -133,19 +147,41 @@ impl Trainer {
             objective: Objective::new(options.lpips.clone()),
             gradients: SplatGradients::default(),
             state: SplatState::default(),
+            field: None,
             recipe,
             dataset,
             options,
         })
     }
 
-    fn first_splats(&mut self) -> Result<Splats, TrainError> {
-        let knobs = &self.recipe.init;
-        let options = InitOptions {
-            opacity: knobs.opacity,
-            scale: knobs.scale,
+    /// The recipe's field, nothing learnt yet.
+    pub(crate) fn first_field(&mut self) -> Result<FieldState, TrainError> {
+        let first = self.photos.get(&self.dataset.train[..1], 1.0)?;
+        let cameras: Vec<Camera> = self
+            .dataset
+            .train
+            .iter()
+            .map(|i| self.dataset.views[*i].camera)
+            .collect();
+        let knobs = self
+            .recipe
+            .field
+            .as_ref()
+            .expect("validated: a stage of field has its knobs");
+        first_field(knobs, &self.dataset, &cameras, first.alpha.is_some(), self.options.seed)
+    }
+
+    /// How the first splats look.
+    pub(crate) fn init_options(&self) -> InitOptions {
+        InitOptions {
+            opacity: self.recipe.init.opacity,
+            scale: self.recipe.init.scale,
             sh_degree: sh::MAX_DEGREE,
-        };
+        }
+    }
+
+    fn first_splats(&mut self) -> Result<Splats, TrainError> {
+        let options = self.init_options();
         let dataset = self.dataset.clone();
         let splats = match dataset.points.as_ref().filter(|points| points.len() >= 10) {
             Some(points) => init::from_points(points, &options),
@@ -159,18 +195,24 @@ impl Trainer {
                     *photo = Some(self.photos.get(&coming, 1.0)?);
                 }
                 let mut rng = Rng::new(self.options.seed, STREAM_INIT);
-                let points = init::random_points(&cameras, &bounds, knobs.random_points, &mut rng, |view, pixel| {
-                    let photo = photos[view].as_ref().expect("loaded above");
-                    let at = pixel.y as usize * photo.width as usize + pixel.x as usize;
-                    let zero = |plane: &Option<Vec<u8>>| plane.as_ref().is_some_and(|plane| plane[at] == 0);
-                    if zero(&photo.mask) {
-                        Look::Masked
-                    } else if zero(&photo.alpha) {
-                        Look::Empty
-                    } else {
-                        Look::Color([0, 1, 2].map(|c| photo.rgb[3 * at + c]))
-                    }
-                });
+                let points = init::random_points(
+                    &cameras,
+                    &bounds,
+                    self.recipe.init.random_points,
+                    &mut rng,
+                    |view, pixel| {
+                        let photo = photos[view].as_ref().expect("loaded above");
+                        let at = pixel.y as usize * photo.width as usize + pixel.x as usize;
+                        let zero = |plane: &Option<Vec<u8>>| plane.as_ref().is_some_and(|plane| plane[at] == 0);
+                        if zero(&photo.mask) {
+                            Look::Masked
+                        } else if zero(&photo.alpha) {
+                            Look::Empty
+                        } else {
+                            Look::Color([0, 1, 2].map(|c| photo.rgb[3 * at + c]))
+                        }
+                    },
+                );
                 init::from_points(&points, &options)
             }
         };
@@ -202,6 +244,25 @@ impl Trainer {
     /// # Errors
     /// When a photograph cannot be read.
     pub fn step(&mut self, events: &mut Vec<Event>) -> Result<StepReport, TrainError> {
+        let (report, signal) = if self.field.is_some() {
+            self.field_step()?
+        } else {
+            self.splat_step(events)?
+        };
+        if self.tick(signal) && !self.finished() {
+            events.push(Event::StageEntered {
+                stage: self.stage_name().to_owned(),
+                step: self.clock.step,
+                seconds: self.seconds,
+            });
+            if self.field.is_some() && !is_field(&self.recipe, self.clock.stage) {
+                self.field_to_splats()?;
+            }
+        }
+        Ok(report)
+    }
+
+    fn splat_step(&mut self, events: &mut Vec<Event>) -> Result<(StepReport, Signal), TrainError> {
         let plan = plan(&self.recipe, &self.clock);
         let coming = coming_views(&self.dataset.train, self.options.seed, &self.clock);
         let photo = self.photos.get(&coming, plan.image_scale)?;
@@ -259,15 +320,8 @@ impl Trainer {
             },
             views: self.dataset.train.len() as u64,
         };
-        if self.tick(signal) && !self.finished() {
-            events.push(Event::StageEntered {
-                stage: self.stage_name().to_owned(),
-                step: self.clock.step,
-                seconds: self.seconds,
-            });
-        }
-        Ok(StepReport {
-            step: self.clock.step,
+        let report = StepReport {
+            step: self.clock.step + 1,
             seconds: self.seconds,
             seconds_left: 0.0,
             view: coming[0],
@@ -276,7 +330,8 @@ impl Trainer {
             splats: self.state.len(),
             visible,
             non_finite: self.gradients.non_finite,
-        })
+        };
+        Ok((report, signal))
     }
 
     /// Adam, and what goes with it, for the gradients of the frame of `view`.
@@ -337,7 +392,7 @@ impl Trainer {
     }
 
     fn densify(&mut self, round: &Round) -> DensityChange {
-        let limit = (self.cap as f64 * round.count_share) as usize;
+        let limit = self.limit(self.clock.stage, round.count_share);
         let mut rng = Rng::new(self.options.seed ^ self.clock.step << 20, STREAM_DENSIFY);
         let state = &mut self.state;
         match round.density {
@@ -350,8 +405,16 @@ impl Trainer {
                 let target = taming::next_count(state.len(), limit, round.share);
                 taming::densify(state, &knobs.options(self.extent, target), &mut rng)
             }
-            Density::Fast(knobs) => fast::densify(state, &knobs.options(limit)),
+            Density::Fast(knobs) => fast::densify(state, &knobs.options(self.pace, limit)),
         }
+    }
+
+    /// Splats that stage `stage` may have at a share of the cap.
+    pub(crate) fn limit(&self, stage: usize, count_share: f64) -> usize {
+        let limit = self.cap as f64 * count_share;
+        let stage = &self.recipe.stage[stage.min(self.recipe.stage.len() - 1)];
+        let share = stage.density.map_or(1.0, |density| density.limit_share(self.pace));
+        ((limit * share) as usize).max(1)
     }
 
     fn update_filter(&mut self) {
@@ -372,7 +435,7 @@ impl Trainer {
         }
     }
 
-    fn scaled_camera(&self, view: usize, scale: f32) -> Camera {
+    pub(crate) fn scaled_camera(&self, view: usize, scale: f32) -> Camera {
         let mut camera = self.dataset.views[view].camera;
         camera.intrinsics = camera.intrinsics.scaled(scale);
         camera
@@ -445,11 +508,11 @@ impl Trainer {
     }
 
     /// The scene as a file holds it and held-out views show it: with the smoothing filter made part of it.
-    pub fn scene(&self) -> Cow<'_, Splats> {
-        if self.recipe.render.smoothing_filter {
-            Cow::Owned(filter::baked(&self.state))
-        } else {
-            Cow::Borrowed(&self.state.splats)
+    pub fn scene(&self) -> Model<'_> {
+        match &self.field {
+            Some(state) => Model::Field(Cow::Borrowed(&state.field)),
+            None if self.recipe.render.smoothing_filter => Model::Splats(Cow::Owned(filter::baked(&self.state))),
+            None => Model::Splats(Cow::Borrowed(&self.state.splats)),
         }
     }
 }

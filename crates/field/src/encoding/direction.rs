@@ -6,9 +6,11 @@ use crate::mlp::PANEL;
 use irradia_compute::each;
 use irradia_compute::simd::{Lanes, Simd};
 use irradia_scene::sh::{C0, C1, C2, C3};
+use serde::{Deserialize, Serialize};
 
 /// How directions are encoded.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(tag = "kind", rename_all = "snake_case")]
 pub enum DirectionEncoding {
     /// The sixteen real harmonics of four bands (Instant-NGP).
     Harmonics,

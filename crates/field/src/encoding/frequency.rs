@@ -4,9 +4,11 @@
 use crate::Num;
 use crate::mlp::PANEL;
 use irradia_compute::simd::{Lanes, Scalar, Simd};
+use serde::{Deserialize, Serialize};
 
 /// The encoding's one size.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct Frequency {
     /// L: 10 for positions, 4 for directions.
     pub octaves: usize,

@@ -7,12 +7,14 @@ use crate::Num;
 use crate::mlp::PANEL;
 use irradia_compute::each;
 use irradia_compute::simd::{Lanes, Scalar, Simd};
+use serde::{Deserialize, Serialize};
 
 /// Most features a level can have.
 pub const MAX_FEATURES: usize = 8;
 
 /// The encoding's sizes.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct HashGrid {
     /// L, resolutions.
     pub levels: usize,

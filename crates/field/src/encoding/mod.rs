@@ -1,5 +1,7 @@
 //! What turns a position or a direction into features that a small network can use.
 
+use serde::{Deserialize, Serialize};
+
 pub mod direction;
 pub mod frequency;
 pub mod hash_grid;
@@ -9,7 +11,8 @@ pub use frequency::Frequency;
 pub use hash_grid::HashGrid;
 
 /// How positions are encoded.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "kind", rename_all = "snake_case")]
 pub enum PositionEncoding {
     /// Sines and cosines (NeRF).
     Frequency(Frequency),

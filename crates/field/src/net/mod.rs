@@ -9,13 +9,15 @@ use crate::mlp::{Mlp, MlpShape, PANEL};
 use crate::{Num, Rows};
 use irradia_compute::simd::{Lanes, Scalar, Simd};
 use irradia_scene::Rng;
+use serde::{Deserialize, Serialize};
 
 mod block;
 
 pub use block::{Block, get3, place, set3};
 
 /// How a network's first output becomes a density, one over field units.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
 pub enum Activation {
     /// e^x, cut off at x = 10 (Instant-NGP).
     Exp,
@@ -26,7 +28,8 @@ pub enum Activation {
 }
 
 /// The half of a network that knows colour.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct ColorShape {
     /// How the viewing direction comes in.
     pub direction: DirectionEncoding,
@@ -35,11 +38,13 @@ pub struct ColorShape {
     /// Hidden layers: 2 in Instant-NGP, 1 of half the width in NeRF.
     pub depth: usize,
     /// Numbers of a photograph's own appearance code; 0 for none.
+    #[serde(default)]
     pub appearance: usize,
 }
 
 /// The sizes of a network.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct NetShape {
     /// How positions come in.
     pub encoding: PositionEncoding,
@@ -48,6 +53,7 @@ pub struct NetShape {
     /// Hidden layers of the density part: 1 in Instant-NGP, 8 in NeRF.
     pub depth: usize,
     /// The hidden layer (from 0) that sees the encoded position again; NeRF: 5.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
     pub skip: Option<usize>,
     /// Features handed from density to colour: 15 in Instant-NGP, 256 in NeRF.
     pub geometry: usize,
@@ -56,6 +62,7 @@ pub struct NetShape {
     /// What is added to the raw density.
     pub density_bias: f32,
     /// `None` for a proposal network, which knows densities alone.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
     pub color: Option<ColorShape>,
 }
 

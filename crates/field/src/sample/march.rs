@@ -2,9 +2,11 @@
 
 use super::occupancy::{Cell, OccupancyGrid};
 use crate::space::{Outside, Ray, Space};
+use serde::{Deserialize, Serialize};
 
 /// How long steps are.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct Steps {
     /// Shortest step, field units (the cube is 2 wide).
     pub shortest: f32,

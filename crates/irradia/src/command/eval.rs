@@ -2,11 +2,11 @@
 
 use super::{DataArgs, Split, file_stem, lpips, thread_count, use_threads};
 use crate::Usage;
-use crate::run_folder::{render_knobs_beside, scene_of};
+use crate::run_folder::{read_scene, render_knobs_beside, scene_of};
 use crate::terminal::say;
 use anyhow::Result;
-use irradia_formats::{read_splats, write_atomic, write_png};
-use irradia_splat::{RenderOptions, Splats};
+use irradia_formats::{write_atomic, write_png};
+use irradia_splat::RenderOptions;
 use irradia_train::eval::{Metrics, evaluate_views, mean};
 use serde_json::json;
 use std::path::PathBuf;
@@ -40,7 +40,7 @@ pub struct Args {
 pub fn run(args: &Args) -> Result<()> {
     use_threads(args.threads)?;
     let scene = scene_of(&args.scene);
-    let cloud = read_splats(&scene)?;
+    let (model, antialiased) = read_scene(&scene)?;
     let dataset = args.reading.read(&args.data)?;
     let indices = args.split.of(&dataset);
     if indices.is_empty() {
@@ -50,13 +50,12 @@ pub fn run(args: &Args) -> Result<()> {
     let knobs = render_knobs_beside(&scene);
     let options = RenderOptions {
         background: knobs.background,
-        antialias: knobs.antialias || cloud.antialiased,
+        antialias: knobs.antialias || antialiased,
         ..RenderOptions::default()
     };
-    let splats = Splats::from_cloud(&cloud);
     let (mut rows, mut metrics, mut outcome) = (Vec::new(), Vec::new(), Ok(()));
     evaluate_views(
-        &splats,
+        &model,
         &dataset,
         &indices,
         &options,
@@ -93,7 +92,7 @@ pub fn run(args: &Args) -> Result<()> {
     ))?;
     if let Some(path) = &args.json {
         let figures = json!({
-            "scene": scene, "data": args.data, "splats": splats.len(),
+            "scene": scene, "data": args.data, "splats": model.splats().map(irradia_splat::Splats::len),
             "psnr": mean.psnr, "ssim": mean.ssim, "lpips": mean.lpips, "views": rows,
         });
         let bytes = serde_json::to_vec_pretty(&figures)?;

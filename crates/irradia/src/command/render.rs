@@ -2,14 +2,13 @@
 
 use super::{DataArgs, Split, file_stem, thread_count, use_threads};
 use crate::Usage;
-use crate::run_folder::{cameras_beside, render_knobs_beside, scene_of};
+use crate::run_folder::{cameras_beside, read_scene, render_knobs_beside, scene_of};
 use crate::terminal::say;
 use anyhow::{Context, Result};
 use glam::Vec3;
-use irradia_formats::{read_splats, write_png};
-use irradia_scene::{Camera, GaussianCloud, Image, Intrinsics, Pose};
-use irradia_splat::{RenderOptions, Renderer, Splats, ViewParams, init::focus_point};
-use irradia_train::eval::render_image;
+use irradia_formats::write_png;
+use irradia_scene::{Camera, Image, Intrinsics, Pose};
+use irradia_splat::{RenderOptions, Renderer, Splats, init::focus_point};
 use std::path::PathBuf;
 
 #[derive(clap::Args)]
@@ -56,7 +55,7 @@ pub fn parse_size(text: &str) -> Result<(u32, u32), String> {
 pub fn run(args: &Args) -> Result<()> {
     use_threads(args.threads)?;
     let scene = scene_of(&args.scene);
-    let cloud = read_splats(&scene)?;
+    let (model, antialiased) = read_scene(&scene)?;
     let cameras: Vec<(String, Camera)> = match (&args.data, args.orbit) {
         (Some(data), _) => {
             let dataset = args.reading.read(data)?;
@@ -67,7 +66,7 @@ pub fn run(args: &Args) -> Result<()> {
                 .collect()
         }
         (None, Some(frames)) => {
-            let cameras = orbit(&cloud, cameras_beside(&scene), frames, args.size);
+            let cameras = orbit(model.splats(), cameras_beside(&scene), frames, args.size);
             cameras
                 .into_iter()
                 .enumerate()
@@ -83,11 +82,10 @@ pub fn run(args: &Args) -> Result<()> {
     let knobs = render_knobs_beside(&scene);
     let options = RenderOptions {
         background: knobs.background,
-        antialias: knobs.antialias || cloud.antialiased,
+        antialias: knobs.antialias || antialiased,
         depth: args.depth,
         ..RenderOptions::default()
     };
-    let splats = Splats::from_cloud(&cloud);
     let mut renderer = Renderer::new();
     let mut depths = Vec::new();
     let write = |name: &str, what: &str, image: &Image| -> Result<()> {
@@ -96,11 +94,12 @@ pub fn run(args: &Args) -> Result<()> {
         Ok(())
     };
     for (name, camera) in &cameras {
-        let image = render_image(&mut renderer, &splats, &ViewParams::new(camera), &options);
+        let frame = model.look(&mut renderer, camera, &options);
+        let image = frame.color;
         write(name, "", &image)?;
-        let alpha = Image::new(image.width, image.height, 1, renderer.alpha().to_vec());
+        let alpha = Image::new(image.width, image.height, 1, frame.alpha);
         if args.depth {
-            let expected = renderer.depth().iter().zip(&alpha.data);
+            let expected = frame.depth.iter().zip(&alpha.data);
             let inverse = expected.map(|(d, a)| if *a > 0.5 { a / d } else { 0.0 }).collect();
             depths.push(Image::new(image.width, image.height, 1, inverse));
         }
@@ -121,7 +120,7 @@ pub fn run(args: &Args) -> Result<()> {
 
 /// A circle around what the training cameras looked at, at their mean distance and height; for a scene without them,
 /// around the middle of the splats.
-fn orbit(cloud: &GaussianCloud, cameras: Option<Vec<Camera>>, frames: u32, size: Option<(u32, u32)>) -> Vec<Camera> {
+fn orbit(splats: Option<&Splats>, cameras: Option<Vec<Camera>>, frames: u32, size: Option<(u32, u32)>) -> Vec<Camera> {
     let cameras = cameras.filter(|c| !c.is_empty());
     let (center, up, radius, height, mut intrinsics) = match &cameras {
         Some(cameras) => {
@@ -138,7 +137,8 @@ fn orbit(cloud: &GaussianCloud, cameras: Option<Vec<Camera>>, frames: u32, size:
         }
         None => {
             let middle = |c: usize| {
-                let mut values: Vec<f32> = cloud.means.iter().map(|m| m[c]).filter(|v| v.is_finite()).collect();
+                let plane = splats.map_or(&[][..], |splats| &splats.means.plane(c)[..splats.len()]);
+                let mut values: Vec<f32> = plane.iter().copied().filter(|v| v.is_finite()).collect();
                 values.sort_unstable_by(f32::total_cmp);
                 let at = |share: f32| {
                     values

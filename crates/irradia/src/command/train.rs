@@ -14,10 +14,11 @@ use irradia_measure::{Evaluation, Lpips};
 use irradia_scene::{Image, sh};
 use irradia_train::eval::{EvaluatedView, Metrics, evaluate_views, mean};
 use irradia_train::event::Observer;
+use irradia_train::model::Model;
 use irradia_train::recipe::Param;
 use irradia_train::report::{Report, ViewReport, machine, peak_rss_bytes, schedule, to_html};
 use irradia_train::schedule::{Moment, outline};
-use irradia_train::{Recipe, RunLimits, TrainOptions, Trainer, checkpoint};
+use irradia_train::{Recipe, RunLimits, TrainOptions, Trainer, checkpoint, field_file};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -240,9 +241,14 @@ fn finish(
     ran?;
     journal.finish();
 
-    let mut cloud = trainer.scene().to_cloud();
-    cloud.antialiased = trainer.recipe.render.antialias;
-    write_splats(&folder.file("scene.ply"), &cloud)?;
+    match trainer.scene() {
+        Model::Splats(splats) => {
+            let mut cloud = splats.to_cloud();
+            cloud.antialiased = trainer.recipe.render.antialias;
+            write_splats(&folder.file("scene.ply"), &cloud)?;
+        }
+        Model::Field(field) => folder.write("field.safetensors", &field_file::to_bytes(&field))?,
+    }
     saved.map_err(anyhow::Error::msg)?;
 
     let mut views = Vec::new();

@@ -41,6 +41,14 @@ impl Density {
         }
     }
 
+    /// Share of the cap that a run may fill in which `pace` recipe steps go by in one step.
+    pub fn limit_share(&self, pace: f64) -> f64 {
+        match self {
+            Density::Fast(_) => pace.max(1.0).powf(-0.5),
+            Density::Classic(_) | Density::Mcmc(_) | Density::Taming(_) => 1.0,
+        }
+    }
+
     /// What has to be gathered for it.
     pub fn statistics(&self) -> Statistics {
         match self {
@@ -160,7 +168,8 @@ impl TamingKnobs {
     }
 }
 
-/// Knobs of [`irradia_splat::densify::fast`].
+/// Knobs of [`irradia_splat::densify::fast`], for a run of as many steps as the recipe has. A run of a quarter of them has
+/// less to give to each splat: it may fill half the cap, and what it cuts shows four times the error.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct FastKnobs {
@@ -177,13 +186,13 @@ pub struct FastKnobs {
 }
 
 impl FastKnobs {
-    /// For at most `target` splats after the round.
-    pub fn options(&self, target: usize) -> FastOptions {
+    /// For at most `target` splats after the round, in a run in which `pace` recipe steps go by in one step.
+    pub fn options(&self, pace: f64, target: usize) -> FastOptions {
         FastOptions {
             target,
             min_opacity: self.min_opacity,
             min_weight: self.min_weight,
-            error_threshold: self.error_threshold,
+            error_threshold: self.error_threshold * pace as f32,
             min_extent: self.min_extent,
         }
     }

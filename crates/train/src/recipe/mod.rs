@@ -2,16 +2,18 @@
 
 mod ablation;
 mod density;
+mod field;
 mod param;
 
 pub use ablation::Ingredients;
 pub use density::{ClassicKnobs, Density, FastKnobs, McmcKnobs, MergeKnobs, TamingKnobs};
+pub use field::{FieldKnobs, FieldSpace};
 use param::check_knob;
 pub use param::{Knob, Param, Params, Shape};
 use serde::{Deserialize, Serialize};
 
 /// The recipes that come with the program: name and text.
-pub const BUILT_IN: [(&str, &str); 7] = [
+pub const BUILT_IN: [(&str, &str); 10] = [
     ("classic", include_str!("../../../../recipes/classic.toml")),
     ("absgrad", include_str!("../../../../recipes/absgrad.toml")),
     ("mcmc", include_str!("../../../../recipes/mcmc.toml")),
@@ -22,6 +24,9 @@ pub const BUILT_IN: [(&str, &str); 7] = [
         "curriculum-paper",
         include_str!("../../../../recipes/curriculum-paper.toml"),
     ),
+    ("hashgrid", include_str!("../../../../recipes/hashgrid.toml")),
+    ("nerf", include_str!("../../../../recipes/nerf.toml")),
+    ("hybrid", include_str!("../../../../recipes/hybrid.toml")),
 ];
 
 /// Why a recipe was refused: one line that names the key.
@@ -79,6 +84,9 @@ pub struct Recipe {
     /// What of a curriculum is in force.
     #[serde(default, skip_serializing_if = "Ingredients::are_all")]
     pub ingredients: Ingredients,
+    /// The radiance field of the stages that train one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub field: Option<FieldKnobs>,
     /// Knobs over the whole run; a stage may overrule them.
     pub params: Params,
     /// What happens, in order.
@@ -130,6 +138,9 @@ pub struct Stage {
     pub name: String,
     /// Its length in recipe steps: `--steps` and `--budget` stretch or shrink the whole run.
     pub steps: u64,
+    /// What it trains. Splats that come after a field begin as its surfaces.
+    #[serde(default, skip_serializing_if = "Represents::is_splats")]
+    pub represents: Represents,
     /// Knobs over this stage.
     #[serde(default)]
     pub params: Params,
@@ -142,6 +153,23 @@ pub struct Stage {
     /// When the stage may end before its steps are over; never when absent.
     #[serde(default)]
     pub exit: Option<Exit>,
+}
+
+/// What a stage trains.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Represents {
+    /// 3D Gaussians.
+    #[default]
+    Splats,
+    /// A radiance field.
+    Field,
+}
+
+impl Represents {
+    fn is_splats(&self) -> bool {
+        *self == Self::Splats
+    }
 }
 
 /// When a stage has done its work: rules on S, the mean L1 error over the training views (CurriculumGS's S_t), of which a
@@ -245,7 +273,11 @@ impl Recipe {
         if !(self.init.opacity > 0.0 && self.init.opacity < 1.0 && self.init.scale > 0.0) {
             return Err("init.opacity must lie between 0 and 1 and init.scale above 0".into());
         }
+        if let Some(field) = &self.field {
+            field.validate()?;
+        }
         for (i, stage) in self.stage.iter().enumerate() {
+            self.validate_order(i)?;
             if stage.steps == 0 {
                 return Err(format!("stage.{}.steps must be at least 1", stage.name));
             }
@@ -284,6 +316,28 @@ impl Recipe {
             }
         }
         Ok(())
+    }
+}
+
+impl Recipe {
+    /// Whether what stage `i` trains can follow what came before.
+    fn validate_order(&self, i: usize) -> Result<(), String> {
+        let stage = &self.stage[i];
+        let before = i.checked_sub(1).map(|before| self.stage[before].represents);
+        let name = &stage.name;
+        match (stage.represents, before) {
+            (Represents::Field, _) if self.field.is_none() => {
+                Err(format!("stage.{name} trains a field, but there is no [field]"))
+            }
+            (Represents::Field, Some(Represents::Splats)) => Err(format!("stage.{name}: a field cannot follow splats")),
+            (Represents::Field, _) if stage.density.is_some() || stage.merge.is_some() => {
+                Err(format!("stage.{name}: a field has neither density control nor merging"))
+            }
+            (Represents::Splats, Some(Represents::Field)) if self.field.as_ref().is_none_or(|f| f.points == 0) => Err(
+                format!("stage.{name} begins as a field's surfaces: say how many splats in field.points"),
+            ),
+            _ => Ok(()),
+        }
     }
 }
 

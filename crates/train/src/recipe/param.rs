@@ -62,11 +62,21 @@ pub enum Param {
     RateShDc,
     /// Learning rate of the other SH coefficients.
     RateShRest,
+    /// Learning rate of a field's tables.
+    RateTables,
+    /// Learning rate of a field's networks.
+    RateNets,
+    /// Learning rate of a field's appearance codes.
+    RateCodes,
+    /// Weight of the interlevel loss, where a field's samples are proposed (mip-NeRF 360).
+    InterlevelWeight,
+    /// Weight of the distortion loss of a field (mip-NeRF 360).
+    DistortionWeight,
 }
 
 impl Param {
     /// All of them, in order.
-    pub const ALL: [Param; 26] = [
+    pub const ALL: [Param; 31] = [
         Param::ImageScale,
         Param::ShDegree,
         Param::CountShare,
@@ -93,6 +103,11 @@ impl Param {
         Param::RateOpacities,
         Param::RateShDc,
         Param::RateShRest,
+        Param::RateTables,
+        Param::RateNets,
+        Param::RateCodes,
+        Param::InterlevelWeight,
+        Param::DistortionWeight,
     ];
 
     /// As recipes write it.

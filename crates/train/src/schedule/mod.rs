@@ -72,6 +72,8 @@ pub struct StepPlan {
     pub trained_share: f32,
     /// Learning rates; that of the means in units of the scene's extent.
     pub rates: Rates,
+    /// What a stage of field is trained by.
+    pub field: FieldPlan,
     /// Density statistics to gather.
     pub gathers: Option<Statistics>,
     /// A round of density control, after the step.
@@ -88,6 +90,21 @@ pub struct StepPlan {
     pub evaluate: bool,
     /// A checkpoint is written, after the step.
     pub checkpoint: bool,
+}
+
+/// Rates and weights of a radiance field.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct FieldPlan {
+    /// Learning rate of tables.
+    pub tables: f32,
+    /// Learning rate of networks.
+    pub nets: f32,
+    /// Learning rate of appearance codes.
+    pub codes: f32,
+    /// Weight of the interlevel loss.
+    pub interlevel: f32,
+    /// Weight of the distortion loss.
+    pub distortion: f32,
 }
 
 /// Weights of what a frame is compared by.
@@ -288,6 +305,13 @@ pub fn plan(recipe: &Recipe, clock: &Clock) -> StepPlan {
             opacities: of(Param::RateOpacities) as f32,
             sh_dc: of(Param::RateShDc) as f32,
             sh_rest: of(Param::RateShRest) as f32,
+        },
+        field: FieldPlan {
+            tables: of(Param::RateTables) as f32,
+            nets: of(Param::RateNets) as f32,
+            codes: of(Param::RateCodes) as f32,
+            interlevel: of(Param::InterlevelWeight) as f32,
+            distortion: of(Param::DistortionWeight) as f32,
         },
         gathers: density.map(|density| density.statistics()),
         densify: density

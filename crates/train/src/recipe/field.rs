@@ -1,0 +1,65 @@
+//! The knobs of a radiance field.
+
+use irradia_field::net::NetShape;
+use irradia_field::{FieldConfig, Outside, Sampler, Space};
+use serde::{Deserialize, Serialize};
+
+/// A radiance field, for the stages that train one.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct FieldKnobs {
+    /// Where it lives.
+    #[serde(default)]
+    pub space: FieldSpace,
+    /// Samples of a step: the number of rays follows from it.
+    pub samples: usize,
+    /// Decay of Adam's second moment.
+    pub beta2: f32,
+    /// Splats that a later stage of splats begins with at most; 0 without such a stage.
+    #[serde(default)]
+    pub points: usize,
+    /// The network that gives out colour.
+    pub net: NetShape,
+    /// Where along a ray samples lie.
+    pub sampler: Sampler,
+}
+
+/// Where a field lives.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum FieldSpace {
+    /// `ndc` where every view names its depth bounds (LLFF captures), `bounded` where every photograph has alpha,
+    /// `unbounded` elsewhere.
+    #[default]
+    Auto,
+    /// The cube that the cameras look at.
+    Bounded,
+    /// That cube, and the rest of the world contracted around it (mip-NeRF 360).
+    Unbounded,
+    /// Normalised device coordinates of a forward-facing capture (NeRF).
+    Ndc,
+}
+
+impl FieldKnobs {
+    /// For `images` photographs in `space`: steps grow with distance only where space is unbounded.
+    pub fn config(&self, images: usize, space: &Space) -> FieldConfig {
+        let mut sampler = self.sampler.clone();
+        if let (Sampler::Occupancy(occupancy), false) = (&mut sampler, space.outside == Outside::Contracted) {
+            occupancy.steps.cone = 0.0;
+        }
+        FieldConfig {
+            net: self.net,
+            sampler,
+            images,
+        }
+    }
+
+    pub(super) fn validate(&self) -> Result<(), String> {
+        if self.samples == 0 || !(0.0..1.0).contains(&self.beta2) {
+            return Err("field.samples must be at least 1 and field.beta2 between 0 and 1".into());
+        }
+        self.config(1, &Space::contracted([0.0; 3], 1.0))
+            .check()
+            .map_err(|error| error.to_string())
+    }
+}

@@ -3,10 +3,20 @@
 use crate::trainer::TrainError;
 use irradia_field::{Field, FieldConfig, Space};
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
-use serde::de::DeserializeOwned;
+use serde::{Deserialize, Serialize};
 use std::collections::HashMap;
 
-const FORMAT: &str = "irradia-field-1";
+/// The header's one key: with several, their order would differ from run to run.
+const KEY: &str = "irradia_field";
+const FORMAT: u32 = 1;
+
+/// What the header says.
+#[derive(Serialize, Deserialize)]
+struct Header {
+    format: u32,
+    config: FieldConfig,
+    space: Space,
+}
 
 /// `field` as a safetensors file.
 pub fn to_bytes(field: &Field) -> Vec<u8> {
@@ -19,17 +29,13 @@ pub fn to_bytes(field: &Field) -> Vec<u8> {
         let view = TensorView::new(Dtype::F32, shape.clone(), bytes).expect("shape and bytes agree");
         (name.as_str(), view)
     });
-    let metadata = HashMap::from([
-        ("format".to_owned(), FORMAT.to_owned()),
-        (
-            "config".to_owned(),
-            serde_json::to_string(&field.config).expect("plain values"),
-        ),
-        (
-            "space".to_owned(),
-            serde_json::to_string(&field.space).expect("plain values"),
-        ),
-    ]);
+    let header = Header {
+        format: FORMAT,
+        config: field.config.clone(),
+        space: field.space,
+    };
+    let header = serde_json::to_string(&header).expect("plain values");
+    let metadata = HashMap::from([(KEY.to_owned(), header)]);
     safetensors::serialize(views, Some(metadata)).expect("in memory")
 }
 
@@ -41,17 +47,15 @@ pub fn from_bytes(bytes: &[u8]) -> Result<Field, TrainError> {
     let wrong = |why: String| TrainError::Checkpoint(format!("not a field of this program: {why}"));
     let (_, header) = SafeTensors::read_metadata(bytes).map_err(|e| wrong(e.to_string()))?;
     let file = SafeTensors::deserialize(bytes).map_err(|e| wrong(e.to_string()))?;
-    let metadata = header.metadata().clone().unwrap_or_default();
-    if metadata.get("format").map(String::as_str) != Some(FORMAT) {
-        return Err(wrong(format!("its format is not {FORMAT}")));
+    let text = header.metadata().as_ref().and_then(|metadata| metadata.get(KEY));
+    let text = text.ok_or_else(|| wrong("its header does not describe one".into()))?;
+    let header: Header = serde_json::from_str(text).map_err(|e| wrong(e.to_string()))?;
+    if header.format != FORMAT {
+        return Err(wrong(format!("format {} and not {FORMAT}", header.format)));
     }
-    fn read<T: DeserializeOwned>(metadata: &HashMap<String, String>, name: &str) -> Result<T, String> {
-        let text = metadata.get(name).ok_or_else(|| format!("no {name}"))?;
-        serde_json::from_str(text).map_err(|e| format!("{name}: {e}"))
-    }
-    let config: FieldConfig = read(&metadata, "config").map_err(wrong)?;
-    let space: Space = read(&metadata, "space").map_err(wrong)?;
-    Ok(Field::from_tensors(config, space, |name| floats(&file, name))?)
+    Ok(Field::from_tensors(header.config, header.space, |name| {
+        floats(&file, name)
+    })?)
 }
 
 /// The tensor `name` of 32-bit floats, if there is one.

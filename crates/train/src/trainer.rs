@@ -146,7 +146,7 @@ impl Trainer {
             renderer: Renderer::new(),
             objective: Objective::new(options.lpips.clone()),
             gradients: SplatGradients::default(),
-            state: SplatState::default(),
+            state: SplatState::new(Splats::zeros(0, sh::MAX_DEGREE)),
             field: None,
             recipe,
             dataset,

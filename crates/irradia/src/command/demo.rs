@@ -20,7 +20,7 @@ pub struct Args {
     #[arg(long, value_name = "WxH", value_parser = parse_size, default_value = "256x256")]
     pub size: (u32, u32),
     /// Steps of training
-    #[arg(long, default_value_t = 2000, value_parser = clap::value_parser!(u64).range(1..))]
+    #[arg(long, default_value_t = 1500, value_parser = clap::value_parser!(u64).range(1..))]
     pub steps: u64,
     /// Threads; all cores when absent
     #[arg(long, value_parser = thread_count())]
@@ -62,7 +62,7 @@ pub fn run(args: &Args) -> Result<()> {
     train::train(&train::Args {
         data: Some(data),
         out: Some(out.clone()),
-        recipe: "classic".into(),
+        recipe: train::DEFAULT_RECIPE.into(),
         set: Vec::new(),
         steps: Some(args.steps),
         max_splats: None,

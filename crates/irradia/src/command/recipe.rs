@@ -4,7 +4,7 @@ use super::train::read_recipe;
 use crate::terminal::say;
 use anyhow::Result;
 use irradia_train::Recipe;
-use irradia_train::recipe::{BUILT_IN, Density, Exit, Param, Stage};
+use irradia_train::recipe::{BUILT_IN, Density, Exit, Param, Represents, Stage};
 use irradia_train::report::columns;
 use irradia_train::schedule::{Moment, outline};
 
@@ -76,9 +76,11 @@ fn plan(recipe: &Recipe, steps: u64) -> String {
     if steps != recipe.total_steps() {
         text += &format!(" for the recipe's {}", recipe.total_steps());
     }
-    text += &format!(", at most {} splats", recipe.max_splats);
-    if let Some(share) = recipe.splats_per_pixel {
-        text += &format!(" or {share} for each pixel of an image");
+    if recipe.stage.iter().any(|stage| stage.represents == Represents::Splats) {
+        text += &format!(", at most {} splats", recipe.max_splats);
+        if let Some(share) = recipe.splats_per_pixel {
+            text += &format!(" or {share} for each pixel of an image");
+        }
     }
     text += "\n\n";
     text += &columns(&stages(recipe, &moments, pace), 6);
@@ -121,7 +123,10 @@ fn stages(recipe: &Recipe, moments: &[Moment], pace: f64) -> Vec<Vec<String>> {
             stage.name.clone(),
             format!("{:.0} - {:.0}", (start / pace).floor() + 1.0, end / pace),
             course(&within, Param::ImageScale),
-            losses(&within),
+            match stage.represents {
+                Represents::Splats => losses(&within),
+                Represents::Field => "squared error of rays".into(),
+            },
             density(stage),
             stage.exit.map_or("-".into(), exit),
         ]);
@@ -166,6 +171,9 @@ fn losses(within: &[&Moment]) -> String {
 }
 
 fn density(stage: &Stage) -> String {
+    if stage.represents == Represents::Field {
+        return "a radiance field".into();
+    }
     let strategy = stage.density.map(|density| {
         let name = match density {
             Density::Classic(knobs) if knobs.absolute => "classic, absolute",
@@ -247,10 +255,7 @@ mod tests {
             let recipe = read_recipe(name, &[]).unwrap();
             for steps in [1, 7, recipe.total_steps(), 100_000] {
                 let text = plan(&recipe, steps);
-                assert!(
-                    text.contains("image scale") && text.contains("rate_means"),
-                    "{name}: {text}"
-                );
+                assert!(text.contains("image scale") && text.contains("rate_"), "{name}: {text}");
                 assert!(!text.contains("NaN") && !text.contains("inf"), "{text}");
             }
         }

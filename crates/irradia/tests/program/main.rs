@@ -2,6 +2,7 @@
 
 mod bad_input;
 mod compare;
+mod field;
 mod outputs;
 mod process;
 mod real_data;

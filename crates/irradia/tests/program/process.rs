@@ -8,7 +8,9 @@ use std::sync::OnceLock;
 use tempfile::TempDir;
 
 /// Density control within the few steps that a test can wait for.
-pub const LIVELY: [&str; 4] = [
+pub const LIVELY: [&str; 6] = [
+    "--recipe",
+    "classic",
     "--set",
     "stage.grow.density.every=10",
     "--set",
@@ -96,6 +98,16 @@ pub fn with_run() -> TempDir {
         irradia_with(&folder, "train data --out run --steps 60 --seed 7", &LIVELY).well();
         folder
     }))
+}
+
+/// Takes from a finished run what its end wrote, as if it had been killed after its last checkpoint.
+pub fn unfinish(run: &Path, scene: &str) {
+    for file in [scene, "report.json", "report.html"] {
+        fs::remove_file(run.join(file)).expect("removed");
+    }
+    let mut config = json(&run.join("run.json"));
+    config["complete"] = false.into();
+    fs::write(run.join("run.json"), config.to_string()).expect("written");
 }
 
 /// A folder that outlives the tests (nothing drops what is static) and that the next ones make anew.

@@ -52,6 +52,22 @@ fn one_thread_and_two_write_the_same_scene() {
 }
 
 #[test]
+fn the_default_recipe_writes_the_same_scene_with_any_threads_and_over_a_break() {
+    let folder = with_data();
+    let line = "train data --steps 90 --set checkpoint_every=40 --set stage.grow.density.every=10";
+    for threads in [1, 3] {
+        irradia(folder.path(), &format!("{line} --threads {threads} --out run{threads}")).well();
+    }
+    let one = scene(&folder.path().join("run1"));
+    assert!(one == scene(&folder.path().join("run3")));
+    // As a kill after step 80 would have left it.
+    let run = folder.path().join("run3");
+    unfinish(&run, "scene.ply");
+    irradia(folder.path(), "train --resume run3").well();
+    assert!(one == scene(&run));
+}
+
+#[test]
 fn a_killed_run_resumes_to_the_bytes_of_an_unbroken_one() {
     let folder = with_data();
     let mut child = caught_in_its_midst(folder.path());
@@ -78,12 +94,7 @@ fn a_run_killed_before_its_first_checkpoint_resumes_from_its_start() {
     let run = folder.path().join("run");
     let finished = scene(&run);
     // As a kill at step 30 would have left it.
-    for file in ["scene.ply", "report.json", "report.html"] {
-        std::fs::remove_file(run.join(file)).expect("removed");
-    }
-    let mut config = json(&run.join("run.json"));
-    config["complete"] = false.into();
-    std::fs::write(run.join("run.json"), config.to_string()).expect("written");
+    unfinish(&run, "scene.ply");
     irradia(folder.path(), "train --resume run").well();
     assert!(scene(&run) == finished);
 }

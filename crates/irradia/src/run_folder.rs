@@ -50,6 +50,9 @@ pub struct RunConfig {
     pub seed: u64,
     /// `--steps`.
     pub steps: Option<u64>,
+    /// Weights of LPIPS, absolute, where there were any.
+    #[serde(default)]
+    pub lpips: Option<PathBuf>,
     /// Whether the recipe was followed to its end and everything was written.
     pub complete: bool,
 }

@@ -80,16 +80,18 @@ impl DataArgs {
 
 /// LPIPS's network: the file given, or `$IRRADIA_LPIPS`, or where the shared data lies; `None` when there is none.
 pub fn lpips(given: Option<&PathBuf>) -> Result<Option<Lpips>> {
-    let from_environment = std::env::var_os("IRRADIA_LPIPS").map(PathBuf::from);
-    if let Some(path) = given.or(from_environment.as_ref()) {
-        return Ok(Some(Lpips::load(path).context("LPIPS weights")?));
-    }
-    let shared = Path::new("../shared/data/lpips/lpips_squeeze.safetensors");
-    if shared.exists() {
-        Ok(Some(Lpips::load(shared)?))
-    } else {
-        Ok(None)
-    }
+    let path = lpips_path(given);
+    path.map(|path| Lpips::load(&path).context("LPIPS weights")).transpose()
+}
+
+/// The file that [`lpips`] reads, absolute.
+pub fn lpips_path(given: Option<&PathBuf>) -> Option<PathBuf> {
+    let shared = || Some(PathBuf::from("../shared/data/lpips/lpips_squeeze.safetensors")).filter(|path| path.exists());
+    let path = given.cloned();
+    let path = path
+        .or_else(|| std::env::var_os("IRRADIA_LPIPS").map(PathBuf::from))
+        .or_else(shared)?;
+    Some(std::path::absolute(&path).unwrap_or(path))
 }
 
 /// What `--threads` takes.

@@ -2,7 +2,7 @@
 
 use super::journal::Journal;
 use super::progress::Progress;
-use super::{DataArgs, file_stem, lpips, thread_count, use_threads};
+use super::{DataArgs, file_stem, lpips, lpips_path, thread_count, use_threads};
 use crate::Usage;
 use crate::run_folder::{RunConfig, RunFolder};
 use crate::terminal::{note, one_line, say};
@@ -94,10 +94,10 @@ pub fn run(args: &Args) -> Result<()> {
 /// Trains on the threads that there are.
 pub fn train(args: &Args) -> Result<()> {
     let started = Instant::now();
-    let lpips = lpips(args.lpips.as_ref())?.map(Arc::new);
+    let weights = |given: Option<&PathBuf>| anyhow::Ok(lpips(given)?.map(Arc::new));
     let (folder, config, trainer) = match &args.resume {
         Some(run) => {
-            let (folder, config) = RunFolder::open(run)?;
+            let (folder, mut config) = RunFolder::open(run)?;
             if config.complete {
                 return say(format_args!(
                     "{} is complete: look at {}",
@@ -105,15 +105,19 @@ pub fn train(args: &Args) -> Result<()> {
                     folder.file("report.html").display()
                 ));
             }
-            resume(folder, config, args, lpips.clone())?
+            // Those it began with, where they still lie: a perceptual loss without them would train another scene.
+            let kept = config.lpips.take().filter(|path| path.exists());
+            config.lpips = lpips_path(args.lpips.as_ref().or(kept.as_ref()));
+            let lpips = weights(config.lpips.as_ref())?;
+            resume(folder, config, args, lpips)?
         }
-        None => begin(args, lpips.clone())?,
+        None => begin(args, weights(args.lpips.as_ref())?)?,
     };
     let hint = format!(
         "; when that is put right, go on with: irradia train --resume {}",
         folder.path().display()
     );
-    finish(folder, config, trainer, lpips.as_deref(), started).map_err(|error| anyhow!("{}{hint}", one_line(&error)))
+    finish(folder, config, trainer, started).map_err(|error| anyhow!("{}{hint}", one_line(&error)))
 }
 
 /// The recipe of `--recipe`, `--set` and `--max-splats`.
@@ -158,6 +162,7 @@ fn begin(args: &Args, lpips: Option<Arc<Lpips>>) -> Result<(RunFolder, RunConfig
         budget: args.budget,
         seed: args.seed,
         steps: args.steps,
+        lpips: lpips_path(args.lpips.as_ref()),
         complete: false,
     };
     folder.write_config(&config)?;
@@ -208,13 +213,7 @@ fn resume(
 }
 
 /// Trains, writes the scene, evaluates and reports.
-fn finish(
-    folder: RunFolder,
-    mut config: RunConfig,
-    mut trainer: Trainer,
-    lpips: Option<&Lpips>,
-    started: Instant,
-) -> Result<()> {
+fn finish(folder: RunFolder, mut config: RunConfig, mut trainer: Trainer, started: Instant) -> Result<()> {
     let stop = Arc::new(AtomicBool::new(false));
     let asked = stop.clone();
     // The second Ctrl-C does not wait. A handler that is already set (by a test, say) is no reason not to train.
@@ -254,6 +253,7 @@ fn finish(
     }
     saved.map_err(anyhow::Error::msg)?;
 
+    let lpips = trainer.options.lpips.clone();
     let mut views = Vec::new();
     let mut metrics: Vec<Evaluation> = Vec::new();
     let options = trainer.render_options(sh::MAX_DEGREE);
@@ -263,7 +263,7 @@ fn finish(
         &trainer.dataset,
         &trainer.dataset.test,
         &options,
-        Metrics::All(lpips),
+        Metrics::All(lpips.as_deref()),
         |view| {
             let report = write_view(&folder, &view);
             match report {

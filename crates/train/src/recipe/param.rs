@@ -16,7 +16,7 @@ pub enum Param {
     ShDegree,
     /// How many splats there may be, as a share of the recipe's cap.
     CountShare,
-    /// Share of the visible splats that are trained, the largest first; the others rest.
+    /// Share of the visible splats whose place and shape are trained, the largest first; of the others opacity and colour are.
     TrainedShare,
     /// Weight of the photometric loss, (1 - w) L1 + w (1 - SSIM).
     PhotoWeight,

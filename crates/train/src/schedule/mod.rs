@@ -68,7 +68,7 @@ pub struct StepPlan {
     pub condition_cap: Option<f32>,
     /// Noise on the means, in units of their rate.
     pub noise: f32,
-    /// Share of the visible splats that are trained, the largest first.
+    /// Share of the visible splats whose place and shape are trained, the largest first.
     pub trained_share: f32,
     /// Learning rates; that of the means in units of the scene's extent.
     pub rates: Rates,

@@ -130,6 +130,7 @@ fn train(args: &[String]) -> Result<()> {
     // A field that has learnt nothing is dear to look at.
     let mut next = seconds / 12.0;
     let mut smooth = 0.0f64;
+    let mut looks = (1..=16).cycle();
     while spent < seconds {
         let began = ProcessTime::now();
         let time = spent / seconds;
@@ -138,6 +139,7 @@ fn train(args: &[String]) -> Result<()> {
         let options = StepOptions {
             net_rate: base.net_rate * decay,
             table_rate: base.table_rate * decay,
+            look: looks.next() == Some(16),
             ..base
         };
         let loss = train_views(&mut state, &views, &options);

@@ -111,6 +111,7 @@ impl Trainer {
                 Background::Fixed(self.recipe.render.background)
             },
             samples: knobs.samples,
+            look: plan.field.look,
             seed: self.options.seed,
         };
         let state = self.field.as_mut().expect("a stage of field has one");

@@ -213,7 +213,8 @@ impl Trainer {
                         }
                     },
                 );
-                init::from_points(&points, &options)
+                let opacity = self.recipe.init.random_opacity.unwrap_or(options.opacity);
+                init::from_points(&points, &InitOptions { opacity, ..options })
             }
         };
         if splats.is_empty() {

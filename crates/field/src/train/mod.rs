@@ -45,6 +45,8 @@ pub struct StepOptions {
     pub background: Background,
     /// Samples that [`train_views`] chooses the number of rays for; 2^18 in Instant-NGP.
     pub samples: usize,
+    /// Whether [`train_views`] looks at the occupancy grid after the step; every 16th time in Instant-NGP.
+    pub look: bool,
     /// Everything random follows from it and the number of the step.
     pub seed: u64,
 }
@@ -61,6 +63,7 @@ impl Default for StepOptions {
             depth: 0.0,
             background: Background::Random,
             samples: 1 << 16,
+            look: true,
             seed: 0,
         }
     }
@@ -89,8 +92,6 @@ pub(crate) struct Scratch {
     batch: RayBatch,
 }
 
-/// Steps between two looks at an occupancy grid (Instant-NGP).
-const LOOK_EVERY: u64 = 16;
 /// One in so many empty cells is looked at.
 const LOOK_ONE_IN: u32 = 16;
 /// The fewest and the most rays of a batch.
@@ -104,7 +105,7 @@ pub fn train_views(state: &mut FieldState, views: &[TrainView], options: &StepOp
     batch.draw(views, state.rays, options.background, &state.field.space, &mut rng);
     let loss = train_step(state, &batch, options);
     state.scratch.batch = batch;
-    if state.step.is_multiple_of(LOOK_EVERY) {
+    if options.look && loss.rays > 0 {
         update_occupancy(state, false, LOOK_ONE_IN, options.seed);
     }
     let wanted = options.samples as f64 * loss.rays as f64 / loss.samples.max(1) as f64;

@@ -112,6 +112,9 @@ pub struct RenderKnobs {
 pub struct InitKnobs {
     /// Their opacity.
     pub opacity: f32,
+    /// Likewise where they are random, most of them in empty space; the same when absent.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub random_opacity: Option<f32>,
     /// Factor on the distance to the nearest neighbours that makes their size.
     pub scale: f32,
     /// How many, where the dataset has no points.
@@ -270,8 +273,9 @@ impl Recipe {
         if self.max_splats == 0 || self.eval_every == 0 || self.checkpoint_every == 0 {
             return Err("max_splats, eval_every and checkpoint_every must be at least 1".into());
         }
-        if !(self.init.opacity > 0.0 && self.init.opacity < 1.0 && self.init.scale > 0.0) {
-            return Err("init.opacity must lie between 0 and 1 and init.scale above 0".into());
+        let opacities = [self.init.opacity, self.init.random_opacity.unwrap_or(self.init.opacity)];
+        if opacities.iter().any(|opacity| !(*opacity > 0.0 && *opacity < 1.0)) || self.init.scale <= 0.0 {
+            return Err("init.opacity and random_opacity must lie between 0 and 1 and init.scale above 0".into());
         }
         if let Some(field) = &self.field {
             field.validate()?;

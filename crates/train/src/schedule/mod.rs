@@ -105,6 +105,8 @@ pub struct FieldPlan {
     pub interlevel: f32,
     /// Weight of the distortion loss.
     pub distortion: f32,
+    /// The occupancy grid is looked at, after the step.
+    pub look: bool,
 }
 
 /// Weights of what a frame is compared by.
@@ -312,6 +314,7 @@ pub fn plan(recipe: &Recipe, clock: &Clock) -> StepPlan {
             codes: of(Param::RateCodes) as f32,
             interlevel: of(Param::InterlevelWeight) as f32,
             distortion: of(Param::DistortionWeight) as f32,
+            look: is_due(clock, LOOK_EVERY),
         },
         gathers: density.map(|density| density.statistics()),
         densify: density
@@ -340,6 +343,9 @@ pub fn plan(recipe: &Recipe, clock: &Clock) -> StepPlan {
 
 /// Steps between updates of the 3D smoothing filter (Mip-Splatting's code: 100).
 const REFILTER_EVERY: u64 = 100;
+
+/// Steps between two looks at a field's occupancy grid (Instant-NGP).
+const LOOK_EVERY: u64 = 16;
 
 /// The stream of the run's seed that orders the views.
 const STREAM_VIEWS: u64 = 3;

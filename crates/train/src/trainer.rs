@@ -11,7 +11,7 @@ use cpu_time::ProcessTime;
 use irradia_compute::adam::AdamStep;
 use irradia_field::{FieldError, FieldState};
 use irradia_measure::{DepthSample, Lpips};
-use irradia_scene::{Camera, Dataset, LoadError, Rng, View, sh};
+use irradia_scene::{Camera, Dataset, LoadError, PointCloud, Rng, View, sh};
 use irradia_splat::densify::{DensityChange, classic, fast, mcmc, merge, taming};
 use irradia_splat::init::{self, InitOptions, Look};
 use irradia_splat::{
@@ -183,7 +183,14 @@ impl Trainer {
     fn first_splats(&mut self) -> Result<Splats, TrainError> {
         let options = self.init_options();
         let dataset = self.dataset.clone();
+        let most = self.recipe.max_splats;
         let splats = match dataset.points.as_ref().filter(|points| points.len() >= 10) {
+            // Evenly over the file: SfM writes points as it finds them, place by place.
+            Some(points) if points.len() > most => {
+                let chosen = (0..most).map(|i| i * points.len() / most);
+                let (positions, colors) = chosen.map(|i| (points.positions[i], points.colors[i])).unzip();
+                init::from_points(&PointCloud { positions, colors }, &options)
+            }
             Some(points) => init::from_points(points, &options),
             None => {
                 let views: Vec<&View> = dataset.train.iter().map(|i| &dataset.views[*i]).collect();
@@ -198,7 +205,7 @@ impl Trainer {
                 let points = init::random_points(
                     &cameras,
                     &bounds,
-                    self.recipe.init.random_points,
+                    self.recipe.init.random_points.min(most),
                     &mut rng,
                     |view, pixel| {
                         let photo = photos[view].as_ref().expect("loaded above");

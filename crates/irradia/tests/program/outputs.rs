@@ -160,6 +160,17 @@ fn a_run_stops_at_the_psnr_it_was_asked_for() {
 }
 
 #[test]
+fn a_limit_on_splats_holds_from_the_start() {
+    let folder = with_data();
+    irradia(folder.path(), "train data --out run --steps 20 --max-splats 500").well();
+    let most = events(&folder.path().join("run"))
+        .iter()
+        .filter_map(|event| event["splats"].as_u64())
+        .max();
+    assert!(most <= Some(500) && most > Some(100), "{most:?}");
+}
+
+#[test]
 fn a_budget_holds_the_whole_recipe() {
     let folder = with_data();
     let ended = irradia(folder.path(), "train data --out run --budget 2s --max-splats 8000").well();

@@ -24,7 +24,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
-/// What is trained by when nothing is said: the best for its time on five of six scenes (RESULTS.md).
+/// What is trained by when nothing is said: the best for its time on all six scenes of RESULTS.md.
 pub const DEFAULT_RECIPE: &str = "fast";
 
 #[derive(clap::Args)]

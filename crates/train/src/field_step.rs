@@ -67,9 +67,9 @@ impl Trainer {
     pub(crate) fn field_step(&mut self) -> Result<(StepReport, Signal), TrainError> {
         let plan = plan(&self.recipe, &self.clock);
         let chosen = self.field_views();
-        let photos: Vec<Arc<Prepared>> = chosen
-            .iter()
-            .map(|view| self.photos.get(&[*view], plan.image_scale))
+        // What comes next is named, so that the photographs load side by side.
+        let photos: Vec<Arc<Prepared>> = (0..chosen.len())
+            .map(|i| self.photos.get(&chosen[i..], plan.image_scale))
             .collect::<Result<_, _>>()?;
         let (started, cpu_started) = (Instant::now(), ProcessTime::now());
         let cameras: Vec<Camera> = chosen

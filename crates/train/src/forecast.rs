@@ -28,13 +28,15 @@ pub struct Forecast {
     work: f64,
     /// Seconds to a unit of work, a moving mean.
     unit: Option<f64>,
+    /// Seconds that the rest of the run takes, were each recipe step a step.
+    whole: f64,
     /// Stage, recipe time and number of splats when the stage was first seen.
     entered: Option<(usize, f64, f64)>,
 }
 
 impl Forecast {
-    /// Takes in what the last step cost; to be called before each step.
-    pub fn observe(&mut self, trainer: &Trainer) {
+    /// Takes in what the last step cost; to be called before each step, which trains on images of size `image_scale`.
+    pub fn observe(&mut self, trainer: &Trainer, image_scale: f32) {
         if self.work > 0.0 {
             self.steps += 1;
             let unit = (trainer.seconds - self.seconds) / self.work;
@@ -46,13 +48,12 @@ impl Forecast {
         if self.entered.is_none_or(|(stage, ..)| stage != clock.stage) {
             self.entered = Some((clock.stage, clock.time, count));
         }
-        self.work = ahead(&trainer.recipe, clock, 1)
-            .first()
-            .map_or(0.0, |now| work(now.image_scale, count));
+        self.work = work(f64::from(image_scale), count);
+        self.whole = self.look_ahead(trainer);
     }
 
-    /// Seconds that the rest of the run takes, were each recipe step a step.
-    fn whole(&self, trainer: &Trainer) -> f64 {
+    /// [`Self::whole`] for the recipe that is left.
+    fn look_ahead(&self, trainer: &Trainer) -> f64 {
         let ahead = ahead(&trainer.recipe, &trainer.clock, MOMENTS);
         let count = trainer.state.len() as f64;
         let start = trainer.clock.time;
@@ -91,14 +92,14 @@ impl Forecast {
 
     /// Seconds that the rest of the run takes at its present pace.
     pub fn seconds_left(&self, trainer: &Trainer) -> f64 {
-        self.whole(trainer) / trainer.pace
+        self.whole / trainer.pace
     }
 
     /// The pace at which the rest of the run takes `seconds`.
     pub fn pace(&self, trainer: &Trainer, seconds: f64) -> f64 {
         let left = trainer.recipe.total_steps() as f64 - trainer.clock.time;
         // At least one more step, whatever has become of the time.
-        (self.whole(trainer) / seconds.max(1e-6)).min(left)
+        (self.whole / seconds.max(1e-6)).min(left)
     }
 }
 

@@ -45,11 +45,11 @@ pub fn run(
     let mut signal = tell(trainer, &mut events, observers);
     let mut reason = None;
     while reason.is_none() && signal != Signal::Stop && !trainer.finished() {
-        forecast.observe(trainer);
+        let due = plan(&trainer.recipe, &trainer.clock);
+        forecast.observe(trainer, due.image_scale);
         if let Some(budget) = limits.budget {
             trainer.pace = forecast.pace(trainer, budget - trainer.seconds);
         }
-        let due = plan(&trainer.recipe, &trainer.clock);
         let looks = due.evaluate || (limits.until_psnr.is_some() && is_due(&trainer.clock, UNTIL_PSNR_EVERY));
         let left = forecast.seconds_left(trainer);
         let report = StepReport {

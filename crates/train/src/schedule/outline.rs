@@ -1,6 +1,6 @@
 //! A recipe's whole plan at a glance, to be printed and drawn.
 
-use super::{Clock, Signal, values};
+use super::{Clock, values};
 use crate::recipe::{Param, Recipe};
 
 /// A stretch of what is still to come.
@@ -55,25 +55,16 @@ pub fn outline(recipe: &Recipe, moments: usize) -> Vec<Moment> {
     let pace = recipe.total_steps() as f64 / moments.max(1) as f64;
     let mut clock = Clock::new(recipe);
     let mut plan = Vec::new();
-    let mut recipe = recipe.clone();
-    for stage in &mut recipe.stage {
-        stage.exit = None;
-    }
-    while !clock.finished(&recipe) {
+    while !clock.finished(recipe) {
         let moment = |clock: &Clock| Moment {
             time: clock.time,
             stage: clock.stage,
-            values: values(&recipe, clock),
+            values: values(recipe, clock),
         };
         plan.push(moment(&clock));
         let left = clock.stage_time + recipe.stage[clock.stage].steps as f64 - clock.time;
-        let signal = Signal {
-            error: 0.0,
-            measured: None,
-            views: 1,
-        };
         if left > pace {
-            clock.tick(&recipe, pace, signal);
+            clock.pass(recipe, pace);
         } else {
             let last = Clock {
                 time: clock.time + left * (1.0 - 1e-9),
@@ -81,7 +72,7 @@ pub fn outline(recipe: &Recipe, moments: usize) -> Vec<Moment> {
                 ..clock.clone()
             };
             plan.push(moment(&last));
-            clock.tick(&recipe, left, signal);
+            clock.pass(recipe, left);
         }
     }
     plan

@@ -68,6 +68,43 @@ pub fn adam(
         });
 }
 
+/// A step's constants in lanes.
+#[derive(Clone, Copy, Debug)]
+pub struct AdamRule<L> {
+    rate: L,
+    root_scale: L,
+    epsilon: L,
+    beta: [L; 2],
+    rest: [L; 2],
+}
+
+impl<L: Lanes<Scalar = f32>> AdamRule<L> {
+    /// Of `step` at the learning rate `rate`. The corrections are applied to the rate and to epsilon's partner, once, instead
+    /// of to every moment.
+    #[inline(always)]
+    pub fn new<S: Simd<F = L>>(simd: S, step: &AdamStep, rate: f32) -> Self {
+        let t = step.step as f64;
+        let correction1 = 1.0 - f64::from(step.beta1).powf(t);
+        let correction2 = 1.0 - f64::from(step.beta2).powf(t);
+        Self {
+            rate: simd.splat(f64::from(rate) / correction1),
+            root_scale: simd.splat(1.0 / correction2.sqrt()),
+            epsilon: simd.set(step.epsilon),
+            beta: [simd.set(step.beta1), simd.set(step.beta2)],
+            rest: [simd.set(1.0 - step.beta1), simd.set(1.0 - step.beta2)],
+        }
+    }
+
+    /// Parameter and both moments after the gradient `g`.
+    #[inline(always)]
+    pub fn step(&self, g: L, parameter: L, first: L, second: L) -> [L; 3] {
+        let m = first.mul_add(self.beta[0], self.rest[0] * g);
+        let v = second.mul_add(self.beta[1], self.rest[1] * g * g);
+        let p = parameter - self.rate * m / v.sqrt().mul_add(self.root_scale, self.epsilon);
+        [p, m, v]
+    }
+}
+
 struct AdamPlane<'a> {
     parameter: &'a mut [f32],
     gradient: &'a [f32],
@@ -86,15 +123,7 @@ impl Kernel for AdamPlane<'_> {
     where
         S::F: Lanes<Scalar = f32>,
     {
-        let t = self.step.step as f64;
-        // The corrections are applied to the rate and to epsilon's partner, once, instead of to every moment.
-        let correction1 = 1.0 - f64::from(self.step.beta1).powf(t);
-        let correction2 = 1.0 - f64::from(self.step.beta2).powf(t);
-        let rate = simd.splat(f64::from(self.rate) / correction1);
-        let root_scale = simd.splat(1.0 / correction2.sqrt());
-        let epsilon = simd.set(self.step.epsilon);
-        let (beta1, beta2) = (simd.set(self.step.beta1), simd.set(self.step.beta2));
-        let (rest1, rest2) = (simd.set(1.0 - self.step.beta1), simd.set(1.0 - self.step.beta2));
+        let rule = AdamRule::new(simd, &self.step, self.rate);
         let zero = simd.splat(0.0);
         for at in (0..self.parameter.len()).step_by(S::LANES) {
             let on = zero.lt(simd.load(&self.active[at..]));
@@ -105,9 +134,7 @@ impl Kernel for AdamPlane<'_> {
             let m_old = simd.load(&self.first[at..]);
             let v_old = simd.load(&self.second[at..]);
             let p_old = simd.load(&self.parameter[at..]);
-            let m = m_old.mul_add(beta1, rest1 * g);
-            let v = v_old.mul_add(beta2, rest2 * g * g);
-            let p = p_old - rate * m / v.sqrt().mul_add(root_scale, epsilon);
+            let [p, m, v] = rule.step(g, p_old, m_old, v_old);
             m.or_where_not(on, m_old).store(&mut self.first[at..]);
             v.or_where_not(on, v_old).store(&mut self.second[at..]);
             p.or_where_not(on, p_old).store(&mut self.parameter[at..]);

@@ -1,6 +1,6 @@
 //! Adam on flat lists, where a gradient of exactly zero can mean that a number took no part.
 
-use irradia_compute::adam::AdamStep;
+use irradia_compute::adam::{AdamRule, AdamStep};
 use irradia_compute::simd::{Kernel, Lanes, Mask, Simd};
 
 /// One step on one list.
@@ -23,14 +23,7 @@ impl Kernel for Adam<'_> {
     where
         S::F: Lanes<Scalar = f32>,
     {
-        let t = self.step.step as f64;
-        let correction1 = 1.0 - f64::from(self.step.beta1).powf(t);
-        let correction2 = 1.0 - f64::from(self.step.beta2).powf(t);
-        let rate = simd.splat(f64::from(self.rate) / correction1);
-        let root_scale = simd.splat(1.0 / correction2.sqrt());
-        let epsilon = simd.set(self.step.epsilon);
-        let (beta1, beta2) = (simd.set(self.step.beta1), simd.set(self.step.beta2));
-        let (rest1, rest2) = (simd.set(1.0 - self.step.beta1), simd.set(1.0 - self.step.beta2));
+        let rule = AdamRule::new(simd, &self.step, self.rate);
         let zero = simd.splat(0.0);
         let n = self.parameters.len();
         let mut at = 0;
@@ -54,9 +47,7 @@ impl Kernel for Adam<'_> {
             let m_old = simd.load(if whole { &self.first[at..] } else { &copies[1] });
             let v_old = simd.load(if whole { &self.second[at..] } else { &copies[2] });
             let p_old = simd.load(if whole { &self.parameters[at..] } else { &copies[3] });
-            let mut m = m_old.mul_add(beta1, rest1 * g);
-            let mut v = v_old.mul_add(beta2, rest2 * g * g);
-            let mut p = p_old - rate * m / v.sqrt().mul_add(root_scale, epsilon);
+            let [mut p, mut m, mut v] = rule.step(g, p_old, m_old, v_old);
             if self.sparse {
                 m = m.or_where_not(on, m_old);
                 v = v.or_where_not(on, v_old);

@@ -2,7 +2,7 @@
 //! scene is not covered well; small splats there are cloned, large ones split; faint and oversized ones go.
 
 use super::DensityChange;
-use super::split::{is_finite, largest_scale, random_halves};
+use super::split::{is_finite, largest_scale, random_halves, rebuild};
 use crate::{SplatState, logit, sigmoid};
 use irradia_scene::Rng;
 
@@ -76,11 +76,7 @@ pub fn densify(state: &mut SplatState, options: &ClassicOptions, rng: &mut Rng) 
         }
     }
     let kept: Vec<u32> = (0..n as u32).filter(|i| !removed[*i as usize]).collect();
-    state.gather(&kept);
-    state.append(&clones);
-    state.append(&halves);
-    state.statistics.clear();
-    state.sort_by_place();
+    rebuild(state, &kept, &[&clones, &halves]);
     DensityChange {
         cloned: clone.len(),
         split: split.len(),

@@ -7,7 +7,7 @@
 //! 2025). Halves keep the image as it is, so that no step is lost to recovery, and opacities are never reset.
 
 use super::DensityChange;
-use super::split::{is_finite, long_axis_halves};
+use super::split::{is_finite, long_axis_halves, rebuild, without};
 use crate::SplatState;
 
 /// Knobs.
@@ -55,13 +55,8 @@ pub fn densify(state: &mut SplatState, options: &FastOptions) -> DensityChange {
     let mut split: Vec<u32> = wanted.into_iter().map(|(_, i)| i).collect();
     split.sort_unstable();
     let halves = long_axis_halves(&state.splats, &split);
-    let left: Vec<u32> = (0..state.len() as u32)
-        .filter(|i| split.binary_search(i).is_err())
-        .collect();
-    state.gather(&left);
-    state.append(&halves);
-    state.statistics.clear();
-    state.sort_by_place();
+    let left = without(state.len(), &split);
+    rebuild(state, &left, &[&halves]);
     DensityChange {
         cloned: 0,
         split: split.len(),

@@ -2,7 +2,7 @@
 //! splats move to where live ones are, the number grows to a fixed budget, and noise explores.
 
 use super::DensityChange;
-use super::split::{draw, is_finite};
+use super::split::{draw, is_finite, rebuild};
 use crate::{SplatState, logit, sigmoid};
 use irradia_compute::Planes;
 use irradia_scene::Rng;
@@ -38,10 +38,7 @@ pub fn densify(state: &mut SplatState, options: &McmcOptions, rng: &mut Rng) -> 
     let sources = draw(&opacities, target - alive.len(), rng);
     share_out(state, &sources);
     let copies = state.splats.gather(&sources);
-    state.gather(&alive);
-    state.append(&copies);
-    state.statistics.clear();
-    state.sort_by_place();
+    rebuild(state, &alive, &[&copies]);
     DensityChange {
         cloned: sources.len(),
         split: 0,

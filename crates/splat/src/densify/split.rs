@@ -1,6 +1,6 @@
 //! What strategies have in common: choosing splats by weight, and putting two in the place of one.
 
-use crate::{Splats, logit, sigmoid};
+use crate::{SplatState, Splats, logit, sigmoid};
 use glam::{Quat, Vec3};
 use irradia_scene::Rng;
 
@@ -32,6 +32,21 @@ fn shift(splats: &mut Splats, i: usize, offset: Vec3) {
     for c in 0..3 {
         splats.means.set(c, i, splats.means.get(c, i) + offset[c]);
     }
+}
+
+/// All but `gone` (ascending) of `count` splats.
+pub(super) fn without(count: usize, gone: &[u32]) -> Vec<u32> {
+    (0..count as u32).filter(|i| gone.binary_search(i).is_err()).collect()
+}
+
+/// Ends a round: `kept` stay, `added` come, statistics begin anew, Morton order is restored.
+pub(super) fn rebuild(state: &mut SplatState, kept: &[u32], added: &[&Splats]) {
+    state.gather(kept);
+    for splats in added {
+        state.append(splats);
+    }
+    state.statistics.clear();
+    state.sort_by_place();
 }
 
 /// Two draws from each of `indices`, smaller, side by side in the result (3DGS).

@@ -2,7 +2,7 @@
 //! gathers. Each round adds what the count's curve asks for, where the scores are high.
 
 use super::DensityChange;
-use super::split::{draw_distinct, is_finite, largest_scale, random_halves};
+use super::split::{draw_distinct, is_finite, largest_scale, random_halves, rebuild, without};
 use crate::SplatState;
 use irradia_scene::Rng;
 
@@ -60,14 +60,8 @@ pub fn densify(state: &mut SplatState, options: &TamingOptions, rng: &mut Rng) -
         .partition(|i| largest_scale(&state.splats, **i as usize) <= options.small);
     let halves = random_halves(&state.splats, &split, rng);
     let clones = state.splats.gather(&clone);
-    let left: Vec<u32> = (0..state.len() as u32)
-        .filter(|i| split.binary_search(i).is_err())
-        .collect();
-    state.gather(&left);
-    state.append(&clones);
-    state.append(&halves);
-    state.statistics.clear();
-    state.sort_by_place();
+    let left = without(state.len(), &split);
+    rebuild(state, &left, &[&clones, &halves]);
     DensityChange {
         cloned: clone.len(),
         split: split.len(),

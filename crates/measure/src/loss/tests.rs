@@ -1,7 +1,7 @@
+use super::differences::Picture;
 use super::*;
 use crate::metric;
 use irradia_compute::simd::Double;
-use irradia_scene::{Image, Rng};
 
 const MIXED: LossWeights = LossWeights {
     l1: 0.7,
@@ -9,40 +9,7 @@ const MIXED: LossWeights = LossWeights {
     mse: 0.5,
 };
 
-struct Case {
-    width: usize,
-    height: usize,
-    render: Vec<f64>,
-    truth: Vec<f64>,
-    mask: Option<Vec<u8>>,
-}
-
-impl Case {
-    /// Smooth colours with noise, planar; the render a little off the truth, and out of \[0, 1\] now and then.
-    fn random(width: usize, height: usize, masked: bool, seed: u64) -> Self {
-        let mut rng = Rng::new(seed, 0);
-        let pixels = width * height;
-        // In single precision, so that both precisions see the same values.
-        let truth: Vec<f64> = (0..3 * pixels)
-            .map(|i| {
-                let wave = (i % width.max(1)) as f32 * 0.3 + (i / width) as f32 * 0.17;
-                f64::from(0.5 + 0.3 * wave.sin() + 0.1 * rng.normal())
-            })
-            .collect();
-        let render = truth
-            .iter()
-            .map(|t| f64::from(*t as f32 + 0.1 * rng.normal()))
-            .collect();
-        let mask = masked.then(|| (0..pixels).map(|_| [0, 255, 255, 100][rng.below(4) as usize]).collect());
-        Self {
-            width,
-            height,
-            render,
-            truth,
-            mask,
-        }
-    }
-
+impl Picture {
     fn in_double(&self, render: &[f64], weights: &LossWeights) -> (LossValues, Vec<f64>) {
         let mut v_render = vec![0.0; render.len()];
         let target = Target {
@@ -71,12 +38,6 @@ impl Case {
         let values = loss.evaluate(&render, &target, weights, &mut v_render);
         (values, v_render)
     }
-
-    fn image(&self, planar: &[f64]) -> Image {
-        let pixels = self.width * self.height;
-        let data = (0..3 * pixels).map(|i| planar[i % 3 * pixels + i / 3] as f32).collect();
-        Image::new(self.width as u32, self.height as u32, 3, data)
-    }
 }
 
 const SIZES: [(usize, usize); 7] = [(1, 1), (5, 3), (23, 17), (1, 40), (40, 1), (16, 16), (33, 150)];
@@ -84,7 +45,7 @@ const SIZES: [(usize, usize); 7] = [(1, 1), (5, 3), (23, 17), (1, 40), (40, 1), 
 #[test]
 fn the_parts_are_what_plain_code_computes() {
     for (seed, (width, height)) in SIZES.into_iter().enumerate() {
-        let case = Case::random(width, height, false, seed as u64);
+        let case = Picture::random(width, height, false, seed as u64);
         let (values, _) = case.in_double(&case.render, &MIXED);
         let n = case.render.len() as f64;
         let differences = || case.render.iter().zip(&case.truth).map(|(x, y)| x - y);
@@ -110,7 +71,7 @@ fn finite_differences_hold_every_gradient() {
     for (seed, (width, height)) in SIZES.into_iter().enumerate() {
         for masked in [false, true] {
             for weights in [MIXED, LossWeights { ssim: 0.0, ..MIXED }, LossWeights::photometric(1.0)] {
-                let case = Case::random(width, height, masked, seed as u64 + 100);
+                let case = Picture::random(width, height, masked, seed as u64 + 100);
                 let (_, v_render) = case.in_double(&case.render, &weights);
                 let largest = v_render.iter().fold(0.0f64, |m, v| m.max(v.abs()));
                 for i in (0..v_render.len()).step_by(1 + v_render.len() / 150) {
@@ -143,7 +104,7 @@ fn every_instruction_set_agrees_with_double_precision() {
         let mut loss = PhotometricLoss::with_level(level);
         for (seed, (width, height)) in SIZES.into_iter().chain([(70, 300)]).enumerate() {
             for weights in [MIXED, LossWeights { ssim: 0.0, ..MIXED }] {
-                let case = Case::random(width, height, seed % 2 == 1, seed as u64 + 200);
+                let case = Picture::random(width, height, seed % 2 == 1, seed as u64 + 200);
                 let (want, v_want) = case.in_double(&case.render, &weights);
                 let (got, v_got) = case.in_single(&mut loss, &weights);
                 let name = format!("{} {width}x{height}", level.name());
@@ -167,7 +128,7 @@ fn every_instruction_set_agrees_with_double_precision() {
 
 #[test]
 fn the_number_of_threads_changes_no_bit() {
-    let case = Case::random(70, 300, true, 5);
+    let case = Picture::random(70, 300, true, 5);
     let run = |threads: usize| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
         pool.install(|| case.in_single(&mut PhotometricLoss::new(), &MIXED))
@@ -183,7 +144,7 @@ fn working_memory_of_another_size_leaves_no_trace() {
     let mut reused = PhotometricLoss::new();
     // 70, 68 and 80 columns round up to the same number of vectors.
     for (seed, (width, height)) in [(70, 40), (68, 40), (80, 9), (3, 3), (70, 40)].into_iter().enumerate() {
-        let case = Case::random(width, height, seed == 1, seed as u64);
+        let case = Picture::random(width, height, seed == 1, seed as u64);
         let fresh = case.in_single(&mut PhotometricLoss::new(), &MIXED);
         assert_eq!(case.in_single(&mut reused, &MIXED), fresh, "{width}x{height}");
     }
@@ -191,7 +152,7 @@ fn working_memory_of_another_size_leaves_no_trace() {
 
 #[test]
 fn equal_images_have_no_loss_and_no_gradient() {
-    let mut case = Case::random(30, 20, false, 1);
+    let mut case = Picture::random(30, 20, false, 1);
     case.render = case.truth.clone();
     let (values, v_render) = case.in_single(&mut PhotometricLoss::new(), &LossWeights::photometric(0.2));
     assert_eq!((values.l1, values.mse), (0.0, 0.0));
@@ -204,7 +165,7 @@ fn equal_images_have_no_loss_and_no_gradient() {
 
 #[test]
 fn masked_pixels_have_no_say_whatever_they_hold() {
-    let case = Case::random(40, 30, true, 9);
+    let case = Picture::random(40, 30, true, 9);
     let mask = case.mask.clone().unwrap();
     let (clean, v_clean) = case.in_single(&mut PhotometricLoss::new(), &MIXED);
     let mut poisoned = case;
@@ -225,7 +186,7 @@ fn masked_pixels_have_no_say_whatever_they_hold() {
 
 #[test]
 fn values_far_from_colours_stay_finite() {
-    let mut case = Case::random(40, 30, false, 9);
+    let mut case = Picture::random(40, 30, false, 9);
     case.render.iter_mut().for_each(|v| *v *= 1e4);
     let (values, v_render) = case.in_single(&mut PhotometricLoss::new(), &MIXED);
     assert!(values.total.is_finite() && v_render.iter().all(|v| v.is_finite()));

@@ -26,6 +26,11 @@ pub enum Sampler {
         /// Intervals of the last network.
         last: usize,
     },
+    /// Nowhere along rays: points are given, such as splats whose colour the field adds to ([`crate::residual_at`]).
+    Given {
+        /// Directions are those that a mirror across the point's surface would show, and not those of view.
+        mirrored: bool,
+    },
 }
 
 /// What is to be said about an occupancy grid.
@@ -115,6 +120,15 @@ impl FieldConfig {
         }
     }
 
+    /// A field that adds to the colours of given points.
+    pub fn residual(net: NetShape, mirrored: bool) -> Self {
+        Self {
+            net,
+            sampler: Sampler::Given { mirrored },
+            images: 0,
+        }
+    }
+
     /// Numbers of an appearance code.
     pub fn appearance(&self) -> usize {
         self.net.color.map_or(0, |color| color.appearance)
@@ -123,7 +137,7 @@ impl FieldConfig {
     /// The shapes of all networks, the last one last.
     pub fn nets(&self) -> Vec<NetShape> {
         match &self.sampler {
-            Sampler::Occupancy(_) => vec![self.net],
+            Sampler::Occupancy(_) | Sampler::Given { .. } => vec![self.net],
             Sampler::Hierarchy { .. } => vec![self.net; 2],
             Sampler::Proposal { rounds, .. } => rounds.iter().map(|(net, _)| *net).chain([self.net]).collect(),
         }
@@ -193,6 +207,7 @@ impl FieldConfig {
                     return wrong("samples of a round", last.to_string(), "say a round and at least 2");
                 }
             }
+            Sampler::Given { .. } => {}
         }
         Ok(())
     }

@@ -1,7 +1,7 @@
 //! A radiance field and its numbers.
 
 use crate::config::{FieldConfig, Sampler};
-use crate::net::{Net, NetParameters};
+use crate::net::{Net, NetParameters, NetShape};
 use crate::sample::OccupancyGrid;
 use crate::space::Space;
 use crate::tensors::{Tensors, fill, fill_one, named};
@@ -75,6 +75,16 @@ impl Field {
             codes: vec![0.0; codes],
             occupancy,
         })
+    }
+
+    /// A field that adds nothing to any colour yet, for [`crate::residual_at`].
+    ///
+    /// # Errors
+    /// When its network cannot be.
+    pub fn residual(net: NetShape, mirrored: bool, space: Space, seed: u64) -> Result<Self, FieldError> {
+        let mut field = Self::new(FieldConfig::residual(net, mirrored), space, seed)?;
+        field.nets[0].silence(&mut field.parameters[0]);
+        Ok(field)
     }
 
     /// Numbers that are trained.

@@ -3,13 +3,12 @@
 use crate::config::Sampler;
 use crate::field::Field;
 use crate::mlp::PANEL;
-use crate::net::{Block, Net, NetParameters, get3, set3};
-use crate::pass::Colors;
+use crate::net::{Block, get3, set3};
+use crate::pass::{Colors, Density};
 use crate::space::Outside;
 use crate::state::FieldState;
 use crate::train::STREAM_LOOK;
 use irradia_compute::Level;
-use irradia_compute::simd::{Kernel, Lanes, Simd};
 use irradia_scene::Rng;
 use rayon::prelude::*;
 
@@ -68,14 +67,7 @@ pub fn color_at(field: &Field, points: &[[f32; 3]], directions: &[[f32; 3]], ima
                 set3(&mut block.directions, i, *direction);
             }
         }
-        let code = field.code(image);
-        block.codes.clear();
-        block.codes.resize(panels * code.len() * PANEL, 0.0);
-        for row in block.codes.chunks_exact_mut(code.len().max(1) * PANEL) {
-            row.chunks_exact_mut(PANEL)
-                .zip(&code)
-                .for_each(|(row, value)| row.fill(*value));
-        }
+        block.share_code(&field.code(image));
         Level::detect().run(Colors {
             net: &field.nets[last],
             parameters: &field.parameters[last],
@@ -89,7 +81,7 @@ pub fn color_at(field: &Field, points: &[[f32; 3]], directions: &[[f32; 3]], ima
 }
 
 /// World points in the unit cube, and whether the field reaches there.
-fn units(field: &Field, points: &[[f32; 3]]) -> (Vec<[f32; 3]>, Vec<bool>) {
+pub(crate) fn units(field: &Field, points: &[[f32; 3]]) -> (Vec<[f32; 3]>, Vec<bool>) {
     let unit = |world: &[f32; 3]| {
         let at = field.space.from_world(*world).unwrap_or([f32::NAN; 3]);
         let everywhere = field.space.outside == Outside::Contracted;
@@ -123,22 +115,4 @@ fn look<T: Send>(
             });
             read(block, chunk * CHUNK, to);
         });
-}
-
-struct Density<'a> {
-    net: &'a Net,
-    parameters: &'a NetParameters<f32>,
-    block: &'a mut Block<f32>,
-}
-
-impl Kernel for Density<'_> {
-    type Output = ();
-
-    #[inline(always)]
-    fn run<S: Simd>(self, simd: S)
-    where
-        S::F: Lanes<Scalar = f32>,
-    {
-        self.net.density(simd, self.parameters, self.block);
-    }
 }

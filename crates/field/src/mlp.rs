@@ -122,6 +122,12 @@ impl Mlp {
         self.layers[self.layers.len() - 1].end()
     }
 
+    /// Where the last layer's numbers lie in the flat list: all zero, the network gives out zeros and still learns.
+    pub fn last_layer(&self) -> std::ops::Range<usize> {
+        let last = &self.layers[self.layers.len() - 1];
+        last.at..last.end()
+    }
+
     /// Multiplications of one sample forward; going back takes twice as many.
     pub fn products(&self) -> usize {
         self.layers.iter().map(Layer::weights).sum()

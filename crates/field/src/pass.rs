@@ -210,6 +210,14 @@ pub(crate) fn trace(
             pass.paint(level, field, 0, &rays[..taken], images);
             return taken;
         }
+        // No point lies on a ray.
+        Sampler::Given { .. } => {
+            let pass = &mut passes[0];
+            pass.starts.resize(rays.len() + 1, 0);
+            pass.look(level, field, 0, rays, true);
+            pass.paint(level, field, 0, rays, images);
+            return rays.len();
+        }
         Sampler::Hierarchy { coarse, fine } => vec![(*coarse, false), (*fine, true)],
         Sampler::Proposal { rounds, last } => {
             let rounds = rounds.iter().map(|(_, n)| (*n, false));
@@ -286,6 +294,25 @@ impl Kernel for Densities<'_> {
             let thickness = simd.load(&self.block.density[s..]) * simd.load(&self.lengths[s..]);
             exp(-thickness).store(&mut self.through[s..]);
         }
+    }
+}
+
+/// Positions to densities, of a block of any points.
+pub(crate) struct Density<'a> {
+    pub net: &'a Net,
+    pub parameters: &'a NetParameters<f32>,
+    pub block: &'a mut Block<f32>,
+}
+
+impl Kernel for Density<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<S: Simd>(self, simd: S)
+    where
+        S::F: Lanes<Scalar = f32>,
+    {
+        self.net.density(simd, self.parameters, self.block);
     }
 }
 

@@ -3,6 +3,7 @@
 use crate::Usage;
 use anyhow::{Context, Result};
 use glam::{Quat, Vec3};
+use irradia_field::Field;
 use irradia_formats::{read_splats, write_atomic};
 use irradia_scene::{Camera, Dataset, Intrinsics, Pose};
 use irradia_splat::Splats;
@@ -13,14 +14,22 @@ use std::borrow::Cow;
 use std::fs;
 use std::path::{Path, PathBuf};
 
+/// The splats of a run.
+pub const SCENE: &str = "scene.ply";
+/// The radiance field of a run.
+pub const FIELD: &str = "field.safetensors";
+/// What adds to the colours of a run's splats.
+pub const RESIDUAL: &str = "residual.safetensors";
+
 /// What a run may leave in its folder.
-const FILES: [&str; 8] = [
+const FILES: [&str; 9] = [
     "run.json",
     "recipe.toml",
     "cameras.json",
     "events.jsonl",
-    "scene.ply",
-    "field.safetensors",
+    SCENE,
+    FIELD,
+    RESIDUAL,
     "report.json",
     "report.html",
 ];
@@ -237,8 +246,13 @@ impl RunFolder {
 
 /// The scene's file where `path` is a run, `path` itself elsewhere.
 pub fn scene_of(path: &Path) -> PathBuf {
-    let files = ["scene.ply", "field.safetensors"].map(|name| path.join(name));
+    let files = [SCENE, FIELD].map(|name| path.join(name));
     files.into_iter().find(|file| file.is_file()).unwrap_or(path.to_owned())
+}
+
+fn read_field(path: &Path) -> Result<Field> {
+    let bytes = fs::read(path).with_context(|| format!("cannot read {}", path.display()))?;
+    field_file::from_bytes(&bytes).with_context(|| path.display().to_string())
 }
 
 /// The scene in a file: a field's where its name ends so, splats elsewhere; and whether it wants its opacities scaled.
@@ -247,12 +261,17 @@ pub fn scene_of(path: &Path) -> PathBuf {
 /// When it cannot be read.
 pub fn read_scene(path: &Path) -> Result<(Model<'static>, bool)> {
     if path.extension().is_some_and(|extension| extension == "safetensors") {
-        let bytes = fs::read(path).with_context(|| format!("cannot read {}", path.display()))?;
-        let field = field_file::from_bytes(&bytes).with_context(|| path.display().to_string())?;
-        return Ok((Model::Field(Cow::Owned(field)), false));
+        return Ok((Model::Field(Cow::Owned(read_field(path)?)), false));
     }
     let cloud = read_splats(path)?;
-    Ok((Model::Splats(Cow::Owned(Splats::from_cloud(&cloud))), cloud.antialiased))
+    let beside = path.with_file_name(RESIDUAL);
+    let residual = if path.file_name().is_some_and(|name| name == SCENE) && beside.is_file() {
+        Some(Box::new(read_field(&beside)?))
+    } else {
+        None
+    };
+    let splats = Cow::Owned(Splats::from_cloud(&cloud));
+    Ok((Model::Splats { splats, residual }, cloud.antialiased))
 }
 
 /// The cameras of the run that `scene` lies in, if it lies in one.

@@ -9,6 +9,6 @@ pub mod render;
 mod splats;
 mod state;
 
-pub use render::{CameraGradient, Gather, OutputGradient, RenderOptions, Renderer, SplatGradients, ViewParams};
+pub use render::{CameraGradient, Gather, OutputGradient, RenderOptions, Renderer, Shade, SplatGradients, ViewParams};
 pub use splats::{COLUMN_NAMES, Splats, logit, sigmoid};
 pub use state::{Rates, SplatState, Statistics};

@@ -1,3 +1,4 @@
+use glam::{Quat, Vec3};
 use irradia_compute::Planes;
 use irradia_scene::{GaussianCloud, sh};
 
@@ -130,6 +131,20 @@ impl Splats {
         for (to, from) in self.columns_mut().into_iter().zip(other.columns()) {
             to.append(from);
         }
+    }
+
+    /// Centre of splat `i`, world units.
+    pub fn mean(&self, i: usize) -> [f32; 3] {
+        std::array::from_fn(|c| self.means.plane(c)[i])
+    }
+
+    /// The unit axis along which splat `i` is thinnest, in the world: of flat ones the normal, of either sign.
+    pub fn shortest_axis(&self, i: usize) -> [f32; 3] {
+        let [w, x, y, z] = std::array::from_fn(|c| self.quats.plane(c)[i]);
+        let scale = |axis: &usize| self.log_scales.plane(*axis)[i];
+        let thinnest = (0..3).min_by(|a, b| scale(a).total_cmp(&scale(b))).unwrap_or(0);
+        let turned = Quat::from_xyzw(x, y, z, w) * Vec3::AXES[thinnest];
+        turned.normalize_or(Vec3::Z).to_array()
     }
 
     /// Bytes held.

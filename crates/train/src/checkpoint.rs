@@ -6,16 +6,18 @@ use crate::recipe::{Param, Recipe};
 use crate::schedule::{Clock, Watch};
 use crate::trainer::{TrainError, TrainOptions, Trainer};
 use irradia_compute::Planes;
-use irradia_field::FieldState;
+use irradia_field::{Field, FieldState};
 use irradia_scene::Dataset;
 use irradia_splat::{COLUMN_NAMES, SplatState, Splats};
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use std::collections::HashMap;
 use std::sync::Arc;
 
-const FORMAT: &str = "irradia-checkpoint-3";
+const FORMAT: &str = "irradia-checkpoint-4";
 /// What the names of a field's tensors begin with.
 const FIELD: &str = "field.";
+/// Likewise of the residual field's.
+const RESIDUAL: &str = "residual.";
 const OWNERS: [&str; 3] = ["splats", "first_moments", "second_moments"];
 
 /// `trainer` as a safetensors file: columns `[components, N]` of splats and moments, statistics, and the clock.
@@ -45,14 +47,15 @@ pub fn to_bytes(trainer: &Trainer) -> Vec<u8> {
         vec![1, state.filter.len()],
         plane_bytes(&state.filter),
     ));
-    if let Some(field) = &trainer.field {
+    for (prefix, field) in [(FIELD, &trainer.field), (RESIDUAL, &trainer.residual)] {
+        let Some(field) = field else { continue };
         for (name, shape, values) in field.tensors() {
             let bytes = values.iter().flat_map(|v| v.to_le_bytes()).collect();
-            arrays.push((format!("{FIELD}{name}"), Dtype::F32, shape, bytes));
+            arrays.push((format!("{prefix}{name}"), Dtype::F32, shape, bytes));
         }
         let whole = [field.step, field.rays as u64];
         let bytes = whole.iter().flat_map(|v| v.to_le_bytes()).collect();
-        arrays.push((format!("{FIELD}whole"), Dtype::U64, vec![whole.len()], bytes));
+        arrays.push((format!("{prefix}whole"), Dtype::U64, vec![whole.len()], bytes));
     }
     let clock = &trainer.clock;
     let whole = [
@@ -219,22 +222,19 @@ pub fn from_bytes(bytes: &[u8], dataset: Arc<Dataset>, options: TrainOptions) ->
         .map_err(|_| wrong("its clock has the wrong length".into()))?;
     let mut trainer = Trainer::unfilled(dataset, recipe, TrainOptions { seed, ..options })?;
     trainer.state = state;
-    if let Ok(whole) = file.tensor(&format!("{FIELD}whole")) {
-        let numbers: Vec<u64> = whole
-            .data()
-            .as_chunks()
-            .0
-            .iter()
-            .map(|b| u64::from_le_bytes(*b))
-            .collect();
-        let ([step, rays], Some(_)) = (&numbers[..], &trainer.recipe.field) else {
-            return Err(wrong("its field and its recipe do not agree".into()));
-        };
+    let disagree = || wrong("its field and its recipe do not agree".into());
+    if file.tensor(&format!("{FIELD}whole")).is_ok() {
+        if trainer.recipe.field.is_none() {
+            return Err(disagree());
+        }
         let fresh = trainer.first_field()?.field;
-        let state = FieldState::from_tensors(fresh.config, fresh.space, *step, *rays as usize, |name| {
-            floats(&file, &format!("{FIELD}{name}"))
-        })?;
-        trainer.field = Some(state);
+        trainer.field = field(&file, FIELD, fresh)?;
+    }
+    if let Some(fresh) = trainer.first_residual()? {
+        trainer.residual = field(&file, RESIDUAL, fresh.field)?;
+        if trainer.residual.is_none() {
+            return Err(disagree());
+        }
     }
     (trainer.pace, trainer.seconds, trainer.cpu_seconds) = (*pace, *seconds, *cpu_seconds);
     trainer.clock = Clock {
@@ -257,6 +257,28 @@ pub fn from_bytes(bytes: &[u8], dataset: Arc<Dataset>, options: TrainOptions) ->
     };
     trainer.restore_filter();
     Ok(trainer)
+}
+
+/// The state whose tensors' names begin with `prefix`, of a field like `fresh`; none where there are none.
+fn field(file: &SafeTensors, prefix: &str, fresh: Field) -> Result<Option<FieldState>, TrainError> {
+    let Ok(whole) = file.tensor(&format!("{prefix}whole")) else {
+        return Ok(None);
+    };
+    let numbers: Vec<u64> = whole
+        .data()
+        .as_chunks()
+        .0
+        .iter()
+        .map(|b| u64::from_le_bytes(*b))
+        .collect();
+    let [step, rays] = numbers[..] else {
+        return Err(TrainError::Checkpoint(format!(
+            "the checkpoint is damaged: {prefix}whole has the wrong length"
+        )));
+    };
+    let get = |name: &str| floats(file, &format!("{prefix}{name}"));
+    let state = FieldState::from_tensors(fresh.config, fresh.space, step, rays as usize, get)?;
+    Ok(Some(state))
 }
 
 fn plane_bytes(planes: &Planes) -> Vec<u8> {

@@ -165,12 +165,7 @@ impl Trainer {
             return Ok(());
         };
         let (started, cpu_started) = (Instant::now(), ProcessTime::now());
-        let cameras: Vec<Camera> = self
-            .dataset
-            .train
-            .iter()
-            .map(|i| self.dataset.views[*i].camera)
-            .collect();
+        let cameras = self.train_cameras();
         let options = PointsOptions {
             count: knobs.points.min(self.cap),
             seed: self.options.seed ^ STREAM_POINTS << 40,

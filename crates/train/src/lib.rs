@@ -13,6 +13,7 @@ mod objective;
 mod photos;
 pub mod recipe;
 pub mod report;
+mod residual;
 mod run;
 pub mod schedule;
 mod trainer;

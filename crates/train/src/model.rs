@@ -1,15 +1,21 @@
 //! What a run makes: splats or a field. Every place that treats them differently while looking at them is here.
 
+use crate::residual;
 use irradia_field::{Field, render_view};
 use irradia_scene::{Camera, Image};
-use irradia_splat::{Renderer, Splats, ViewParams};
+use irradia_splat::{Renderer, Splats};
 use std::borrow::Cow;
 
 /// A scene that can be looked at.
 #[derive(Clone, Debug)]
 pub enum Model<'a> {
     /// 3D Gaussians.
-    Splats(Cow<'a, Splats>),
+    Splats {
+        /// The Gaussians.
+        splats: Cow<'a, Splats>,
+        /// What adds to their colours.
+        residual: Option<Box<Field>>,
+    },
     /// A radiance field.
     Field(Cow<'a, Field>),
 }
@@ -38,8 +44,8 @@ impl Model<'_> {
             Image::new(width, height, 3, data)
         };
         match self {
-            Model::Splats(splats) => {
-                renderer.render(splats, &ViewParams::new(camera), options);
+            Model::Splats { splats, residual } => {
+                residual::render(renderer, splats, residual.as_deref(), camera, options);
                 Frame {
                     color: image(renderer.color()),
                     alpha: renderer.alpha().to_vec(),
@@ -70,7 +76,7 @@ impl Model<'_> {
     /// Gaussians, where that is what it is.
     pub fn splats(&self) -> Option<&Splats> {
         match self {
-            Model::Splats(splats) => Some(splats),
+            Model::Splats { splats, .. } => Some(splats),
             Model::Field(_) => None,
         }
     }

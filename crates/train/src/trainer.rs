@@ -6,6 +6,7 @@ use crate::model::Model;
 use crate::objective::{Objective, Reference};
 use crate::photos::{PhotoCache, Prepared};
 use crate::recipe::{Density, Recipe};
+use crate::residual;
 use crate::schedule::{Clock, Round, Signal, StepPlan, coming_views, plan};
 use cpu_time::ProcessTime;
 use irradia_compute::adam::AdamStep;
@@ -92,6 +93,8 @@ pub struct Trainer {
     pub state: SplatState,
     /// The field, in the stages that train one.
     pub field: Option<FieldState>,
+    /// What adds to the splats' colours, where the recipe has it.
+    pub residual: Option<FieldState>,
     /// Where the run stands.
     pub clock: Clock,
     /// As given.
@@ -107,9 +110,9 @@ pub struct Trainer {
     /// Never more splats than this: the recipe's limits for this data.
     pub cap: usize,
     pub(crate) photos: PhotoCache,
-    renderer: Renderer,
+    pub(crate) renderer: Renderer,
     objective: Objective,
-    gradients: SplatGradients,
+    pub(crate) gradients: SplatGradients,
 }
 
 impl Trainer {
@@ -125,6 +128,7 @@ impl Trainer {
             let splats = trainer.first_splats()?;
             trainer.state = SplatState::new(splats);
         }
+        trainer.residual = trainer.first_residual()?;
         Ok(trainer)
     }
 
@@ -133,7 +137,7 @@ impl Trainer {
         if dataset.train.is_empty() {
             return Err(TrainError::NoViews(0));
         }
-        let cameras: Vec<Camera> = dataset.train.iter().map(|i| dataset.views[*i].camera).collect();
+        let cameras = train_cameras(&dataset);
         let total = recipe.total_steps() as f64;
         Ok(Self {
             clock: Clock::new(&recipe),
@@ -148,6 +152,7 @@ impl Trainer {
             gradients: SplatGradients::default(),
             state: SplatState::new(Splats::zeros(0, sh::MAX_DEGREE)),
             field: None,
+            residual: None,
             recipe,
             dataset,
             options,
@@ -157,12 +162,7 @@ impl Trainer {
     /// The recipe's field, nothing learnt yet.
     pub(crate) fn first_field(&mut self) -> Result<FieldState, TrainError> {
         let first = self.photos.get(&self.dataset.train[..1], 1.0)?;
-        let cameras: Vec<Camera> = self
-            .dataset
-            .train
-            .iter()
-            .map(|i| self.dataset.views[*i].camera)
-            .collect();
+        let cameras = self.train_cameras();
         let knobs = self
             .recipe
             .field
@@ -291,7 +291,8 @@ impl Trainer {
             depth: plan.losses.depth > 0.0 || plan.losses.smooth > 0.0,
             ..self.render_options(plan.sh_degree)
         };
-        self.renderer.render(&self.state.splats, &view, &options);
+        let residual = residual::in_force(&self.residual, &plan);
+        residual::render(&mut self.renderer, &self.state.splats, residual, &camera, &options);
         let reference = Reference {
             photo: &photo,
             background,
@@ -312,6 +313,7 @@ impl Trainer {
         };
         self.renderer.backward(&self.state.splats, &v_out, &mut self.gradients);
         let visible = self.renderer.visible();
+        self.train_residual(&plan, &camera);
         self.update(&plan, &view);
         if let Some(change) = self.control_density(&plan) {
             events.push(Event::densified(self.clock.step + 1, change, self.state.len()));
@@ -443,6 +445,11 @@ impl Trainer {
         }
     }
 
+    /// The training views' cameras.
+    pub(crate) fn train_cameras(&self) -> Vec<Camera> {
+        train_cameras(&self.dataset)
+    }
+
     pub(crate) fn scaled_camera(&self, view: usize, scale: f32) -> Camera {
         let mut camera = self.dataset.views[view].camera;
         camera.intrinsics = camera.intrinsics.scaled(scale);
@@ -481,9 +488,10 @@ impl Trainer {
                 .collect();
             let photo = self.photos.get(&order, plan.image_scale)?;
             let (started, cpu_started) = (Instant::now(), ProcessTime::now());
-            let params = ViewParams::new(&self.scaled_camera(view, plan.image_scale));
+            let camera = self.scaled_camera(view, plan.image_scale);
             let options = self.render_options(plan.sh_degree);
-            self.renderer.render(&self.state.splats, &params, &options);
+            let residual = residual::in_force(&self.residual, plan);
+            residual::render(&mut self.renderer, &self.state.splats, residual, &camera, &options);
             self.objective.error(self.renderer.color(), &photo, false);
             sum += self.objective.mean_error();
             count += 1;
@@ -517,12 +525,26 @@ impl Trainer {
 
     /// The scene as a file holds it and held-out views show it: with the smoothing filter made part of it.
     pub fn scene(&self) -> Model<'_> {
-        match &self.field {
-            Some(state) => Model::Field(Cow::Borrowed(&state.field)),
-            None if self.recipe.render.smoothing_filter => Model::Splats(Cow::Owned(filter::baked(&self.state))),
-            None => Model::Splats(Cow::Borrowed(&self.state.splats)),
+        if let Some(state) = &self.field {
+            return Model::Field(Cow::Borrowed(&state.field));
+        }
+        Model::Splats {
+            splats: if self.recipe.render.smoothing_filter {
+                Cow::Owned(filter::baked(&self.state))
+            } else {
+                Cow::Borrowed(&self.state.splats)
+            },
+            residual: self
+                .residual
+                .as_ref()
+                .filter(|state| state.step > 0)
+                .map(|state| Box::new(state.field.clone())),
         }
     }
+}
+
+fn train_cameras(dataset: &Dataset) -> Vec<Camera> {
+    dataset.train.iter().map(|i| dataset.views[*i].camera).collect()
 }
 
 /// The recipe's limits on the number of splats, for images of these cameras.

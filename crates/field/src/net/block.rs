@@ -49,6 +49,17 @@ impl<T: Scalar> Block<T> {
         self.points.resize(self.panels() * 3 * PANEL, T::default());
     }
 
+    /// Gives all samples the same appearance code.
+    pub(crate) fn share_code(&mut self, code: &[T]) {
+        self.codes.clear();
+        self.codes.resize(self.panels() * code.len() * PANEL, T::default());
+        for row in self.codes.chunks_exact_mut(code.len().max(1) * PANEL) {
+            row.chunks_exact_mut(PANEL)
+                .zip(code)
+                .for_each(|(row, value)| row.fill(*value));
+        }
+    }
+
     /// Keeps the samples `kept` (ascending) and forgets the others.
     pub fn keep(&mut self, kept: &[u32]) {
         if kept.len() == self.len {

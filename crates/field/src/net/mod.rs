@@ -155,6 +155,12 @@ impl Net {
         }
     }
 
+    /// Makes every colour grey (a half) until something is learnt.
+    pub(crate) fn silence(&self, parameters: &mut NetParameters<f32>) {
+        let (mlp, _) = self.color_parts();
+        parameters.color[mlp.last_layer()].fill(0.0);
+    }
+
     /// How many numbers table, density and colour part have.
     pub fn sizes(&self) -> [usize; 3] {
         [

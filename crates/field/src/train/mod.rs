@@ -15,8 +15,11 @@ use irradia_scene::Rng;
 use rayon::prelude::*;
 use worker::{Task, Worker};
 
+mod residual;
 mod update;
 mod worker;
+
+pub use residual::{ResidualOptions, Sight, residual_at, train_residual};
 
 /// Groups of a batch: threads that can work at once.
 const GROUPS: usize = 32;
@@ -154,7 +157,19 @@ fn gradients(
         let mut rng = Rng::new(options.seed, (step << 8) + group as u64);
         worker.rays(&task, range, &mut rng);
     });
-    let (first, others) = scratch.workers.split_at_mut(1);
+    let loss = add_up(&mut scratch.workers);
+    let mean = 1.0 / n.max(1) as f64;
+    StepLoss {
+        color: loss.color * mean,
+        total: loss.total * mean,
+        rays: n,
+        samples: loss.samples,
+    }
+}
+
+/// Adds the workers' sums to the first one's, in their order; their losses.
+fn add_up(workers: &mut [Worker]) -> StepLoss {
+    let (first, others) = workers.split_at_mut(1);
     let (sum, mut loss) = (&mut first[0], StepLoss::default());
     loss.add(&sum.loss);
     for worker in others {
@@ -165,13 +180,7 @@ fn gradients(
         }
         add(&mut sum.codes, &worker.codes);
     }
-    let mean = 1.0 / n.max(1) as f64;
-    StepLoss {
-        color: loss.color * mean,
-        total: loss.total * mean,
-        rays: n,
-        samples: loss.samples,
-    }
+    loss
 }
 
 fn add(to: &mut [f32], from: &[f32]) {

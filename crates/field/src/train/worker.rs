@@ -17,6 +17,8 @@ use irradia_scene::Rng;
 #[derive(Clone, Debug, Default)]
 pub(super) struct Worker {
     passes: Vec<Pass>,
+    /// Points that lie on no ray.
+    pub(super) block: Block<f32>,
     pub grads: Vec<NetParameters<f32>>,
     pub codes: Vec<f32>,
     /// For each network the points and the gradients of their encodings, panel after panel.
@@ -36,9 +38,8 @@ pub(super) struct Task<'a> {
 }
 
 impl Worker {
-    /// Forward and backward over the rays `range` of the batch.
-    pub fn rays(&mut self, task: &Task, mut range: std::ops::Range<usize>, rng: &mut Rng) {
-        let field = task.field;
+    /// All sums zero.
+    pub fn clear(&mut self, field: &Field) {
         self.loss = StepLoss::default();
         self.stored.resize_with(field.nets.len(), Default::default);
         self.stored.iter_mut().flatten().for_each(Vec::clear);
@@ -52,6 +53,12 @@ impl Worker {
         } else {
             self.grads = field.parameters.iter().map(NetParameters::without_table).collect();
         }
+    }
+
+    /// Forward and backward over the rays `range` of the batch.
+    pub fn rays(&mut self, task: &Task, mut range: std::ops::Range<usize>, rng: &mut Rng) {
+        let field = task.field;
+        self.clear(field);
         while !range.is_empty() {
             let rays = &task.batch.rays[range.clone()];
             let images = &task.batch.images[range.clone()];
@@ -193,12 +200,12 @@ impl Worker {
     }
 }
 
-struct Backward<'a> {
-    net: &'a Net,
-    turned: &'a NetParameters<f32>,
-    block: &'a mut Block<f32>,
-    grads: &'a mut NetParameters<f32>,
-    with_color: bool,
+pub(super) struct Backward<'a> {
+    pub net: &'a Net,
+    pub turned: &'a NetParameters<f32>,
+    pub block: &'a mut Block<f32>,
+    pub grads: &'a mut NetParameters<f32>,
+    pub with_color: bool,
 }
 
 impl Kernel for Backward<'_> {

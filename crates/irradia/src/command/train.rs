@@ -4,7 +4,7 @@ use super::journal::Journal;
 use super::progress::Progress;
 use super::{DataArgs, file_stem, lpips, lpips_path, thread_count, use_threads};
 use crate::Usage;
-use crate::run_folder::{RunConfig, RunFolder};
+use crate::run_folder::{FIELD, RESIDUAL, RunConfig, RunFolder, SCENE};
 use crate::terminal::{note, one_line, say};
 use anyhow::{Context, Result, anyhow};
 use clap::builder::RangedU64ValueParser;
@@ -244,12 +244,15 @@ fn finish(folder: RunFolder, mut config: RunConfig, mut trainer: Trainer, starte
     journal.finish();
 
     match trainer.scene() {
-        Model::Splats(splats) => {
+        Model::Splats { splats, residual } => {
             let mut cloud = splats.to_cloud();
             cloud.antialiased = trainer.recipe.render.antialias;
-            write_splats(&folder.file("scene.ply"), &cloud)?;
+            write_splats(&folder.file(SCENE), &cloud)?;
+            if let Some(field) = residual {
+                folder.write(RESIDUAL, &field_file::to_bytes(&field))?;
+            }
         }
-        Model::Field(field) => folder.write("field.safetensors", &field_file::to_bytes(&field))?,
+        Model::Field(field) => folder.write(FIELD, &field_file::to_bytes(&field))?,
     }
     saved.map_err(anyhow::Error::msg)?;
 

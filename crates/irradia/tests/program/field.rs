@@ -73,6 +73,36 @@ fn splats_begin_as_the_surfaces_of_a_field() {
 }
 
 #[test]
+fn what_a_field_adds_to_splats_is_kept_beside_them_to_the_bit() {
+    let folder = with_data();
+    for threads in [1, 2] {
+        let line = format!("train data --recipe shiny --steps 120 --set checkpoint_every=50 --threads {threads}");
+        irradia(folder.path(), &format!("{line} --out run{threads}")).well();
+    }
+    let [one, two] = [1, 2].map(|threads| folder.path().join(format!("run{threads}")));
+    let both = |run: &Path| ["scene.ply", "residual.safetensors"].map(|f| std::fs::read(run.join(f)).expect(f));
+    let unbroken = both(&one);
+    assert!(unbroken == both(&two));
+    unfinish(&two, "scene.ply");
+    std::fs::remove_file(two.join("residual.safetensors")).expect("removed");
+    irradia(folder.path(), "train --resume run2").well();
+    assert!(unbroken == both(&two));
+
+    let report = json(&one.join("report.json"));
+    irradia(folder.path(), "eval run1 --data data --json whole.json").well();
+    let psnr = |file: &str| json(&folder.path().join(file))["psnr"].as_f64().expect("a figure");
+    let told = report["psnr"].as_f64().expect("a figure");
+    assert!(
+        (psnr("whole.json") - told).abs() < 0.01,
+        "{} and {told}",
+        psnr("whole.json")
+    );
+    std::fs::copy(one.join("scene.ply"), folder.path().join("alone.ply")).expect("copied");
+    irradia(folder.path(), "eval alone.ply --data data --json alone.json").well();
+    assert!((psnr("alone.json") - told).abs() > 1e-3, "the field adds something");
+}
+
+#[test]
 fn what_is_no_field_is_refused() {
     let folder = with_data();
     irradia(

@@ -41,6 +41,8 @@ pub(super) struct ProjectChunk<'a> {
     pub filter: &'a [f32],
     pub view: &'a ViewParams,
     pub options: &'a RenderOptions,
+    /// Whether colours are final: nothing below 0.
+    pub clamp: bool,
     pub first: usize,
     pub footprints: &'a mut [Footprint2d],
     pub depth_keys: &'a mut [u32],
@@ -101,7 +103,7 @@ impl Kernel for ProjectChunk<'_> {
                 };
             }
         }
-        let colors = harmonics.colors(simd, self.splats, self.first);
+        let colors = harmonics.colors(simd, self.splats, self.first, self.clamp);
         for at in harmonics.starts() {
             for i in at..at + S::LANES {
                 let color = each!(c in 3 => colors[c][i]);

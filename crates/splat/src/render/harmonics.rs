@@ -53,9 +53,9 @@ impl Harmonics {
         (0..count).map(move |i| usize::from(starts[i]))
     }
 
-    /// Colours, clamped at 0, of what was looked at; the chunk's first splat is `first`.
+    /// Colours, clamped at 0 if `clamp`, of what was looked at; the chunk's first splat is `first`.
     #[inline(always)]
-    pub fn colors<S: Simd>(&self, simd: S, splats: &Splats, first: usize) -> [[f32; CHUNK]; 3]
+    pub fn colors<S: Simd>(&self, simd: S, splats: &Splats, first: usize, clamp: bool) -> [[f32; CHUNK]; 3]
     where
         S::F: Lanes<Scalar = f32>,
     {
@@ -72,7 +72,7 @@ impl Harmonics {
                 }
             }
         }
-        for color in &mut colors {
+        for color in colors.iter_mut().filter(|_| clamp) {
             for start in &self.starts[..self.count] {
                 let at = usize::from(*start);
                 simd.load(&color[at..]).max(simd.splat(0.0)).store(&mut color[at..]);

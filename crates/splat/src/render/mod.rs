@@ -52,6 +52,9 @@ impl Default for RenderOptions {
     }
 }
 
+/// What is added to the colours of the splats it is told, `[r, g, b]` each.
+pub type Shade<'a> = &'a dyn Fn(&[u32]) -> Vec<[f32; 3]>;
+
 /// Gradients of the loss with regard to a frame.
 #[derive(Clone, Copy, Debug)]
 pub struct OutputGradient<'a> {
@@ -128,6 +131,7 @@ pub struct Renderer {
     options: RenderOptions,
     footprints: Vec<Footprint2d>,
     depth_keys: Vec<u32>,
+    in_view: Vec<u32>,
     bins: Bins,
     /// Tile-major `[tiles, CHANNELS, blocks, BLOCK]`.
     tiles: Vec<f32>,
@@ -159,6 +163,7 @@ impl Renderer {
             options: RenderOptions::default(),
             footprints: Vec::new(),
             depth_keys: Vec::new(),
+            in_view: Vec::new(),
             bins: Bins::default(),
             tiles: Vec::new(),
             color: Vec::new(),
@@ -216,11 +221,27 @@ impl Renderer {
 
     /// Renders `splats` into this renderer's buffers.
     pub fn render(&mut self, splats: &Splats, view: &ViewParams, options: &RenderOptions) {
+        self.render_shaded(splats, view, options, None);
+    }
+
+    /// As [`Self::render`], with something added to colours before they are clamped at 0: `shade` is told the splats in view,
+    /// in ascending order, and gives `[r, g, b]` for each. The gradient of what it gives is that of the splats' DC
+    /// coefficient over [`irradia_scene::sh::C0`].
+    pub fn render_shaded(&mut self, splats: &Splats, view: &ViewParams, options: &RenderOptions, shade: Option<Shade>) {
         assert!(
             self.filter.is_empty() || self.filter.len() == splats.stride(),
             "a filter for every splat, with padding"
         );
-        self.project(splats, view, options);
+        self.project(splats, view, options, shade.is_none());
+        if let Some(shade) = shade {
+            self.in_view.clear();
+            let seen = |i: &u32| self.depth_keys[*i as usize] != u32::MAX;
+            self.in_view.extend((0..splats.len() as u32).filter(seen));
+            for (i, added) in self.in_view.iter().zip(shade(&self.in_view)) {
+                let color = &mut self.footprints[*i as usize].color;
+                *color = std::array::from_fn(|c| (color[c] + added[c]).max(0.0));
+            }
+        }
         self.bins
             .build(self.level, view.width, view.height, &self.footprints, &self.depth_keys);
         self.blend(view, options);
@@ -228,7 +249,12 @@ impl Renderer {
         self.options = *options;
     }
 
-    fn project(&mut self, splats: &Splats, view: &ViewParams, options: &RenderOptions) {
+    /// Splats in view of the last [`Self::render_shaded`] with a shade, ascending.
+    pub fn in_view(&self) -> &[u32] {
+        &self.in_view
+    }
+
+    fn project(&mut self, splats: &Splats, view: &ViewParams, options: &RenderOptions, clamp: bool) {
         let stride = splats.stride();
         self.footprints.resize(stride, Footprint2d::default());
         self.depth_keys.resize(stride, u32::MAX);
@@ -243,6 +269,7 @@ impl Renderer {
                     filter,
                     view,
                     options,
+                    clamp,
                     first: chunk * CHUNK,
                     footprints,
                     depth_keys,

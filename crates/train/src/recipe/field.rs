@@ -24,6 +24,29 @@ pub struct FieldKnobs {
     pub sampler: Sampler,
 }
 
+/// A small field that adds a view-dependent colour to splats: reflections that harmonics cannot hold.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ResidualKnobs {
+    /// Decay of Adam's second moment.
+    pub beta2: f32,
+    /// Whether it is asked by the direction that a mirror would show, across the splat's shortest axis, and not by that of
+    /// view (Ref-NeRF, Verbin et al. 2022): what surroundings a place reflects then depends little on the place.
+    pub mirrored: bool,
+    /// Its network, of which the density is not used.
+    pub net: NetShape,
+}
+
+impl ResidualKnobs {
+    pub(super) fn validate(&self) -> Result<(), String> {
+        if !(0.0..1.0).contains(&self.beta2) {
+            return Err("residual.beta2 must lie between 0 and 1".into());
+        }
+        let checked = FieldConfig::residual(self.net, self.mirrored).check();
+        checked.map_err(|error| format!("residual: {error}"))
+    }
+}
+
 /// Where a field lives.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -57,6 +80,9 @@ impl FieldKnobs {
     pub(super) fn validate(&self) -> Result<(), String> {
         if self.samples == 0 || !(0.0..1.0).contains(&self.beta2) {
             return Err("field.samples must be at least 1 and field.beta2 between 0 and 1".into());
+        }
+        if matches!(self.sampler, Sampler::Given { .. }) {
+            return Err("field.sampler cannot be given points: say occupancy, hierarchy or proposal".into());
         }
         self.config(1, &Space::contracted([0.0; 3], 1.0))
             .check()

@@ -7,13 +7,13 @@ mod param;
 
 pub use ablation::Ingredients;
 pub use density::{ClassicKnobs, Density, FastKnobs, McmcKnobs, MergeKnobs, TamingKnobs};
-pub use field::{FieldKnobs, FieldSpace};
+pub use field::{FieldKnobs, FieldSpace, ResidualKnobs};
 use param::check_knob;
 pub use param::{Knob, Param, Params, Shape};
 use serde::{Deserialize, Serialize};
 
 /// The recipes that come with the program: name and text.
-pub const BUILT_IN: [(&str, &str); 10] = [
+pub const BUILT_IN: [(&str, &str); 11] = [
     ("classic", include_str!("../../../../recipes/classic.toml")),
     ("absgrad", include_str!("../../../../recipes/absgrad.toml")),
     ("mcmc", include_str!("../../../../recipes/mcmc.toml")),
@@ -26,6 +26,7 @@ pub const BUILT_IN: [(&str, &str); 10] = [
     ),
     ("hashgrid", include_str!("../../../../recipes/hashgrid.toml")),
     ("nerf", include_str!("../../../../recipes/nerf.toml")),
+    ("shiny", include_str!("../../../../recipes/shiny.toml")),
     ("hybrid", include_str!("../../../../recipes/hybrid.toml")),
 ];
 
@@ -87,6 +88,9 @@ pub struct Recipe {
     /// The radiance field of the stages that train one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub field: Option<FieldKnobs>,
+    /// What adds to the splats' colours.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub residual: Option<ResidualKnobs>,
     /// Knobs over the whole run; a stage may overrule them.
     pub params: Params,
     /// What happens, in order.
@@ -279,6 +283,9 @@ impl Recipe {
         }
         if let Some(field) = &self.field {
             field.validate()?;
+        }
+        if let Some(residual) = &self.residual {
+            residual.validate()?;
         }
         for (i, stage) in self.stage.iter().enumerate() {
             self.validate_order(i)?;

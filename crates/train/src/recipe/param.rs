@@ -72,11 +72,13 @@ pub enum Param {
     InterlevelWeight,
     /// Weight of the distortion loss of a field (mip-NeRF 360).
     DistortionWeight,
+    /// From 0.5 on, for the rest of the run, the residual field of a recipe that has one adds to the splats' colours.
+    Residual,
 }
 
 impl Param {
     /// All of them, in order.
-    pub const ALL: [Param; 31] = [
+    pub const ALL: [Param; 32] = [
         Param::ImageScale,
         Param::ShDegree,
         Param::CountShare,
@@ -108,6 +110,7 @@ impl Param {
         Param::RateCodes,
         Param::InterlevelWeight,
         Param::DistortionWeight,
+        Param::Residual,
     ];
 
     /// As recipes write it.
@@ -119,7 +122,7 @@ impl Param {
     /// The value where no recipe says anything.
     pub fn default_value(self) -> f64 {
         match self {
-            Param::ImageScale | Param::CountShare | Param::TrainedShare | Param::PhotoWeight => 1.0,
+            Param::ImageScale | Param::CountShare | Param::TrainedShare | Param::PhotoWeight | Param::Residual => 1.0,
             Param::CoarseFactor => 4.0,
             _ => 0.0,
         }
@@ -132,7 +135,7 @@ impl Param {
             Param::CountShare => 0.001..=1.0,
             Param::TrainedShare => 0.001..=1.0,
             Param::ShDegree => 0.0..=3.0,
-            Param::SsimWeight | Param::RandomBackground => 0.0..=1.0,
+            Param::SsimWeight | Param::RandomBackground | Param::Residual => 0.0..=1.0,
             Param::CoarseFactor => 1.0..=64.0,
             _ => 0.0..=f64::MAX,
         }

@@ -107,6 +107,8 @@ pub struct FieldPlan {
     pub distortion: f32,
     /// The occupancy grid is looked at, after the step.
     pub look: bool,
+    /// The residual field adds to the splats' colours.
+    pub residual: bool,
 }
 
 /// Weights of what a frame is compared by.
@@ -315,6 +317,7 @@ pub fn plan(recipe: &Recipe, clock: &Clock) -> StepPlan {
             interlevel: of(Param::InterlevelWeight) as f32,
             distortion: of(Param::DistortionWeight) as f32,
             look: is_due(clock, LOOK_EVERY),
+            residual: of(Param::Residual) >= 0.5,
         },
         gathers: density.map(|density| density.statistics()),
         densify: density

@@ -1,21 +1,34 @@
 //! How long the rest of a run takes, and the pace at which it takes as long as it may.
 //!
-//! A recipe's steps do not cost the same: images grow, splats grow in number. What is left of the recipe is looked through
-//! with a model of a step's cost whose one constant is measured as the run goes.
+//! A recipe's steps do not cost the same: images grow, splats grow in number and colour. What is left of the recipe is looked
+//! through with a model of a step's work, of which one constant is measured as the run goes, and of how its strategy adds
+//! splats.
 
-use crate::schedule::{Ahead, ahead};
+use crate::recipe::{Density, Represents};
+use crate::schedule::{Ahead, StepPlan, ahead};
 use crate::trainer::Trainer;
 
-/// A step's cost grows with pixels and splats to these powers: twice the pixels cost 1.65 times as much, twice the splats
-/// 1.3 times (RESULTS.md, "How cost grows").
-const PIXELS_POWER: f64 = 0.72;
-const SPLATS_POWER: f64 = 0.38;
+/// Work of a step, microseconds of a core on which these were fitted (fox_colmap, demo, chair, lund_door; AVX-512): a pixel,
+const PIXEL: f64 = 0.085;
+/// a splat,
+const SPLAT: f64 = 0.11;
+/// each of its parameters in use,
+const PARAMETER: f64 = 0.006;
+/// a pixel that LPIPS looks at,
+const PERCEPTUAL_PIXEL: f64 = 1.8;
+/// and a sample of a field.
+const SAMPLE: f64 = 2.0;
+/// Parameters of a splat beside its harmonics.
+const GEOMETRY: f64 = 11.0;
 /// Moments of the future that are looked at.
-const MOMENTS: usize = 32;
+const MOMENTS: usize = 48;
 /// Steps over which the cost is averaged.
 const WINDOW: u64 = 50;
-/// Seconds of a step before any was measured: its order on two cores.
-const FIRST_GUESS: f64 = 0.01;
+/// The strategy `fast` ends with so many splats more where images grow: pixels to this power (2.3 times for images of twice
+/// the side; 1.8 to 2.6 on five scenes),
+const SPLATS_BY_PIXELS: f64 = 0.6;
+/// within this share of the recipe.
+const SPLATS_FOLLOW: f64 = 0.12;
 
 /// What has been learnt of a run's cost and growth.
 #[derive(Clone, Debug, Default)]
@@ -30,64 +43,114 @@ pub struct Forecast {
     unit: Option<f64>,
     /// Seconds that the rest of the run takes, were each recipe step a step.
     whole: f64,
-    /// Stage, recipe time and number of splats when the stage was first seen.
+    /// Mean pixels of a training image.
+    pixels: f64,
+    /// The present stage when it was first seen, with its number, recipe time and number of splats.
     entered: Option<(usize, f64, f64)>,
+    /// Size of the training images.
+    image_scale: f64,
+    /// Where `fast` is going since images have grown.
+    aim: Option<Aim>,
+}
+
+/// A number of splats that is being reached.
+#[derive(Clone, Copy, Debug)]
+struct Aim {
+    count: f64,
+    /// Splats added in a recipe step.
+    rate: f64,
+    /// Recipe time at which it is reached or given up.
+    until: f64,
+}
+
+impl Aim {
+    /// That of images whose sides grow by `factor` at `time`, when there are `count` splats.
+    fn new(trainer: &Trainer, factor: f64, time: f64, count: f64) -> Self {
+        let follow = SPLATS_FOLLOW * trainer.recipe.total_steps() as f64;
+        let aim = count * factor.powi(2).powf(SPLATS_BY_PIXELS);
+        Self {
+            count: aim,
+            rate: (aim - count) / follow,
+            until: time + follow,
+        }
+    }
 }
 
 impl Forecast {
-    /// Takes in what the last step cost; to be called before each step, which trains on images of size `image_scale`.
-    pub fn observe(&mut self, trainer: &Trainer, image_scale: f32) {
+    /// Takes in what the last step cost; to be called before each step, of which `plan` is the plan.
+    pub fn observe(&mut self, trainer: &Trainer, plan: &StepPlan) {
         if self.work > 0.0 {
             self.steps += 1;
             let unit = (trainer.seconds - self.seconds) / self.work;
             let share = 1.0 / self.steps.min(WINDOW) as f64;
             self.unit = Some(self.unit.map_or(unit, |mean| mean + share * (unit - mean)));
         }
-        self.seconds = trainer.seconds;
-        let (clock, count) = (&trainer.clock, trainer.state.len() as f64);
-        if self.entered.is_none_or(|(stage, ..)| stage != clock.stage) {
-            self.entered = Some((clock.stage, clock.time, count));
+        if self.pixels == 0.0 {
+            let cameras = trainer.train_cameras();
+            let sizes = cameras.iter().map(|c| &c.intrinsics);
+            let pixels: f64 = sizes.map(|k| f64::from(k.width) * f64::from(k.height)).sum();
+            self.pixels = pixels / cameras.len().max(1) as f64;
         }
-        self.work = work(f64::from(image_scale), count);
-        self.whole = self.look_ahead(trainer);
+        self.seconds = trainer.seconds;
+        let (stage, time, count) = (trainer.clock.stage, trainer.clock.time, trainer.state.len() as f64);
+        if self.entered.is_none_or(|(then, ..)| then != stage) {
+            self.entered = Some((stage, time, count));
+        }
+        let image_scale = f64::from(plan.image_scale);
+        if self.image_scale > 0.0 && image_scale > self.image_scale {
+            self.aim = Some(Aim::new(trainer, image_scale / self.image_scale, time, count));
+        }
+        self.image_scale = image_scale;
+        let ahead = ahead(&trainer.recipe, &trainer.clock, MOMENTS);
+        self.work = ahead.first().map_or(0.0, |next| self.work(trainer, next, count));
+        self.whole = self.look_ahead(trainer, &ahead);
     }
 
     /// [`Self::whole`] for the recipe that is left.
-    fn look_ahead(&self, trainer: &Trainer) -> f64 {
-        let ahead = ahead(&trainer.recipe, &trainer.clock, MOMENTS);
-        let count = trainer.state.len() as f64;
-        let start = trainer.clock.time;
-        let (stage, entered, before) = self.entered.unwrap_or((trainer.clock.stage, start, count));
-        // Growth goes on as it has since the stage began. Without an example, and where the number has only fallen (random
-        // points that nothing needed), the stage may double it.
-        let seen = start - entered;
-        let length: f64 = ahead.iter().filter(|a| a.grows).map(|a| a.duration).sum();
-        let known =
-            seen > 0.1 * length && count > before && ahead.first().is_some_and(|now| now.grows && now.stage == stage);
-        let rate = if known {
+    fn look_ahead(&self, trainer: &Trainer, ahead: &[Ahead]) -> f64 {
+        let unit = self.unit.unwrap_or(1e-6 / rayon::current_num_threads() as f64);
+        let mut growth = Growth {
+            rate: self.rate(trainer),
+            aim: self.aim,
+            image_scale: self.image_scale,
+            time: trainer.clock.time,
+            count: trainer.state.len() as f64,
+        };
+        let mut sum = 0.0;
+        for stretch in ahead {
+            growth.pass(trainer, stretch);
+            sum += stretch.duration * self.work(trainer, stretch, growth.count);
+        }
+        unit * sum
+    }
+
+    /// Splats added in a recipe step since the stage began. Without an example, and where the number has only fallen (random
+    /// points that nothing needed), the stage may double it.
+    fn rate(&self, trainer: &Trainer) -> f64 {
+        let (stage, time, count) = (trainer.clock.stage, trainer.clock.time, trainer.state.len() as f64);
+        let length = trainer.recipe.stage.get(stage).map_or(1.0, |stage| stage.steps as f64);
+        let (_, entered, before) = self.entered.unwrap_or((stage, time, count));
+        let seen = time - entered;
+        if seen > 0.1 * (length - seen) && count > before {
             (count - before) / seen
         } else {
-            count / length.max(1.0)
+            count / length
+        }
+    }
+
+    /// Work of a step on `count` splats, microseconds.
+    fn work(&self, trainer: &Trainer, step: &Ahead, count: f64) -> f64 {
+        if let (Represents::Field, Some(knobs)) = (trainer.recipe.stage[step.stage].represents, &trainer.recipe.field) {
+            return SAMPLE * knobs.samples as f64;
+        }
+        let pixels = self.pixels * step.image_scale.powi(2);
+        let parameters = GEOMETRY + 3.0 * (step.sh_degree + 1.0).powi(2);
+        let perceptual = if step.perceptual {
+            PERCEPTUAL_PIXEL * pixels.min(crate::objective::PATCH.pow(2) as f64)
+        } else {
+            0.0
         };
-        let (mut splats, mut sum) = (count, 0.0);
-        for Ahead {
-            stage,
-            image_scale,
-            count_share,
-            grows,
-            duration,
-        } in ahead
-        {
-            if grows {
-                let limit = (trainer.limit(stage, count_share) as f64).max(count);
-                splats = (splats + rate * duration).clamp(1.0, limit);
-            }
-            sum += duration * work(image_scale, splats);
-        }
-        match self.unit {
-            Some(unit) => unit * sum,
-            None => FIRST_GUESS * (trainer.recipe.total_steps() as f64 - start),
-        }
+        PIXEL * pixels + count.max(1.0) * (SPLAT + PARAMETER * parameters) + perceptual
     }
 
     /// Seconds that the rest of the run takes at its present pace.
@@ -103,6 +166,48 @@ impl Forecast {
     }
 }
 
-fn work(image_scale: f64, splats: f64) -> f64 {
-    image_scale.powi(2).powf(PIXELS_POWER) * splats.max(1.0).powf(SPLATS_POWER)
+/// The number of splats over what is left of a run.
+struct Growth {
+    /// [`Forecast::rate`].
+    rate: f64,
+    aim: Option<Aim>,
+    image_scale: f64,
+    time: f64,
+    count: f64,
+}
+
+impl Growth {
+    /// Lets the stretch go by.
+    fn pass(&mut self, trainer: &Trainer, stretch: &Ahead) {
+        let stage = &trainer.recipe.stage[stretch.stage];
+        let limit = (trainer.limit(stretch.stage, stretch.count_share) as f64).max(self.count);
+        let grown = match &stage.density {
+            None => self.count,
+            Some(Density::Mcmc(knobs)) => {
+                self.count * f64::from(knobs.growth).powf(stretch.duration / knobs.every as f64)
+            }
+            Some(Density::Taming(_)) => {
+                let before = stretch.share - stretch.duration / stage.steps as f64;
+                let left = (1.0 - stretch.share).max(0.0) / (1.0 - before).max(1e-9);
+                limit - (limit - self.count) * left.powi(2)
+            }
+            Some(Density::Fast(_)) => {
+                let factor = stretch.image_scale / self.image_scale;
+                if factor > 1.0 {
+                    self.aim = Some(Aim::new(trainer, factor, self.time, self.count));
+                }
+                match self.aim {
+                    None => self.count + self.rate * stretch.duration,
+                    Some(aim) if self.time < aim.until && self.count < aim.count => {
+                        (self.count + aim.rate * stretch.duration).min(aim.count)
+                    }
+                    Some(_) => self.count,
+                }
+            }
+            Some(Density::Classic(_)) => self.count + self.rate * stretch.duration,
+        };
+        self.count = grown.clamp(1.0, limit);
+        self.image_scale = stretch.image_scale;
+        self.time += stretch.duration;
+    }
 }

@@ -12,7 +12,7 @@ use rayon::prelude::*;
 use std::sync::Arc;
 
 /// Side of the square that LPIPS looks at in a step, pixels.
-const PATCH: usize = 128;
+pub(crate) const PATCH: usize = 128;
 /// How sharply an edge of the photograph permits one in depth: of 0.1 counts 1 / e (Godard et al. 2017 have 1 for colours
 /// that were normalised otherwise).
 const EDGE_SHARPNESS: f32 = 10.0;

@@ -46,7 +46,7 @@ pub fn run(
     let mut reason = None;
     while reason.is_none() && signal != Signal::Stop && !trainer.finished() {
         let due = plan(&trainer.recipe, &trainer.clock);
-        forecast.observe(trainer, due.image_scale);
+        forecast.observe(trainer, &due);
         if let Some(budget) = limits.budget {
             trainer.pace = forecast.pace(trainer, budget - trainer.seconds);
         }

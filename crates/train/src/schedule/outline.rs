@@ -10,10 +10,14 @@ pub struct Ahead {
     pub stage: usize,
     /// Size of the training images relative to the data's.
     pub image_scale: f64,
+    /// SH bands in use.
+    pub sh_degree: f64,
+    /// Whether pictures are compared by a perceptual loss.
+    pub perceptual: bool,
     /// Splats there may be, as a share of the cap.
     pub count_share: f64,
-    /// Whether splats are added.
-    pub grows: bool,
+    /// Recipe steps of the stage that will have gone by at its end, as a share.
+    pub share: f64,
     /// Recipe steps that it lasts.
     pub duration: f64,
 }
@@ -30,8 +34,10 @@ pub fn ahead(recipe: &Recipe, clock: &Clock, parts: usize) -> Vec<Ahead> {
         stretches.push(Ahead {
             stage: clock.stage,
             image_scale: values[Param::ImageScale as usize],
+            sh_degree: values[Param::ShDegree as usize],
+            perceptual: values[Param::PerceptualWeight as usize] > 0.0,
             count_share: values[Param::CountShare as usize],
-            grows: stage.density.is_some(),
+            share: (clock.time + duration - clock.stage_time) / stage.steps as f64,
             duration,
         });
         clock.pass(recipe, duration);

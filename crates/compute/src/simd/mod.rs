@@ -43,6 +43,24 @@ pub trait Simd: Copy + Send + Sync + 'static {
         }
         self.load(&values)
     }
+    /// A square of `LANES` by `LANES` turned over: `to[j * to_stride + i] = from[i * stride + j]`.
+    ///
+    /// # Panics
+    /// When a row does not fit.
+    #[inline(always)]
+    fn transpose(
+        self,
+        from: &[<Self::F as Lanes>::Scalar],
+        stride: usize,
+        to: &mut [<Self::F as Lanes>::Scalar],
+        to_stride: usize,
+    ) {
+        for j in 0..Self::LANES {
+            for i in 0..Self::LANES {
+                to[j * to_stride + i] = from[i * stride + j];
+            }
+        }
+    }
 }
 
 /// The scalar in a lane.
@@ -364,6 +382,12 @@ mod tests {
             let mut sums = [0.0; 8];
             S::F::sums(&many, &mut sums);
             assert_eq!(sums, many.map(S::F::sum));
+            let square: Vec<f32> = (0..20 * 16).map(|i| i as f32).collect();
+            let mut turned = [f32::NAN; 18 * 16];
+            simd.transpose(&square, 20, &mut turned, 18);
+            for (i, j) in (0..S::LANES).flat_map(|i| (0..S::LANES).map(move |j| (i, j))) {
+                assert_eq!(turned[j * 18 + i], square[i * 20 + j], "row {i}, column {j}");
+            }
             let nan = simd.splat(f64::NAN);
             assert!(nan.lt(b).none() && nan.le(b).none());
             assert_eq!(simd.splat(-1000.0).exp2().sum(), simd.splat(-126.0).exp2().sum());

@@ -78,7 +78,7 @@ macro_rules! float_lanes {
      abs: |$abs_v:ident| $abs:expr, neg: |$neg_v:ident| $neg:expr, floor: |$floor_v:ident| $floor:expr,
      lt: |$lt_a:ident, $lt_b:ident| $lt:expr, le: |$le_a:ident, $le_b:ident| $le:expr,
      select: |$sel_m:ident, $sel_a:ident, $sel_b:ident| $select:expr,
-     exp2: |$exp_v:ident| $exp2:expr, recip: |$recip_v:ident| $recip:expr, sum: |$sum_v:ident| $sum:expr, sums: $sums:ident) => {
+     exp2: |$exp_v:ident| $exp2:expr, recip: |$recip_v:ident| $recip:expr, sum: |$sum_v:ident| $sum:expr, sums: $sums:ident, turn: $turn:ident) => {
         impl Simd for $simd {
             type F = $vector;
             const LANES: usize = $lanes;
@@ -96,6 +96,17 @@ macro_rules! float_lanes {
                 let from: &[f32; $lanes] = from.first_chunk().expect("a whole vector");
                 // SAFETY: the token proves the instruction set; the array is as long as the unaligned load.
                 $vector(unsafe { $loadu(from.as_ptr()) })
+            }
+            #[inline(always)]
+            fn transpose(self, from: &[f32], stride: usize, to: &mut [f32], to_stride: usize) {
+                let mut square = [self.splat(0.0); $lanes];
+                for i in 0..$lanes {
+                    square[i] = self.load(&from[i * stride..]);
+                }
+                let turned = $turn(square);
+                for j in 0..$lanes {
+                    turned[j].store(&mut to[j * to_stride..]);
+                }
             }
         }
 
@@ -243,7 +254,8 @@ float_lanes!(
         let half = _mm256_add_ps(_mm512_castps512_ps256(v), _mm512_extractf32x8_ps::<1>(v));
         sum_of_8(half)
     },
-    sums: sums_of_16
+    sums: sums_of_16,
+    turn: turn_16
 );
 
 float_lanes!(
@@ -259,7 +271,8 @@ float_lanes!(
     exp2: |v| exp2_8(v),
     recip: |v| _mm256_rcp_ps(v),
     sum: |v| sum_of_8(v),
-    sums: sums_of_8
+    sums: sums_of_8,
+    turn: turn_8
 );
 
 #[inline(always)]
@@ -347,6 +360,58 @@ fn sums_of_16<const N: usize>(vectors: &[F32x16; N], to: &mut [f32; N]) {
         let half = _mm256_add_ps(_mm512_castps512_ps256(v), _mm512_extractf32x8_ps::<1>(v));
         _mm_add_ps(_mm256_castps256_ps128(half), _mm256_extractf128_ps::<1>(half))
     });
+}
+
+/// Rows and columns exchanged: within squares of four by four, then the squares.
+#[inline(always)]
+fn turn_16(mut rows: [F32x16; 16]) -> [F32x16; 16] {
+    // SAFETY: a vector proves the instruction set.
+    unsafe {
+        for r in (0..16).step_by(4) {
+            let [a, b, c, d] = [rows[r].0, rows[r + 1].0, rows[r + 2].0, rows[r + 3].0];
+            let ab = [_mm512_unpacklo_ps(a, b), _mm512_unpackhi_ps(a, b)];
+            let cd = [_mm512_unpacklo_ps(c, d), _mm512_unpackhi_ps(c, d)];
+            for k in 0..2 {
+                let (ab, cd) = (_mm512_castps_pd(ab[k]), _mm512_castps_pd(cd[k]));
+                rows[r + 2 * k] = F32x16(_mm512_castpd_ps(_mm512_unpacklo_pd(ab, cd)));
+                rows[r + 2 * k + 1] = F32x16(_mm512_castpd_ps(_mm512_unpackhi_pd(ab, cd)));
+            }
+        }
+        for c in 0..4 {
+            let [a, b, c_, d] = [rows[c].0, rows[c + 4].0, rows[c + 8].0, rows[c + 12].0];
+            let even = [_mm512_shuffle_f32x4::<0x88>(a, b), _mm512_shuffle_f32x4::<0x88>(c_, d)];
+            let odd = [_mm512_shuffle_f32x4::<0xdd>(a, b), _mm512_shuffle_f32x4::<0xdd>(c_, d)];
+            rows[c] = F32x16(_mm512_shuffle_f32x4::<0x88>(even[0], even[1]));
+            rows[c + 4] = F32x16(_mm512_shuffle_f32x4::<0x88>(odd[0], odd[1]));
+            rows[c + 8] = F32x16(_mm512_shuffle_f32x4::<0xdd>(even[0], even[1]));
+            rows[c + 12] = F32x16(_mm512_shuffle_f32x4::<0xdd>(odd[0], odd[1]));
+        }
+    }
+    rows
+}
+
+/// As [`turn_16`].
+#[inline(always)]
+fn turn_8(mut rows: [F32x8; 8]) -> [F32x8; 8] {
+    // SAFETY: a vector proves the instruction set.
+    unsafe {
+        for r in (0..8).step_by(4) {
+            let [a, b, c, d] = [rows[r].0, rows[r + 1].0, rows[r + 2].0, rows[r + 3].0];
+            let ab = [_mm256_unpacklo_ps(a, b), _mm256_unpackhi_ps(a, b)];
+            let cd = [_mm256_unpacklo_ps(c, d), _mm256_unpackhi_ps(c, d)];
+            for k in 0..2 {
+                let (ab, cd) = (_mm256_castps_pd(ab[k]), _mm256_castps_pd(cd[k]));
+                rows[r + 2 * k] = F32x8(_mm256_castpd_ps(_mm256_unpacklo_pd(ab, cd)));
+                rows[r + 2 * k + 1] = F32x8(_mm256_castpd_ps(_mm256_unpackhi_pd(ab, cd)));
+            }
+        }
+        for c in 0..4 {
+            let (a, b) = (rows[c].0, rows[c + 4].0);
+            rows[c] = F32x8(_mm256_permute2f128_ps::<0x20>(a, b));
+            rows[c + 4] = F32x8(_mm256_permute2f128_ps::<0x31>(a, b));
+        }
+    }
+    rows
 }
 
 impl Mask for Mask16 {

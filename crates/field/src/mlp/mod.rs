@@ -1,0 +1,271 @@
+//! Fully connected ReLU networks over panels of samples, and their vector-Jacobian product.
+//!
+//! Activations are feature-major within a panel of 32 samples, `[panel, feature, 32]`: a layer is then
+//! `y[o][s] += w[i][o] x[i][s]` with the sample in the lane. Weights are packed into tiles of eight
+//! outputs: forward layer by layer, and once a step for the way back.
+//! Every width is padded to a multiple of eight; what is padding is zero and stays zero.
+
+mod outer;
+mod product;
+
+use crate::{Num, Rows};
+use irradia_compute::simd::{Scalar, Simd};
+use irradia_scene::Rng;
+use outer::outer;
+use product::{Begin, Finish, pack, product};
+
+/// Samples of a panel.
+pub const PANEL: usize = 32;
+/// Widths are padded to this.
+pub const ROWS: usize = 8;
+
+/// The sizes of a network.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct MlpShape {
+    /// Input features.
+    pub inputs: usize,
+    /// Output features (linear).
+    pub outputs: usize,
+    /// Features of a hidden layer.
+    pub width: usize,
+    /// Hidden layers (ReLU).
+    pub depth: usize,
+    /// The hidden layer (from 0) that sees the input again; NeRF: 5 of 8.
+    pub skip: Option<usize>,
+}
+
+/// Where one layer's numbers lie in the flat list of parameters: weights `[inputs + again, outputs]`, then the bias.
+#[derive(Clone, Copy, Debug)]
+struct Layer {
+    inputs: usize,
+    /// Rows of the network's input that come in again (0 or all of it).
+    again: usize,
+    outputs: usize,
+    at: usize,
+}
+
+impl Layer {
+    fn weights(&self) -> usize {
+        (self.inputs + self.again) * self.outputs
+    }
+    fn bias(&self) -> usize {
+        self.at + self.weights()
+    }
+    fn end(&self) -> usize {
+        self.bias() + self.outputs
+    }
+}
+
+/// A network: its sizes and where its parameters lie. The parameters themselves are a flat list that others hold.
+#[derive(Clone, Debug)]
+pub struct Mlp {
+    /// The sizes asked for.
+    pub shape: MlpShape,
+    layers: Vec<Layer>,
+}
+
+/// Activations and gradients of a block of samples; buffers are reused.
+#[derive(Clone, Debug, Default)]
+pub struct MlpTape<T> {
+    /// What each layer gives out, `[panels, outputs, 32]`.
+    outputs: Vec<Rows<T>>,
+    /// The gradient of the same before the ReLU.
+    gradients: Vec<Rows<T>>,
+    /// One layer's weights or gradients, laid out for the product at hand.
+    packed: Rows<T>,
+}
+
+impl<T: Scalar> MlpTape<T> {
+    /// What the network gives out, `[panels, padded outputs, 32]`.
+    pub fn output(&self) -> &[T] {
+        self.outputs.last().map_or(&[], |rows| rows)
+    }
+
+    /// To be filled with the gradient of [`Self::output`] before going back.
+    pub fn output_gradient(&mut self) -> &mut Rows<T> {
+        self.gradients.last_mut().expect("forward came first")
+    }
+
+    /// Everything kept a sample, layer by layer, with its number of rows: for throwing samples away.
+    pub(crate) fn outputs_mut(&mut self) -> &mut [Rows<T>] {
+        &mut self.outputs
+    }
+}
+
+impl Mlp {
+    /// Lays a network out.
+    pub fn new(shape: MlpShape) -> Self {
+        let pad = |n: usize| n.next_multiple_of(ROWS);
+        let inputs = pad(shape.inputs);
+        let mut layers: Vec<Layer> = Vec::new();
+        for l in 0..=shape.depth {
+            layers.push(Layer {
+                inputs: if l == 0 { inputs } else { pad(shape.width) },
+                again: if l > 0 && l < shape.depth && shape.skip == Some(l) {
+                    inputs
+                } else {
+                    0
+                },
+                outputs: pad(if l == shape.depth { shape.outputs } else { shape.width }),
+                at: layers.last().map_or(0, Layer::end),
+            });
+        }
+        Self { shape, layers }
+    }
+
+    /// Rows of the input, padded.
+    pub fn inputs(&self) -> usize {
+        self.layers[0].inputs
+    }
+
+    /// Rows of the output, padded.
+    pub fn outputs(&self) -> usize {
+        self.layers[self.layers.len() - 1].outputs
+    }
+
+    /// Numbers in the flat list.
+    pub fn parameters(&self) -> usize {
+        self.layers[self.layers.len() - 1].end()
+    }
+
+    /// Where the last layer's numbers lie in the flat list: all zero, the network gives out zeros and still learns.
+    pub fn last_layer(&self) -> std::ops::Range<usize> {
+        let last = &self.layers[self.layers.len() - 1];
+        last.at..last.end()
+    }
+
+    /// Multiplications of one sample forward; going back takes twice as many.
+    pub fn products(&self) -> usize {
+        self.layers.iter().map(Layer::weights).sum()
+    }
+
+    /// Random weights (He et al. 2015, uniform), zero biases, zeros where there is padding.
+    pub fn init(&self, rng: &mut Rng) -> Vec<f32> {
+        let mut parameters = vec![0.0; self.parameters()];
+        for (l, layer) in self.layers.iter().enumerate() {
+            let width = |real: usize, padded: usize| if real == 0 { padded } else { real };
+            let inputs = if l == 0 {
+                self.shape.inputs
+            } else {
+                width(self.shape.width, layer.inputs)
+            };
+            let last = l == self.shape.depth;
+            let outputs = if last { self.shape.outputs } else { self.shape.width };
+            let again = if layer.again > 0 { self.shape.inputs } else { 0 };
+            let bound = (if last { 3.0 } else { 6.0 } / (inputs + again) as f32).sqrt();
+            for i in (0..inputs).chain(layer.inputs..layer.inputs + again) {
+                for o in 0..outputs {
+                    parameters[layer.at + i * layer.outputs + o] = rng.range(-bound, bound);
+                }
+            }
+        }
+        parameters
+    }
+
+    /// The weights for going back, at the same places: going back is then going forward.
+    ///
+    /// A layer's tiles, `[(inputs + again) / 8, outputs, 8]`: see [`product`].
+    pub fn transposed<T: Scalar>(&self, parameters: &[T]) -> Vec<T> {
+        let mut turned = vec![T::default(); parameters.len()];
+        for layer in &self.layers {
+            let weights = &parameters[layer.at..layer.bias()];
+            let tiles = turned[layer.at..layer.bias()].as_chunks_mut::<ROWS>().0;
+            for (i, row) in weights.chunks_exact(layer.outputs).enumerate() {
+                for (o, w) in row.iter().enumerate() {
+                    tiles[i / ROWS * layer.outputs + o][i % ROWS] = *w;
+                }
+            }
+        }
+        turned
+    }
+
+    /// `tape.output()` of `x [panels, inputs, 32]`.
+    #[inline(always)]
+    pub fn forward<S: Simd>(&self, simd: S, parameters: &[Num<S>], x: &[Num<S>], tape: &mut MlpTape<Num<S>>) {
+        let panels = x.len() / (self.inputs() * PANEL);
+        tape.outputs.resize_with(self.layers.len(), Rows::default);
+        tape.gradients.resize_with(self.layers.len(), Rows::default);
+        // Layer after layer, so that a layer's weights stay in the cache for all panels.
+        for (l, layer) in self.layers.iter().enumerate() {
+            pack(&parameters[layer.at..layer.bias()], layer.outputs, &mut tape.packed);
+            let (before, after) = tape.outputs.split_at_mut(l);
+            let from = before.last().map_or(x, |hidden| hidden);
+            after[0].resize(panels * layer.outputs * PANEL, Default::default());
+            let bias = Begin::Bias(&parameters[layer.bias()..layer.end()]);
+            let finish = if l + 1 == self.layers.len() {
+                Finish::Keep
+            } else {
+                Finish::Relu
+            };
+            for (p, to) in after[0].chunks_exact_mut(layer.outputs * PANEL).enumerate() {
+                let from = [panel(from, layer.inputs, p), panel(x, layer.again, p)];
+                product(simd, &tape.packed, from, bias, finish, to);
+            }
+        }
+    }
+
+    /// Goes back: adds to `grads` (flat, as the parameters) and writes the input's gradient to `v_x`, where it is wanted.
+    ///
+    /// `turned` is [`Self::transposed`]; `x` and `tape` are those of [`Self::forward`], with
+    /// [`MlpTape::output_gradient`] filled, zero in the padding rows.
+    #[inline(always)]
+    pub fn backward<S: Simd>(
+        &self,
+        simd: S,
+        turned: &[Num<S>],
+        x: &[Num<S>],
+        tape: &mut MlpTape<Num<S>>,
+        grads: &mut [Num<S>],
+        v_x: Option<&mut Rows<Num<S>>>,
+    ) {
+        self.pull_back(simd, turned, tape, v_x);
+        for (l, layer) in self.layers.iter().enumerate() {
+            let from = if l == 0 { x } else { &tape.outputs[l - 1] };
+            let from = [(from, layer.inputs), (x, layer.again)];
+            let v = (&tape.gradients[l][..], layer.outputs);
+            outer(simd, from, v, &mut tape.packed, &mut grads[layer.at..layer.end()]);
+        }
+    }
+
+    /// The half of [`Self::backward`] that needs no parameters' gradients: the gradients of all activations, and of the input.
+    #[inline(always)]
+    pub fn pull_back<S: Simd>(
+        &self,
+        simd: S,
+        turned: &[Num<S>],
+        tape: &mut MlpTape<Num<S>>,
+        mut v_x: Option<&mut Rows<Num<S>>>,
+    ) {
+        let panels = tape.output().len() / (self.outputs() * PANEL);
+        if let Some(v_x) = &mut v_x {
+            v_x.resize(panels * self.inputs() * PANEL, Default::default());
+        }
+        let mut begin = Begin::Zero;
+        for (l, layer) in self.layers.iter().enumerate().rev() {
+            let (before, after) = tape.gradients.split_at_mut(l);
+            let v = |p| [panel(&after[0], layer.outputs, p), &[]];
+            let turned = &turned[layer.at..layer.bias()];
+            let (to_hidden, to_input) = turned.split_at(if l == 0 { 0 } else { layer.inputs * layer.outputs });
+            if let Some(v_hidden) = before.last_mut() {
+                let hidden = &tape.outputs[l - 1];
+                v_hidden.resize(hidden.len(), Default::default());
+                for (p, to) in v_hidden.chunks_exact_mut(layer.inputs * PANEL).enumerate() {
+                    let mask = Finish::Mask(panel(hidden, layer.inputs, p));
+                    product(simd, to_hidden, v(p), Begin::Zero, mask, to);
+                }
+            }
+            if let (false, Some(v_x)) = (to_input.is_empty(), &mut v_x) {
+                for (p, to) in v_x.chunks_exact_mut(self.inputs() * PANEL).enumerate() {
+                    product(simd, to_input, v(p), begin, Finish::Keep, to);
+                }
+                begin = Begin::Add;
+            }
+        }
+    }
+}
+
+/// Panel `p` of `rows [panels, count, 32]`.
+#[inline(always)]
+fn panel<T>(rows: &[T], count: usize, p: usize) -> &[T] {
+    &rows[p * count * PANEL..(p + 1) * count * PANEL]
+}

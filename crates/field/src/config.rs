@@ -1,8 +1,9 @@
 //! What a field's shape depends on.
 
 use crate::FieldError;
+use crate::background::{MAX_DEGREE, numbers};
 use crate::encoding::{DirectionEncoding, Frequency, HashGrid, PositionEncoding};
-use crate::net::{Activation, ColorShape, NetShape};
+use crate::net::{Activation, ColorShape, Net, NetShape};
 use crate::sample::march::Steps;
 use serde::{Deserialize, Serialize};
 
@@ -57,7 +58,13 @@ pub struct FieldConfig {
     pub sampler: Sampler,
     /// Photographs with an appearance code each, where [`ColorShape::appearance`] is not 0.
     pub images: usize,
+    /// Degree in direction, 0 to 3, of a background that is learnt with the field; `None`: what lies behind is given.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub background_degree: Option<u32>,
 }
+
+/// The most samples of a ray in a round.
+const MOST_SAMPLES: usize = 1 << 16;
 
 impl FieldConfig {
     /// Instant-NGP's shape at sizes for processors: 8 levels of 4 features in tables of 2^15 corners, hidden layers of 32.
@@ -94,6 +101,7 @@ impl FieldConfig {
                 decay: 0.8,
             }),
             images: 0,
+            background_degree: None,
         }
     }
 
@@ -117,6 +125,7 @@ impl FieldConfig {
             },
             sampler: Sampler::Hierarchy { coarse, fine },
             images: 0,
+            background_degree: None,
         }
     }
 
@@ -143,13 +152,55 @@ impl FieldConfig {
         }
     }
 
+    /// Numbers that [`crate::Field::tensors`] holds: what is trained, and the occupancy grid.
+    pub fn numbers(&self) -> usize {
+        let nets = self.nets().into_iter().map(|shape| Net::new(shape).sizes());
+        let grid = match &self.sampler {
+            Sampler::Occupancy(o) => o.side.pow(3),
+            _ => 0,
+        };
+        nets.flatten().sum::<usize>() + self.images * self.appearance() + numbers(self.background_degree) + grid
+    }
+
     /// Whether all sizes can be.
     ///
     /// # Errors
     /// The first that cannot.
     pub fn check(&self) -> Result<(), FieldError> {
         let wrong = |what, value: String, hint| Err(FieldError::Config { what, value, hint });
+        if let Some(degree) = self.background_degree.filter(|degree| *degree > MAX_DEGREE) {
+            return wrong("degree of the background", degree.to_string(), "say 0 to 3");
+        }
+        // Beyond these a file that says so is broken, and sums of sizes could overflow.
+        let limits = |net: &NetShape| {
+            let octaves = match net.encoding {
+                PositionEncoding::Frequency(f) => f.octaves,
+                PositionEncoding::HashGrid(_) => 0,
+            };
+            let toward = match net.color.map(|color| color.direction) {
+                Some(DirectionEncoding::Frequency(f)) => f.octaves,
+                _ => 0,
+            };
+            let color = net.color.map_or([0; 3], |c| [c.width, c.depth, c.appearance]);
+            [
+                ("width of a hidden layer", net.width, 4096, "say at most 4096"),
+                ("number of hidden layers", net.depth, 64, "say at most 64"),
+                ("geometry", net.geometry, 4096, "say at most 4096"),
+                ("octaves", octaves.max(toward), 32, "say at most 32"),
+                ("width of a colour layer", color[0], 4096, "say at most 4096"),
+                ("number of colour layers", color[1], 64, "say at most 64"),
+                ("appearance code", color[2], 4096, "say at most 4096"),
+            ]
+        };
+        if self.images > 1 << 24 {
+            return wrong("number of images", self.images.to_string(), "say at most 2^24");
+        }
         for net in self.nets() {
+            for (what, value, most, hint) in limits(&net) {
+                if value > most {
+                    return wrong(what, value.to_string(), hint);
+                }
+            }
             if let PositionEncoding::HashGrid(g) = &net.encoding {
                 if ![1, 2, 4, 8].contains(&g.features) {
                     return wrong("features of a level", g.features.to_string(), "say 1, 2, 4 or 8");
@@ -176,6 +227,14 @@ impl FieldConfig {
                         "say a multiple of 8",
                     );
                 }
+                if color.appearance != self.appearance() {
+                    let value = color.appearance.to_string();
+                    return wrong(
+                        "appearance code",
+                        value,
+                        "say the same for all networks that know colour",
+                    );
+                }
                 if color.appearance > 0 && self.images == 0 {
                     return wrong("number of images", "0".into(), "appearance codes need one an image");
                 }
@@ -198,13 +257,15 @@ impl FieldConfig {
                 }
             }
             Sampler::Hierarchy { coarse, fine } => {
-                if *coarse < 2 || *fine < 1 {
-                    return wrong("samples", format!("{coarse} + {fine}"), "say at least 2 and 1");
+                if !(2..=MOST_SAMPLES).contains(coarse) || !(1..=MOST_SAMPLES).contains(fine) {
+                    let value = format!("{coarse} + {fine}");
+                    return wrong("samples", value, "say at least 2 and 1, and at most 65536");
                 }
             }
             Sampler::Proposal { rounds, last } => {
-                if *last < 2 || rounds.is_empty() || rounds.iter().any(|(_, n)| *n < 2) {
-                    return wrong("samples of a round", last.to_string(), "say a round and at least 2");
+                let mut counts = rounds.iter().map(|(_, n)| n).chain([last]);
+                if rounds.is_empty() || counts.any(|n| !(2..=MOST_SAMPLES).contains(n)) {
+                    return wrong("samples of a round", last.to_string(), "say a round and 2 to 65536");
                 }
             }
             Sampler::Given { .. } => {}

@@ -1,5 +1,6 @@
 //! A radiance field and its numbers.
 
+use crate::background::{background_color, numbers};
 use crate::config::{FieldConfig, Sampler};
 use crate::net::{Net, NetParameters, NetShape};
 use crate::sample::OccupancyGrid;
@@ -45,6 +46,8 @@ pub struct Field {
     pub parameters: Vec<NetParameters<f32>>,
     /// Appearance codes `[images, appearance]`.
     pub codes: Vec<f32>,
+    /// The background's harmonics `[(degree + 1)^2, 3]`, empty where none is learnt: see [`crate::background_color`].
+    pub background: Vec<f32>,
     /// Where something is, for [`Sampler::Occupancy`].
     pub occupancy: Option<OccupancyGrid>,
 }
@@ -67,12 +70,14 @@ impl Field {
             Sampler::Occupancy(o) => Some(OccupancyGrid::new(o.side)),
             _ => None,
         };
+        let background = vec![0.0; numbers(config.background_degree)];
         Ok(Self {
             config,
             space,
             nets,
             parameters,
             codes: vec![0.0; codes],
+            background,
             occupancy,
         })
     }
@@ -90,7 +95,7 @@ impl Field {
     /// Numbers that are trained.
     pub fn len(&self) -> usize {
         let net = |p: &NetParameters<f32>| p.table.len() + p.density.len() + p.color.len();
-        self.parameters.iter().map(net).sum::<usize>() + self.codes.len()
+        self.parameters.iter().map(net).sum::<usize>() + self.codes.len() + self.background.len()
     }
 
     /// Whether there are none; never so.
@@ -100,7 +105,7 @@ impl Field {
 
     /// Names and values of everything that makes the field: enough to render it again with its configuration and space.
     pub fn tensors(&self) -> Tensors<'_> {
-        let mut list = named("", &self.parameters, &self.codes);
+        let mut list = named("", &self.parameters, [&self.codes, &self.background]);
         if let Some(grid) = &self.occupancy {
             list.push(("occupancy".into(), vec![grid.side; 3], &grid.density));
         }
@@ -117,7 +122,8 @@ impl Field {
         mut get: impl FnMut(&str) -> Option<Vec<f32>>,
     ) -> Result<Self, FieldError> {
         let mut field = Self::new(config, space, 0)?;
-        fill("", &mut field.parameters, &mut field.codes, &mut get)?;
+        let lists = [&mut field.codes, &mut field.background];
+        fill("", &mut field.parameters, lists.map(Vec::as_mut_slice), &mut get)?;
         if let Some(grid) = &mut field.occupancy {
             let mut density = grid.density.clone();
             fill_one("occupancy", &mut density, &mut get)?;
@@ -134,6 +140,11 @@ impl Field {
         self.codes
             .get(at..at.saturating_add(size))
             .map_or_else(|| vec![0.0; size], <[f32]>::to_vec)
+    }
+
+    /// What the field has learnt to lie behind everything in the unit world `direction`, sRGB; `None` where it has not.
+    pub(crate) fn behind(&self, direction: [f32; 3]) -> Option<[f32; 3]> {
+        (!self.background.is_empty()).then(|| background_color(&self.background, direction))
     }
 
     /// The networks' weights turned over, for going back.

@@ -6,6 +6,7 @@
 //! checkpoint from which the run goes on bit by bit.
 #![forbid(unsafe_code)]
 
+mod background;
 mod batch;
 mod config;
 pub mod contraction;
@@ -25,7 +26,8 @@ mod tensors;
 mod to_points;
 mod train;
 
-pub use batch::{Background, RayBatch, TrainView};
+pub use background::{background_color, background_vjp};
+pub use batch::{Background, Draw, KnownDepth, RayBatch, TrainView};
 pub use config::{FieldConfig, Occupancy, Sampler};
 pub use field::{Field, FieldError};
 pub use look::{color_at, density_at, update_occupancy};

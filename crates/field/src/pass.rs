@@ -56,18 +56,17 @@ impl Pass {
         self.starts[r]..self.starts[r + 1]
     }
 
-    /// Colour, alpha and mean distance of ray `r`, before any background.
-    pub fn composite(&self, r: usize) -> ([f32; 3], f32, f32) {
-        let (mut color, mut distance) = ([0.0; 3], 0.0);
+    /// Colour and alpha of ray `r`, before any background.
+    pub fn composite(&self, r: usize) -> ([f32; 3], f32) {
+        let mut color = [0.0; 3];
         for i in self.of(r) {
             let w = self.weights[i];
             let rgb = get3(&self.block.rgb, i);
             for c in 0..3 {
                 color[c] += w * rgb[c];
             }
-            distance += w * self.middles[i];
         }
-        (color, 1.0 - self.behind[r], distance)
+        (color, 1.0 - self.behind[r])
     }
 
     /// The sample at which half of ray `r` is covered.

@@ -15,6 +15,8 @@ pub struct FieldState {
     pub moments: [Vec<NetParameters<f32>>; 2],
     /// First and second moments of the codes.
     pub code_moments: [Vec<f32>; 2],
+    /// First and second moments of the background.
+    pub background_moments: [Vec<f32>; 2],
     /// Steps made.
     pub step: u64,
     /// Rays of the next batch that [`crate::train_views`] draws.
@@ -27,10 +29,11 @@ impl FieldState {
     /// Nothing trained yet.
     pub fn new(field: Field) -> Self {
         let zeros: Vec<_> = field.parameters.iter().map(NetParameters::zeros_like).collect();
-        let codes = vec![0.0; field.codes.len()];
+        let nothing = |list: &[f32]| [0, 1].map(|_| vec![0.0; list.len()]);
         Self {
             moments: [zeros.clone(), zeros],
-            code_moments: [codes.clone(), codes],
+            code_moments: nothing(&field.codes),
+            background_moments: nothing(&field.background),
             step: 0,
             rays: FIRST_RAYS,
             scratch: crate::train::Scratch::default(),
@@ -43,7 +46,8 @@ impl FieldState {
     pub fn tensors(&self) -> Tensors<'_> {
         let mut list = self.field.tensors();
         for (k, prefix) in PREFIXES.into_iter().enumerate() {
-            list.extend(named(prefix, &self.moments[k], &self.code_moments[k]));
+            let lists = [&self.code_moments[k][..], &self.background_moments[k]];
+            list.extend(named(prefix, &self.moments[k], lists));
         }
         list
     }
@@ -61,7 +65,8 @@ impl FieldState {
     ) -> Result<Self, FieldError> {
         let mut state = Self::new(Field::from_tensors(config, space, &mut get)?);
         for (k, prefix) in PREFIXES.into_iter().enumerate() {
-            fill(prefix, &mut state.moments[k], &mut state.code_moments[k], &mut get)?;
+            let lists = [&mut state.code_moments[k][..], &mut state.background_moments[k]];
+            fill(prefix, &mut state.moments[k], lists, &mut get)?;
         }
         (state.step, state.rays) = (step, rays);
         Ok(state)

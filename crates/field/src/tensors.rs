@@ -6,7 +6,11 @@ use crate::net::NetParameters;
 /// Name, shape and values, row after row.
 pub type Tensors<'a> = Vec<(String, Vec<usize>, &'a [f32])>;
 
-pub(crate) fn named<'a>(prefix: &str, nets: &'a [NetParameters<f32>], codes: &'a [f32]) -> Tensors<'a> {
+/// What is learnt beside the networks.
+const LISTS: [&str; 2] = ["codes", "background"];
+
+/// `lists` are those of [`LISTS`].
+pub(crate) fn named<'a>(prefix: &str, nets: &'a [NetParameters<f32>], lists: [&'a [f32]; 2]) -> Tensors<'a> {
     let mut list = Vec::new();
     for (i, net) in nets.iter().enumerate() {
         for (part, values) in [("table", &net.table), ("density", &net.density), ("color", &net.color)] {
@@ -15,8 +19,10 @@ pub(crate) fn named<'a>(prefix: &str, nets: &'a [NetParameters<f32>], codes: &'a
             }
         }
     }
-    if !codes.is_empty() {
-        list.push((format!("{prefix}codes"), vec![codes.len()], codes));
+    for (name, values) in LISTS.into_iter().zip(lists) {
+        if !values.is_empty() {
+            list.push((format!("{prefix}{name}"), vec![values.len()], values));
+        }
     }
     list
 }
@@ -24,7 +30,7 @@ pub(crate) fn named<'a>(prefix: &str, nets: &'a [NetParameters<f32>], codes: &'a
 pub(crate) fn fill(
     prefix: &str,
     nets: &mut [NetParameters<f32>],
-    codes: &mut [f32],
+    lists: [&mut [f32]; 2],
     get: &mut impl FnMut(&str) -> Option<Vec<f32>>,
 ) -> Result<(), FieldError> {
     for (i, net) in nets.iter_mut().enumerate() {
@@ -37,7 +43,10 @@ pub(crate) fn fill(
             fill_one(&format!("{prefix}net{i}.{part}"), values, get)?;
         }
     }
-    fill_one(&format!("{prefix}codes"), codes, get)
+    for (name, values) in LISTS.into_iter().zip(lists) {
+        fill_one(&format!("{prefix}{name}"), values, get)?;
+    }
+    Ok(())
 }
 
 pub(crate) fn fill_one(

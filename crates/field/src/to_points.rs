@@ -107,7 +107,7 @@ fn meet(field: &Field, cameras: &[Camera], options: &PointsOptions, chunk: u64, 
         let taken = trace(Level::detect(), field, &rays[at..], &[], None, passes);
         let pass = &passes[passes.len() - 1];
         for r in 0..taken {
-            let (color, alpha, _) = pass.composite(r);
+            let (color, alpha) = pass.composite(r);
             if let (Some(i), true) = (pass.median(r), alpha >= options.alpha) {
                 hits.push(Hit {
                     unit: field.space.unit(rays[at + r].at(pass.middles[i])),

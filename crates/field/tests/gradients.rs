@@ -2,7 +2,6 @@
 //! are generic over lanes, and here a lane is one `f64`.
 
 use irradia_compute::simd::Double;
-use irradia_field::Rows;
 use irradia_field::contraction::{contract, contract_vjp, uncontract};
 use irradia_field::encoding::direction::{harmonics, harmonics_vjp};
 use irradia_field::encoding::{DirectionEncoding, Frequency, HashGrid, PositionEncoding};
@@ -10,6 +9,7 @@ use irradia_field::mlp::{Mlp, MlpShape, MlpTape, PANEL};
 use irradia_field::net::{Activation, Block, ColorShape, Net, NetParameters, NetShape, get3, place, set3};
 use irradia_field::render::quadrature::{weights, weights_vjp};
 use irradia_field::sample::proposal::{distortion, interlevel};
+use irradia_field::{Rows, background_color, background_vjp};
 use irradia_scene::Rng;
 
 /// Steps of the differences; their error is of its square, 1e-10, beside rounding of 1e-16 / 1e-5.
@@ -404,6 +404,27 @@ fn compositing() {
     let mut gradient = vec![0.0; 12];
     weights_vjp(&through, &w, &v, counted, &mut gradient);
     check("thickness", &thickness, &gradient, 0..12, |t| dot(&forward(t).1, &v));
+}
+
+#[test]
+fn learnt_backgrounds_of_every_degree() {
+    for degree in 0..=3usize {
+        let mut rng = Rng::new(12, degree as u64);
+        let coefficients = random(&mut rng, 3 * (degree + 1).pow(2), -1.0, 1.0);
+        let d = glam::DVec3::new(rng.normal().into(), rng.normal().into(), rng.normal().into()).normalize();
+        let v: [f64; 3] = std::array::from_fn(|_| f64::from(rng.range(-1.0, 1.0)));
+        let color = background_color(&coefficients, d.to_array());
+        let mut gradient = vec![0.0; coefficients.len()];
+        background_vjp(color, d.to_array(), v, &mut gradient);
+        check("background", &coefficients, &gradient, 0..coefficients.len(), |c| {
+            dot(&background_color(c, d.to_array()), &v)
+        });
+    }
+    assert_eq!(
+        background_color(&[0.0; 12], [0.0, 0.0, 1.0]),
+        [0.5; 3],
+        "grey before training"
+    );
 }
 
 #[test]

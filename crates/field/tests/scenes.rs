@@ -54,6 +54,7 @@ fn even(x: f32, where_to: impl Fn([usize; 3]) -> bool) -> Field {
             decay: 0.95,
         }),
         images: 0,
+        background_degree: None,
     };
     let mut field = Field::new(config, Space::cube([0.0; 3], 1.0), 0).unwrap();
     for parameters in &mut field.parameters {

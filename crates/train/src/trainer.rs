@@ -10,7 +10,7 @@ use crate::residual;
 use crate::schedule::{Clock, Round, Signal, StepPlan, coming_views, plan};
 use cpu_time::ProcessTime;
 use irradia_compute::adam::AdamStep;
-use irradia_field::{FieldError, FieldState};
+use irradia_field::{FieldError, FieldState, KnownDepth};
 use irradia_measure::{DepthSample, Lpips};
 use irradia_scene::{Camera, Dataset, LoadError, PointCloud, Rng, View, sh};
 use irradia_splat::densify::{DensityChange, classic, fast, mcmc, merge, taming};
@@ -19,6 +19,7 @@ use irradia_splat::{
     Gather, RenderOptions, Renderer, SplatGradients, SplatState, Splats, Statistics, ViewParams, filter, regularize,
 };
 use std::borrow::Cow;
+use std::collections::HashMap;
 use std::sync::Arc;
 use std::time::Instant;
 
@@ -110,6 +111,8 @@ pub struct Trainer {
     /// Never more splats than this: the recipe's limits for this data.
     pub cap: usize,
     pub(crate) photos: PhotoCache,
+    /// What is known of depth in the views that a field is trained on, by view, width and height.
+    pub(crate) depths: HashMap<(usize, u32, u32), Arc<[KnownDepth]>>,
     pub(crate) renderer: Renderer,
     objective: Objective,
     pub(crate) gradients: SplatGradients,
@@ -147,6 +150,7 @@ impl Trainer {
             extent: init::camera_extent(&cameras),
             photos: PhotoCache::new(dataset.clone(), recipe.render.background, options.photo_budget),
             cap: cap(&recipe, &cameras),
+            depths: HashMap::new(),
             renderer: Renderer::new(),
             objective: Objective::new(options.lpips.clone()),
             gradients: SplatGradients::default(),
@@ -457,7 +461,7 @@ impl Trainer {
     }
 
     /// Depths of the points that view number `view` is known to see, where the plan has a use for them.
-    fn known_depths(&self, view: usize, camera: &Camera, plan: &StepPlan) -> Vec<DepthSample> {
+    pub(crate) fn known_depths(&self, view: usize, camera: &Camera, plan: &StepPlan) -> Vec<DepthSample> {
         let Some(points) = self.dataset.points.as_ref().filter(|_| plan.losses.depth > 0.0) else {
             return Vec::new();
         };

@@ -12,7 +12,7 @@ use rayon::prelude::*;
 /// How a view is rendered.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct RenderOptions {
-    /// What lies behind the field, sRGB in \[0, 1\].
+    /// What lies behind the field, sRGB in \[0, 1\], unless it has learnt that itself.
     pub background: [f32; 3],
     /// The photograph whose appearance code is used; the mean code, zero, where there is none.
     pub image: Option<u32>,
@@ -94,7 +94,7 @@ pub fn render_view(field: &Field, camera: &Camera, options: &RenderOptions) -> F
 
 /// Red, green, blue, alpha, mean and median depth and the normal of ray `r`.
 fn pixel(field: &Field, pass: &Pass, r: usize, (ray, cosine): &(Ray, f32), options: &RenderOptions) -> [f32; 9] {
-    let (color, alpha, _) = pass.composite(r);
+    let (color, alpha) = pass.composite(r);
     let depth_at = |i: usize| cosine * ray.world_distance(pass.middles[i]);
     let mut depth = 0.0;
     let mut normal = Vec3::ZERO;
@@ -106,7 +106,8 @@ fn pixel(field: &Field, pass: &Pass, r: usize, (ray, cosine): &(Ray, f32), optio
             normal -= pass.weights[i] * slope.normalize_or_zero();
         }
     }
-    let color: [f32; 3] = std::array::from_fn(|c| color[c] + pass.behind[r] * options.background[c]);
+    let background = field.behind(ray.view).unwrap_or(options.background);
+    let color: [f32; 3] = std::array::from_fn(|c| color[c] + pass.behind[r] * background[c]);
     let depth = if alpha > 0.0 { depth / alpha } else { 0.0 };
     let median = pass.median(r).map_or(0.0, depth_at);
     let [x, y, z] = normal.normalize_or_zero().to_array();

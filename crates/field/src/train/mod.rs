@@ -5,7 +5,7 @@
 //! tables' gradients are scattered afterwards, each level by one task that walks all samples in their order: no locks, no
 //! atomics, and the same bits for any number of threads.
 
-use crate::batch::{Background, RayBatch, TrainView};
+use crate::batch::{Background, Draw, RayBatch, TrainView};
 use crate::field::Field;
 use crate::look::update_occupancy;
 use crate::state::FieldState;
@@ -32,7 +32,7 @@ pub(crate) const STREAM_LOOK: u64 = 0xff;
 pub struct StepOptions {
     /// Learning rate of tables; 0.01 in Instant-NGP.
     pub table_rate: f32,
-    /// Learning rate of networks; 0.01 in Instant-NGP, 0.0005 in NeRF.
+    /// Learning rate of networks and of the background; 0.01 in Instant-NGP, 0.0005 in NeRF.
     pub net_rate: f32,
     /// Learning rate of appearance codes.
     pub code_rate: f32,
@@ -42,9 +42,10 @@ pub struct StepOptions {
     pub interlevel: f32,
     /// Weight of the distortion loss; 0.01 in mip-NeRF 360.
     pub distortion: f32,
-    /// Weight of the squared error of distance, field units, where a ray's is known.
+    /// Weight of the mean squared error of distance, over the rays whose distance is known, in the measure in which samples
+    /// are spread ([`crate::Space::spread`]): field units, and disparity in the far part of a contracted world.
     pub depth: f32,
-    /// What lies behind a photograph that has alpha.
+    /// What lies behind photographs; behind one that has no alpha only where the field does not learn that itself.
     pub background: Background,
     /// Samples that [`train_views`] chooses the number of rays for; 2^18 in Instant-NGP.
     pub samples: usize,
@@ -99,13 +100,24 @@ pub(crate) struct Scratch {
 const LOOK_ONE_IN: u32 = 16;
 /// The fewest and the most rays of a batch.
 const RAYS: [usize; 2] = [64, 16_384];
+/// One in so many rays goes through a pixel of known depth where that counts.
+const KNOWN_ONE_IN: usize = 4;
 
 /// One whole step on photographs: draws [`FieldState::rays`] rays, trains on them, keeps the occupancy grid up to date and sets
 /// the number of rays for next time such that they make about `options.samples` samples.
 pub fn train_views(state: &mut FieldState, views: &[TrainView], options: &StepOptions) -> StepLoss {
     let mut batch = std::mem::take(&mut state.scratch.batch);
     let mut rng = Rng::new(options.seed, (state.step << 8) + STREAM_RAYS);
-    batch.draw(views, state.rays, options.background, &state.field.space, &mut rng);
+    let what = Draw {
+        rays: state.rays,
+        known: if options.depth > 0.0 {
+            state.rays / KNOWN_ONE_IN
+        } else {
+            0
+        },
+        background: options.background,
+    };
+    batch.draw(views, &what, &state.field.space, &mut rng);
     let loss = train_step(state, &batch, options);
     state.scratch.batch = batch;
     if options.look && loss.rays > 0 {
@@ -134,7 +146,7 @@ pub fn train_step(state: &mut FieldState, batch: &RayBatch, options: &StepOption
     loss
 }
 
-/// Leaves every gradient in `scratch`: the networks' and the codes' in its first worker, the tables' with their points.
+/// Leaves every gradient in `scratch`: those of networks, codes and background in its first worker, the tables' with their points.
 fn gradients(
     level: Level,
     field: &Field,
@@ -144,12 +156,14 @@ fn gradients(
     scratch: &mut Scratch,
 ) -> StepLoss {
     let turned = field.turned();
+    let known = batch.depths.iter().filter(|depth| **depth > 0.0).count();
     let task = Task {
         level,
         field,
         turned: &turned,
         batch,
         options,
+        depth: options.depth / known.max(1) as f32,
     };
     let n = batch.rays.len();
     scratch.workers.par_iter_mut().enumerate().for_each(|(group, worker)| {
@@ -179,6 +193,7 @@ fn add_up(workers: &mut [Worker]) -> StepLoss {
             add(&mut to.color, &from.color);
         }
         add(&mut sum.codes, &worker.codes);
+        add(&mut sum.background, &worker.background);
     }
     loss
 }

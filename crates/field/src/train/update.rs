@@ -22,6 +22,7 @@ pub(super) fn update(
         field,
         moments: [firsts, seconds],
         code_moments: [code_first, code_second],
+        background_moments: [background_first, background_second],
         ..
     } = state;
     let (workers, tables) = (&scratch.workers, &mut scratch.tables);
@@ -103,6 +104,15 @@ pub(super) fn update(
         rate: options.code_rate,
         step,
         sparse: true,
+    });
+    level.run(Adam {
+        parameters: &mut field.background,
+        gradients: &workers[0].background,
+        first: background_first,
+        second: background_second,
+        rate: options.net_rate,
+        step,
+        sparse: false,
     });
 }
 

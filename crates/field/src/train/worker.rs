@@ -1,6 +1,7 @@
 //! What one group of a batch's rays goes through: forward, losses, and the way back.
 
 use super::{StepLoss, StepOptions};
+use crate::background::background_vjp;
 use crate::batch::RayBatch;
 use crate::config::Sampler;
 use crate::encoding::PositionEncoding;
@@ -21,6 +22,7 @@ pub(super) struct Worker {
     pub(super) block: Block<f32>,
     pub grads: Vec<NetParameters<f32>>,
     pub codes: Vec<f32>,
+    pub background: Vec<f32>,
     /// For each network the points and the gradients of their encodings, panel after panel.
     pub stored: Vec<[Vec<f32>; 2]>,
     v_weights: Vec<f32>,
@@ -35,6 +37,43 @@ pub(super) struct Task<'a> {
     pub turned: &'a [NetParameters<f32>],
     pub batch: &'a RayBatch,
     pub options: &'a StepOptions,
+    /// Weight of one ray's squared error of distance in the sum over all.
+    pub depth: f32,
+}
+
+/// How well a ray's colour is met.
+struct Score {
+    /// Mean squared error.
+    squares: f32,
+    /// What lay behind.
+    background: [f32; 3],
+    /// The gradient of the batch's mean by the colour.
+    v_color: [f32; 3],
+}
+
+impl Task<'_> {
+    /// Compares ray `ray`, of which `color` is met and `behind` gets through; adds to the gradient of the learnt background.
+    fn score(&self, ray: usize, color: [f32; 3], behind: f32, v_background: &mut [f32]) -> Score {
+        let batch = self.batch;
+        let share = 1.0 / batch.rays.len() as f32;
+        let view = batch.rays[ray].view;
+        let learnt = if batch.opaque[ray] {
+            self.field.behind(view)
+        } else {
+            None
+        };
+        let background = learnt.unwrap_or(batch.backgrounds[ray]);
+        let error: [f32; 3] = std::array::from_fn(|c| color[c] + behind * background[c] - batch.targets[ray][c]);
+        let v_color = error.map(|e| 2.0 / 3.0 * e * share);
+        if learnt.is_some() {
+            background_vjp(background, view, v_color.map(|v| v * behind), v_background);
+        }
+        Score {
+            squares: error.iter().map(|e| e * e / 3.0).sum(),
+            background,
+            v_color,
+        }
+    }
 }
 
 impl Worker {
@@ -45,6 +84,8 @@ impl Worker {
         self.stored.iter_mut().flatten().for_each(Vec::clear);
         self.codes.clear();
         self.codes.resize(field.codes.len(), 0.0);
+        self.background.clear();
+        self.background.resize(field.background.len(), 0.0);
         if self.grads.len() == field.nets.len() {
             for grads in &mut self.grads {
                 grads.density.fill(0.0);
@@ -80,7 +121,7 @@ impl Worker {
         let n = pass.block.len;
         if n == 0 {
             if with_color {
-                self.score_empty(batch, range, last);
+                self.score_empty(task, range, last);
             }
             return;
         }
@@ -96,35 +137,28 @@ impl Worker {
         for (r, ray) in range.clone().enumerate() {
             let samples = pass.of(r);
             if with_color {
-                let (color, _, distance) = pass.composite(r);
-                let background = batch.backgrounds[ray];
-                let mut v_color = [0.0; 3];
-                let mut squares = 0.0;
-                for c in 0..3 {
-                    let error = color[c] + pass.behind[r] * background[c] - batch.targets[ray][c];
-                    squares += error * error / 3.0;
-                    v_color[c] = 2.0 / 3.0 * error * share;
-                }
-                // What is known of the distance counts as far as the ray ends in the field.
-                let known = batch.depths.get(ray).copied().unwrap_or(0.0);
-                let mut v_distance = 0.0;
-                let mut depth = 0.0;
-                if known > 0.0 && task.options.depth > 0.0 {
-                    let error = distance + pass.behind[r] * known - known;
-                    depth = task.options.depth * error * error;
-                    v_distance = 2.0 * task.options.depth * error * share;
-                }
+                let Score {
+                    squares,
+                    background,
+                    v_color,
+                } = task.score(ray, pass.composite(r).0, pass.behind[r], &mut self.background);
                 for i in samples.clone() {
                     let rgb = get3(&pass.block.rgb, i);
-                    let mut v = v_distance * (pass.middles[i] - known);
-                    for c in 0..3 {
-                        v += v_color[c] * (rgb[c] - background[c]);
-                    }
-                    v_weights[i] = v;
+                    v_weights[i] = (0..3).map(|c| v_color[c] * (rgb[c] - background[c])).sum();
                     set3(&mut pass.block.v_rgb, i, v_color.map(|v| v * pass.weights[i]));
                 }
+                let known = batch.depths.get(ray).copied().unwrap_or(0.0);
+                if known > 0.0 && task.depth > 0.0 {
+                    // As far as the ray ends in the field: what gets through is left out of the mean.
+                    let beyond = |i: usize| field.space.spread(pass.middles[i]) - field.space.spread(known);
+                    let error: f32 = samples.clone().map(|i| pass.weights[i] * beyond(i)).sum();
+                    for i in samples.clone() {
+                        v_weights[i] += 2.0 * task.depth * error * beyond(i);
+                    }
+                    self.loss.total += f64::from(task.depth * error * error / share);
+                }
                 self.loss.color += if last { f64::from(squares) } else { 0.0 };
-                self.loss.total += f64::from(squares + depth);
+                self.loss.total += f64::from(squares);
             }
             let Sampler::Proposal { rounds, last: count } = &field.config.sampler else {
                 continue;
@@ -189,11 +223,9 @@ impl Worker {
     }
 
     /// The loss of rays that meet nothing.
-    fn score_empty(&mut self, batch: &RayBatch, range: std::ops::Range<usize>, last: bool) {
+    fn score_empty(&mut self, task: &Task, range: std::ops::Range<usize>, last: bool) {
         for ray in range {
-            let squares: f32 = (0..3)
-                .map(|c| (batch.backgrounds[ray][c] - batch.targets[ray][c]).powi(2) / 3.0)
-                .sum();
+            let squares = task.score(ray, [0.0; 3], 1.0, &mut self.background).squares;
             self.loss.color += if last { f64::from(squares) } else { 0.0 };
             self.loss.total += f64::from(squares);
         }

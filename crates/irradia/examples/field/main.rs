@@ -77,7 +77,7 @@ fn train(args: &[String]) -> Result<()> {
             alpha: planes[image].1.as_deref(),
             over: behind,
             mask: photos[image].mask.as_deref(),
-            depth: None,
+            depths: &[],
             image: image as u32,
         })
         .collect();

@@ -18,6 +18,10 @@ pub struct FieldKnobs {
     /// Splats that a later stage of splats begins with at most; 0 without such a stage.
     #[serde(default)]
     pub points: usize,
+    /// Degree in direction, 0 to 3, of a background that is learnt with the field, for photographs without alpha; absent: what
+    /// lies behind is fixed or random.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub background_degree: Option<u32>,
     /// The network that gives out colour.
     pub net: NetShape,
     /// Where along a ray samples lie.
@@ -64,8 +68,9 @@ pub enum FieldSpace {
 }
 
 impl FieldKnobs {
-    /// For `images` photographs in `space`: steps grow with distance only where space is unbounded.
-    pub fn config(&self, images: usize, space: &Space) -> FieldConfig {
+    /// For `images` photographs in `space`: steps grow with distance only where space is unbounded, and of what lies behind
+    /// photographs with alpha (`transparent`) there is nothing to learn.
+    pub fn config(&self, images: usize, space: &Space, transparent: bool) -> FieldConfig {
         let mut sampler = self.sampler.clone();
         if let (Sampler::Occupancy(occupancy), false) = (&mut sampler, space.outside == Outside::Contracted) {
             occupancy.steps.cone = 0.0;
@@ -74,6 +79,7 @@ impl FieldKnobs {
             net: self.net,
             sampler,
             images,
+            background_degree: self.background_degree.filter(|_| !transparent),
         }
     }
 
@@ -84,7 +90,7 @@ impl FieldKnobs {
         if matches!(self.sampler, Sampler::Given { .. }) {
             return Err("field.sampler cannot be given points: say occupancy, hierarchy or proposal".into());
         }
-        self.config(1, &Space::contracted([0.0; 3], 1.0))
+        self.config(1, &Space::contracted([0.0; 3], 1.0), false)
             .check()
             .map_err(|error| error.to_string())
     }

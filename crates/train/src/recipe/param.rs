@@ -32,7 +32,8 @@ pub enum Param {
     PerceptualWeight,
     /// Weight of the mean |alpha - alpha of the photograph|, where it has one.
     AlphaWeight,
-    /// Weight of the mean |depth - depth of the points that the view sees|, relative to that depth.
+    /// Weight of the mean |depth - depth of the points that the view sees|, relative to that depth; for a field of the mean
+    /// squared difference of distance, in the units in which its samples are spread, at pixels where such points lie.
     DepthWeight,
     /// Weight of the edge-aware smoothness of depth.
     SmoothWeight,

@@ -31,7 +31,7 @@ enum Command {
     Eval(command::eval::Args),
     /// Render a scene into PNG frames
     Render(command::render::Args),
-    /// Say what a file or dataset holds
+    /// Say what a scene, a run or a dataset holds
     Info(command::files::InfoArgs),
     /// Convert a scene from one file format to another, by extension
     Convert(command::files::ConvertArgs),

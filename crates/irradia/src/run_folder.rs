@@ -255,12 +255,17 @@ fn read_field(path: &Path) -> Result<Field> {
     field_file::from_bytes(&bytes).with_context(|| path.display().to_string())
 }
 
+/// Whether `path` is named as the file of a field is.
+pub fn is_field(path: &Path) -> bool {
+    path.extension().is_some_and(|extension| extension == "safetensors")
+}
+
 /// The scene in a file: a field's where its name ends so, splats elsewhere; and whether it wants its opacities scaled.
 ///
 /// # Errors
 /// When it cannot be read.
 pub fn read_scene(path: &Path) -> Result<(Model<'static>, bool)> {
-    if path.extension().is_some_and(|extension| extension == "safetensors") {
+    if is_field(path) {
         return Ok((Model::Field(Cow::Owned(read_field(path)?)), false));
     }
     let cloud = read_splats(path)?;

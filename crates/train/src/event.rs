@@ -17,6 +17,9 @@ pub enum Event {
         total_steps: u64,
         /// Splats now.
         splats: usize,
+        /// Numbers of the field, where one is trained.
+        #[serde(skip_serializing_if = "Option::is_none")]
+        parameters: Option<usize>,
         /// Training views.
         views: usize,
     },
@@ -54,6 +57,9 @@ pub enum Event {
         psnr: f64,
         /// Splats now.
         splats: usize,
+        /// Numbers of the field, where one is trained.
+        #[serde(skip_serializing_if = "Option::is_none")]
+        parameters: Option<usize>,
     },
     /// A checkpoint was written.
     Saved {
@@ -95,6 +101,9 @@ pub struct StepReport {
     pub mse: f64,
     /// Splats now.
     pub splats: usize,
+    /// Numbers of the field, where one is trained.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub parameters: Option<usize>,
     /// Splats that the view saw.
     pub visible: usize,
     /// Splats whose gradient was not finite and that therefore rested.

@@ -53,6 +53,18 @@ pub fn from_bytes(bytes: &[u8]) -> Result<Field, TrainError> {
     if header.format != FORMAT {
         return Err(wrong(format!("format {} and not {FORMAT}", header.format)));
     }
+    header.config.check()?;
+    // Before there is memory for what the header only claims.
+    let (wanted, found) = (header.config.numbers(), bytes.len() / size_of::<f32>());
+    if wanted > found {
+        return Err(wrong(format!(
+            "it should hold {wanted} numbers and has room for {found}"
+        )));
+    }
+    let Space { center, scale, .. } = header.space;
+    if !(scale > 0.0 && scale.is_finite() && center.iter().all(|c| c.is_finite())) {
+        return Err(wrong("its space has no size".into()));
+    }
     Ok(Field::from_tensors(header.config, header.space, |name| {
         floats(&file, name)
     })?)

@@ -137,6 +137,7 @@ impl Trainer {
             loss: loss.total,
             mse: loss.color,
             splats: 0,
+            parameters: Some(state.field.len()),
             visible: 0,
             non_finite: 0,
         };

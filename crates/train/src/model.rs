@@ -80,4 +80,12 @@ impl Model<'_> {
             Model::Field(_) => None,
         }
     }
+
+    /// The field, where that is what it is.
+    pub fn field(&self) -> Option<&Field> {
+        match self {
+            Model::Splats(_) => None,
+            Model::Field(field) => Some(field),
+        }
+    }
 }

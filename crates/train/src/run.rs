@@ -32,6 +32,7 @@ pub fn run(
         step: trainer.clock.step,
         total_steps: trainer.total_steps(),
         splats: trainer.state.len(),
+        parameters: trainer.parameters(),
         views: trainer.dataset.train.len(),
     }];
     if trainer.clock.step == 0 {
@@ -65,6 +66,7 @@ pub fn run(
                 seconds,
                 psnr,
                 splats,
+                parameters: trainer.parameters(),
             });
             if limits.until_psnr.is_some_and(|limit| psnr >= limit) {
                 reason = Some("held-out PSNR reached");

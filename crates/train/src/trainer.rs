@@ -245,6 +245,11 @@ impl Trainer {
         self.clock.finished(&self.recipe)
     }
 
+    /// Numbers of the field, in the stages that train one.
+    pub fn parameters(&self) -> Option<usize> {
+        self.field.as_ref().map(|state| state.field.len())
+    }
+
     /// Name of the present stage.
     pub fn stage_name(&self) -> &str {
         let stages = &self.recipe.stage;
@@ -342,6 +347,7 @@ impl Trainer {
             loss: loss.total,
             mse: loss.mse,
             splats: self.state.len(),
+            parameters: None,
             visible,
             non_finite: self.gradients.non_finite,
         };

@@ -92,7 +92,8 @@ pub fn run(args: &Args) -> Result<()> {
     ))?;
     if let Some(path) = &args.json {
         let figures = json!({
-            "scene": scene, "data": args.data, "splats": model.splats().map(irradia_splat::Splats::len),
+            "scene": scene, "data": args.data,
+            "splats": model.splats().map(irradia_splat::Splats::len), "parameters": model.field().map(irradia_field::Field::len),
             "psnr": mean.psnr, "ssim": mean.ssim, "lpips": mean.lpips, "views": rows,
         });
         let bytes = serde_json::to_vec_pretty(&figures)?;

@@ -1,6 +1,7 @@
 //! `irradia info` and `irradia convert`
 
-use crate::run_folder::scene_of;
+use super::describe_field::describe_field;
+use crate::run_folder::{is_field, read_scene, scene_of};
 use crate::terminal::say;
 use anyhow::Result;
 use irradia_formats::{SplatFormat, describe, read_splats, write_splats};
@@ -8,7 +9,7 @@ use std::path::PathBuf;
 
 #[derive(clap::Args)]
 pub struct InfoArgs {
-    /// A splat file, a run, a point cloud or a dataset's folder
+    /// A splat file, a field, a run, a point cloud or a dataset's folder
     pub path: PathBuf,
 }
 
@@ -21,7 +22,15 @@ pub struct ConvertArgs {
 }
 
 pub fn info(args: &InfoArgs) -> Result<()> {
-    say(describe(&scene_of(&args.path))?)
+    let scene = scene_of(&args.path);
+    if is_field(&scene) {
+        let (model, _) = read_scene(&scene)?;
+        let bytes = std::fs::metadata(&scene).map_or(0, |file| file.len());
+        if let Some(field) = model.field() {
+            return say(describe_field(field, bytes));
+        }
+    }
+    say(describe(&scene)?)
 }
 
 pub fn convert(args: &ConvertArgs) -> Result<()> {

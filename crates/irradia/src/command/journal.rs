@@ -171,6 +171,7 @@ impl Observer for Journal {
                 seconds,
                 psnr,
                 splats,
+                ..
             } => self.evaluated(*step, *seconds, Some(*psnr), *splats as u64),
             Event::StageEntered { stage, step, seconds } => self.stage(stage.clone(), *step, *seconds),
             Event::Finished { step, seconds, .. } => self.end_stage(*step, *seconds),

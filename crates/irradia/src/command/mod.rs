@@ -2,6 +2,7 @@
 
 pub mod compare;
 pub mod demo;
+mod describe_field;
 pub mod eval;
 pub mod files;
 mod journal;

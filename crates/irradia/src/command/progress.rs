@@ -57,10 +57,10 @@ impl Progress {
         let rate = (report.step - self.first_step) as f64 / self.started.elapsed().as_secs_f64().max(1e-9);
         let held_out = self.held_out.map_or(String::new(), |p| format!(" held-out {p:.2} dB"));
         let message = format!(
-            "loss {:.4} psnr {:.2} dB{held_out} {} splats {rate:.1} steps/s {}",
+            "loss {:.4} psnr {:.2} dB{held_out} {} {rate:.1} steps/s {}",
             report.loss,
             -10.0 * mse.log10(),
-            report.splats,
+            size_in_words(report.splats as u64, report.parameters.map(|n| n as u64)),
             self.stage
         );
         match &self.bar {
@@ -84,6 +84,11 @@ impl Progress {
     }
 }
 
+/// How large a scene is: a field by its numbers, where it is one.
+pub fn size_in_words(splats: u64, parameters: Option<u64>) -> String {
+    parameters.map_or_else(|| format!("{splats} splats"), |n| format!("{n} parameters"))
+}
+
 impl Observer for Progress {
     fn on_event(&mut self, event: &Event, trainer: &Trainer) -> Signal {
         match event {
@@ -92,6 +97,7 @@ impl Observer for Progress {
                 step,
                 total_steps,
                 splats,
+                parameters,
                 views,
             } => {
                 self.first_step = *step;
@@ -100,9 +106,8 @@ impl Observer for Progress {
                     bar.set_length(*total_steps);
                     bar.set_position(*step);
                 }
-                self.say(&format!(
-                    "{recipe}: {splats} splats, {views} views, {total_steps} steps"
-                ));
+                let size = size_in_words(*splats as u64, parameters.map(|n| n as u64));
+                self.say(&format!("{recipe}: {size}, {views} views, {total_steps} steps"));
             }
             Event::StageEntered { stage, .. } => self.stage.clone_from(stage),
             Event::Step(report) => self.step(report, trainer),

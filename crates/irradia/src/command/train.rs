@@ -1,7 +1,7 @@
 //! `irradia train`
 
 use super::journal::Journal;
-use super::progress::Progress;
+use super::progress::{Progress, size_in_words};
 use super::{DataArgs, file_stem, lpips, lpips_path, thread_count, use_threads};
 use crate::Usage;
 use crate::run_folder::{FIELD, RESIDUAL, RunConfig, RunFolder, SCENE};
@@ -295,6 +295,7 @@ fn finish(folder: RunFolder, mut config: RunConfig, mut trainer: Trainer, starte
         cpu_seconds: trainer.cpu_seconds,
         total_seconds: started.elapsed().as_secs_f64(),
         splats: trainer.state.len() as u64,
+        parameters: trainer.parameters().map(|n| n as u64),
         peak_rss_bytes: peak_rss_bytes(),
         psnr: mean.psnr,
         ssim: mean.ssim,
@@ -317,11 +318,11 @@ fn finish(folder: RunFolder, mut config: RunConfig, mut trainer: Trainer, starte
     config.complete = trainer.finished();
     folder.write_config(&config)?;
     say(format_args!(
-        "held-out PSNR {:.2} dB, SSIM {:.4}{}; {} splats, {:.1} s of training",
+        "held-out PSNR {:.2} dB, SSIM {:.4}{}; {}, {:.1} s of training",
         report.psnr,
         report.ssim,
         report.lpips.map_or(String::new(), |l| format!(", LPIPS {l:.4}")),
-        report.splats,
+        size_in_words(report.splats, report.parameters),
         report.seconds
     ))?;
     if !config.complete {

@@ -103,6 +103,80 @@ fn what_a_field_adds_to_splats_is_kept_beside_them_to_the_bit() {
 }
 
 #[test]
+fn a_field_is_told_as_a_field() {
+    let folder = with_data();
+    let line = format!("train data --recipe hashgrid --steps 20 {SMALL} --out run");
+    let ended = irradia(folder.path(), &line).well();
+    let run = folder.path().join("run");
+    let report = json(&run.join("report.json"));
+    let parameters = report["parameters"].as_u64().expect("a number");
+    // 8 levels of 4 features and at most 2^15 corners, and two small networks.
+    assert!((500_000..1_100_000).contains(&parameters), "{parameters}");
+    let words = format!("{parameters} parameters");
+    assert!(
+        ended.stdout.contains(&words) && ended.stderr.contains(&words),
+        "{ended:?}"
+    );
+    assert!(!(ended.stdout + &ended.stderr).contains("splats"));
+    for event in events(&run) {
+        let counts = ["started", "step", "evaluated"].contains(&event["event"].as_str().unwrap_or(""));
+        assert_eq!(event["parameters"].as_u64(), counts.then_some(parameters), "{event}");
+    }
+    let [by_run, by_file] =
+        ["run", "run/field.safetensors"].map(|path| irradia(folder.path(), &format!("info {path}")).well());
+    assert_eq!(by_run.stdout, by_file.stdout);
+    for says in [
+        &words,
+        "hash grid of 8 levels",
+        "occupancy grid of 128",
+        "cube of half side",
+        " MB",
+    ] {
+        assert!(by_run.stdout.contains(says), "{says}: {}", by_run.stdout);
+    }
+    irradia(folder.path(), "eval run --data data --json figures.json").well();
+    assert_eq!(json(&folder.path().join("figures.json"))["parameters"], parameters);
+
+    let line = "compare data --recipes hashgrid,classic --seeds 1 --steps 5 --out both";
+    let ended = irradia(folder.path(), line).well();
+    assert!(ended.stdout.contains(&words), "{}", ended.stdout);
+    let entries = json(&folder.path().join("both/compare.json"))["scenes"][0]["entries"].clone();
+    assert_eq!(entries[0]["parameters"]["mean"].as_f64(), Some(parameters as f64));
+    assert!(entries[0]["splats"].is_null() && entries[1]["parameters"].is_null());
+    assert!(entries[1]["splats"]["mean"].as_f64() > Some(0.0));
+}
+
+#[test]
+fn a_background_is_learnt_resumed_and_kept_in_the_file() {
+    let folder = with_data();
+    let line = format!("train data --recipe hashgrid --steps 40 {SMALL} --set field.background_degree=2");
+    // The demo's photographs have alpha: behind those there is nothing to learn.
+    irradia(folder.path(), &format!("{line} --out clear")).well();
+    let told = irradia(folder.path(), "info clear").well().stdout;
+    assert!(told.contains("given when looked at"), "{told}");
+    for file in files_under(&folder.path().join("data")) {
+        if file.extension().is_some_and(|extension| extension == "png") {
+            let opaque = image::open(&file).expect("a picture").to_rgb8();
+            opaque.save(&file).expect("written");
+        }
+    }
+    for threads in [1, 2] {
+        irradia(folder.path(), &format!("{line} --threads {threads} --out run{threads}")).well();
+    }
+    let [one, two] = [1, 2].map(|threads| folder.path().join(format!("run{threads}")));
+    let unbroken = field(&one);
+    assert!(unbroken == field(&two));
+    unfinish(&two, "field.safetensors");
+    irradia(folder.path(), "train --resume run2").well();
+    assert!(unbroken == field(&two));
+    let told = irradia(folder.path(), "info run2").well().stdout;
+    assert!(told.contains("learnt, harmonics of degree 2"), "{told}");
+    irradia(folder.path(), "eval run1 --data data --json figures.json").well();
+    let figures = json(&folder.path().join("figures.json"));
+    assert_eq!(figures["psnr"], json(&one.join("report.json"))["psnr"]);
+}
+
+#[test]
 fn what_is_no_field_is_refused() {
     let folder = with_data();
     irradia(
@@ -120,7 +194,24 @@ fn what_is_no_field_is_refused() {
         std::fs::write(&path, bytes).expect("written");
         irradia(folder.path(), &format!("render {name}.safetensors --orbit 1 --out x"))
             .refused(1, &["safetensors", name]);
+        irradia(folder.path(), &format!("info {name}.safetensors")).refused(1, &["safetensors", name]);
     }
+    // Of the same length, so that the rest of the file stays where it is.
+    for (from, to, says) in [
+        (r#"log2_table\":15"#, r#"log2_table\":24"#, "room for"),
+        (r#"\"side\":128"#, r#"\"side\":999"#, "occupancy grid"),
+        (r#"\"width\":32"#, r#"\"width\":99"#, "multiple of 8"),
+        (r#"\"format\":1"#, r#"\"format\":9"#, "format 9"),
+        ("irradia_field", "irradia_filed", "does not describe one"),
+    ] {
+        let at = bytes.windows(from.len()).position(|window| window == from.as_bytes());
+        let at = at.unwrap_or_else(|| panic!("no {from}"));
+        let mut wrong = bytes.clone();
+        wrong[at..at + to.len()].copy_from_slice(to.as_bytes());
+        std::fs::write(folder.path().join("wrong.safetensors"), wrong).expect("written");
+        irradia(folder.path(), "info wrong.safetensors").refused(1, &["wrong.safetensors", says]);
+    }
+    irradia(folder.path(), "info none.safetensors").refused(1, &["none.safetensors"]);
     irradia(
         folder.path(),
         "train data --recipe hashgrid --set field.net.width=7 --out x",

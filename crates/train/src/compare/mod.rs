@@ -72,8 +72,10 @@ pub struct Entry {
     pub seconds: Option<Spread>,
     /// Processor seconds of the training loop.
     pub cpu_seconds: Option<Spread>,
-    /// Gaussians at the end.
+    /// Gaussians at the end; `None` for fields.
     pub splats: Option<Spread>,
+    /// Numbers of the field; `None` for splats.
+    pub parameters: Option<Spread>,
     /// Most memory the process held, bytes.
     pub peak_memory: Option<Spread>,
     /// Share of blocks of steps whose mean training loss is above that of the block before; see [`rises`].
@@ -116,6 +118,8 @@ pub struct Figures {
     pub total_seconds: f64,
     /// Gaussians at the end.
     pub splats: u64,
+    /// Numbers of the field, where that is what was made.
+    pub parameters: Option<u64>,
     /// Bytes.
     pub peak_memory: u64,
     /// dB.
@@ -171,8 +175,10 @@ pub struct Overall {
     pub lpips: Option<f64>,
     /// Likewise.
     pub seconds: f64,
-    /// Likewise.
-    pub splats: f64,
+    /// Likewise; `None` where the recipe makes fields.
+    pub splats: Option<f64>,
+    /// Likewise, where it makes fields.
+    pub parameters: Option<f64>,
     /// On how many of the scenes all runs reach what the first recipe ends with.
     pub marks: usize,
     /// And on how many in a third of the first recipe's time, or less.
@@ -229,6 +235,7 @@ impl Figures {
             cpu_seconds: report.cpu_seconds,
             total_seconds: report.total_seconds,
             splats: report.splats,
+            parameters: report.parameters,
             peak_memory: report.peak_rss_bytes,
             psnr: report.psnr,
             ssim: report.ssim,
@@ -283,7 +290,8 @@ impl Scene {
                     lpips: spread(&|f| f.lpips),
                     seconds: spread(&|f| Some(f.seconds)),
                     cpu_seconds: spread(&|f| Some(f.cpu_seconds)),
-                    splats: spread(&|f| Some(f.splats as f64)),
+                    splats: spread(&|f| f.parameters.is_none().then_some(f.splats as f64)),
+                    parameters: spread(&|f| f.parameters.map(|n| n as f64)),
                     peak_memory: spread(&|f| (f.peak_memory > 0).then_some(f.peak_memory as f64)),
                     loss_rises: spread(&|f| f.loss_rises),
                     error_rises: spread(&|f| f.error_rises),
@@ -321,7 +329,8 @@ pub fn overall(scenes: &[Scene]) -> Vec<Overall> {
                     .collect()
             };
             let mean = |values: Vec<f64>| values.iter().sum::<f64>() / values.len() as f64;
-            let lpips = values(&|e| e.lpips);
+            // Where every scene has one.
+            let all = |values: Vec<f64>| (values.len() == whole.len()).then(|| mean(values));
             let shares = || whole.iter().filter_map(|scene| scene.entries[i].mark_share);
             Overall {
                 marks: shares().count(),
@@ -330,9 +339,10 @@ pub fn overall(scenes: &[Scene]) -> Vec<Overall> {
                 scenes: whole.len(),
                 psnr: mean(values(&|e| e.psnr)),
                 ssim: mean(values(&|e| e.ssim)),
-                lpips: (lpips.len() == whole.len()).then(|| mean(lpips)),
+                lpips: all(values(&|e| e.lpips)),
                 seconds: mean(values(&|e| e.seconds)),
-                splats: mean(values(&|e| e.splats)),
+                splats: all(values(&|e| e.splats)),
+                parameters: all(values(&|e| e.parameters)),
             }
         })
         .collect()

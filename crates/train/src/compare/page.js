@@ -42,6 +42,7 @@
     ["Training, s", "seconds", (x) => fixed(x, 1), -1],
     ["CPU, s", "cpu_seconds", (x) => fixed(x, 1), -1],
     ["Splats", "splats", whole, 0],
+    ["Parameters", "parameters", whole, 0],
     ["Memory", "peak_memory", bytes, 0],
     ["Loss rises", "loss_rises", (x) => `${fixed(100 * x, 0)} %`, -1],
     ["Error rises", "error_rises", (x) => `${fixed(100 * x, 0)} %`, -1],
@@ -150,10 +151,11 @@
     return [sides, divided];
   };
 
+  const size = (o) => (known(o.parameters) ? `${whole(o.parameters)} parameters` : whole(o.splats));
   if (comparison.overall.length && comparison.scenes.length > 1) {
     at("overall").hidden = false;
     const lines = comparison.overall.map((o, i) =>
-      row([colored(o.recipe, i), fixed(o.psnr, 2), fixed(o.ssim, 4), fixed(o.lpips, 4), fixed(o.seconds, 1), whole(o.splats),
+      row([colored(o.recipe, i), fixed(o.psnr, 2), fixed(o.ssim, 4), fixed(o.lpips, 4), fixed(o.seconds, 1), size(o),
         ...[o.marks, o.marks_in_a_third].map((n) => (i ? `${n} of ${o.scenes}` : "–"))]));
     at("overall-table").replaceWith(table(["Recipe", "PSNR, dB", "SSIM", "LPIPS", "Training, s", "Splats", "Reaches the first",
       "In a third of its time"], lines));

@@ -120,7 +120,7 @@ fn rows(comparison: &Comparison) -> Vec<Vec<String>> {
                 number(entry.lpips, 4, 1.0),
                 number(entry.seconds, 1, 1.0),
                 number(entry.cpu_seconds, 1, 1.0),
-                number(entry.splats, 0, 1.0),
+                size(entry),
                 number(entry.peak_memory, 0, 1e-6),
                 number(entry.loss_rises, 2, 1.0),
                 number(entry.error_rises, 2, 1.0),
@@ -139,7 +139,8 @@ fn rows(comparison: &Comparison) -> Vec<Vec<String>> {
                 o.lpips.map_or_else(dash, |l| format!("{l:.4}")),
                 format!("{:.1}", o.seconds),
                 dash(),
-                format!("{:.0}", o.splats),
+                o.parameters
+                    .map_or_else(|| o.splats.map_or_else(dash, |n| format!("{n:.0}")), of_field),
                 dash(),
                 dash(),
                 dash(),
@@ -148,6 +149,16 @@ fn rows(comparison: &Comparison) -> Vec<Vec<String>> {
         }
     }
     rows
+}
+
+/// Splats, or the parameters of a field.
+fn size(entry: &Entry) -> String {
+    let parameters = entry.parameters.map(|spread| of_field(spread.mean));
+    parameters.unwrap_or_else(|| number(entry.splats, 0, 1.0))
+}
+
+fn of_field(parameters: f64) -> String {
+    format!("{parameters:.0} parameters")
 }
 
 /// `scene, recipe, seed: error` of every run that failed.

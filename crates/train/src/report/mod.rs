@@ -43,6 +43,9 @@ pub struct Report {
     pub total_seconds: f64,
     /// Gaussians at the end.
     pub splats: u64,
+    /// Numbers of the field, where the run made one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub parameters: Option<u64>,
     /// Most memory the process ever held, bytes; 0 where the system does not say.
     pub peak_rss_bytes: u64,
     /// Mean over the held-out views, dB.

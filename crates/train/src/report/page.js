@@ -1,5 +1,7 @@
 (() => {
   const report = JSON.parse(document.getElementById("data").textContent);
+  // Of a field its numbers are told; there are no splats to count.
+  const isField = known(report.parameters);
   document.title = `${report.dataset || "Report"} – Irradia`;
   at("version").textContent = report.version;
   at("title").textContent = report.dataset || "Report";
@@ -8,7 +10,7 @@
     ["PSNR", fixed(report.psnr, 2), "dB"],
     ["SSIM", fixed(report.ssim, 4)],
     ["LPIPS", fixed(report.lpips, 4)],
-    ["Splats", whole(report.splats)],
+    isField ? ["Parameters", whole(report.parameters)] : ["Splats", whole(report.splats)],
     ["Steps", whole(report.steps)],
     ["Training", duration(report.seconds)],
     ["Peak memory", bytes(report.peak_rss_bytes)],
@@ -117,7 +119,7 @@
     at("curves").replaceChildren(
       chart("Loss", [{ color: "var(--loss)", points: series("loss") }], { smooth: true, zero: true, digits: 4 }),
       chart("PSNR", [{ color: "var(--psnr)", points: series("psnr") }], { digits: 2, unit: " dB" }),
-      chart("Splats", [{ color: "var(--count)", points: series("splats") }], { zero: true }),
+      ...(isField ? [] : [chart("Splats", [{ color: "var(--count)", points: series("splats") }], { zero: true })]),
     );
     at("over-steps").setAttribute("aria-pressed", String(axis === "step"));
     at("over-seconds").setAttribute("aria-pressed", String(axis === "seconds"));

@@ -1,0 +1,66 @@
+//! What a `field.safetensors` holds, for people.
+
+use irradia_field::encoding::PositionEncoding;
+use irradia_field::{Field, Outside, Sampler};
+use irradia_formats::Description;
+
+/// A summary of `field`, whose file has `bytes`.
+pub fn describe_field(field: &Field, bytes: u64) -> Description {
+    let config = &field.config;
+    let net = &config.net;
+    let encoding = match &net.encoding {
+        PositionEncoding::Frequency(f) => format!("frequencies of {} octaves", f.octaves),
+        PositionEncoding::HashGrid(g) => format!(
+            "hash grid of {} levels, {} to {} cells a side, {} features a corner, at most 2^{} corners a level",
+            g.levels, g.coarsest, g.finest, g.features, g.log2_table
+        ),
+    };
+    let color = net.color.map_or(String::new(), |color| {
+        format!("; colour {} of {}", color.depth, color.width)
+    });
+    let sampler = match &config.sampler {
+        Sampler::Occupancy(o) => format!("steps through an occupancy grid of {} cells a side", o.side),
+        Sampler::Hierarchy { coarse, fine } => format!("hierarchy, {coarse} and {fine} more"),
+        Sampler::Proposal { rounds, last } => {
+            let rounds: Vec<String> = rounds.iter().map(|(_, n)| n.to_string()).collect();
+            format!("proposals, {} and then {last}", rounds.join(", "))
+        }
+    };
+    let space = &field.space;
+    let [x, y, z] = space.center;
+    let cube = format!(
+        "cube of half side {:.3} about ({x:.3}, {y:.3}, {z:.3})",
+        1.0 / space.scale
+    );
+    let space = match &space.outside {
+        Outside::Nothing => cube,
+        Outside::Contracted => format!("{cube}, the rest of the world contracted around it"),
+        Outside::Ndc(frustum) => format!("normalised device coordinates from depth {:.3}", frustum.near),
+    };
+    let background = config
+        .background_degree
+        .map_or("given when looked at".to_owned(), |degree| {
+            format!("learnt, harmonics of degree {degree}")
+        });
+    let mut facts = vec![
+        ("encoding", encoding),
+        (
+            "hidden layers",
+            format!("density {} of {}{color}", net.depth, net.width),
+        ),
+        ("networks", field.nets.len().to_string()),
+        ("sampler", sampler),
+        ("space", space),
+        ("background", background),
+    ];
+    if config.appearance() > 0 {
+        let codes = format!("{} photographs, {} numbers each", config.images, config.appearance());
+        facts.push(("appearance", codes));
+    }
+    facts.push(("file", format!("{:.1} MB", bytes as f64 * 1e-6)));
+    Description {
+        title: format!("radiance field with {} parameters", field.len()),
+        facts,
+        warnings: Vec::new(),
+    }
+}

@@ -269,7 +269,9 @@ mod tests {
         let text = Recipe::built_in("hashgrid").expect("it is");
         let error = |weight: f32| {
             let overrides = [
-                "field.samples=8192".to_owned(),
+                "field.samples=4096".to_owned(),
+                "field.sampler.side=32".to_owned(),
+                "field.net.encoding.log2_table=12".to_owned(),
                 "field.space=\"bounded\"".to_owned(),
                 format!("params.depth_weight={weight}"),
             ];
@@ -303,6 +305,6 @@ mod tests {
         };
         let (with, without) = (error(1.0), error(0.0));
         eprintln!("mean error of depth at held-out points: {with:.3} with their weight, {without:.3} without");
-        assert!(with < 0.1 && without > 3.0 * with, "{with} and {without}");
+        assert!(with < 0.25 && without > 3.0 * with, "{with} and {without}");
     }
 }

@@ -135,6 +135,7 @@ impl FieldConfig {
             net,
             sampler: Sampler::Given { mirrored },
             images: 0,
+            background_degree: None,
         }
     }
 

@@ -82,7 +82,10 @@ impl Trainer {
             .map(|(view, camera)| self.field_depths(*view, camera, &plan))
             .collect();
         let train = &self.dataset.train;
-        let number = |view: &usize| train.iter().position(|v| v == view).unwrap_or(0) as u32;
+        let mut numbers = vec![0; self.dataset.views.len()];
+        for (number, view) in train.iter().enumerate() {
+            numbers[*view] = number as u32;
+        }
         let views: Vec<TrainView> = chosen
             .iter()
             .zip(&photos)
@@ -95,7 +98,7 @@ impl Trainer {
                 over: photo.background,
                 mask: photo.mask.as_deref(),
                 depths,
-                image: number(view),
+                image: numbers[*view],
             })
             .collect();
         let knobs = self

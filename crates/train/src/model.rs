@@ -84,7 +84,7 @@ impl Model<'_> {
     /// The field, where that is what it is.
     pub fn field(&self) -> Option<&Field> {
         match self {
-            Model::Splats(_) => None,
+            Model::Splats { .. } => None,
             Model::Field(field) => Some(field),
         }
     }

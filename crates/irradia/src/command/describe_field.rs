@@ -25,6 +25,8 @@ pub fn describe_field(field: &Field, bytes: u64) -> Description {
             let rounds: Vec<String> = rounds.iter().map(|(_, n)| n.to_string()).collect();
             format!("proposals, {} and then {last}", rounds.join(", "))
         }
+        Sampler::Given { mirrored: false } => "colours of splats, by direction of view".to_owned(),
+        Sampler::Given { mirrored: true } => "colours of splats, by the direction that a mirror shows".to_owned(),
     };
     let space = &field.space;
     let [x, y, z] = space.center;

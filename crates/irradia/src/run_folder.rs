@@ -1,9 +1,9 @@
 //! The folder of a run, and what is read back from it.
 
 use crate::Usage;
-use anyhow::{Context, Result};
+use anyhow::{Context, Result, bail};
 use glam::{Quat, Vec3};
-use irradia_field::Field;
+use irradia_field::{Field, Sampler};
 use irradia_formats::{read_splats, write_atomic};
 use irradia_scene::{Camera, Dataset, Intrinsics, Pose};
 use irradia_splat::Splats;
@@ -250,7 +250,11 @@ pub fn scene_of(path: &Path) -> PathBuf {
     files.into_iter().find(|file| file.is_file()).unwrap_or(path.to_owned())
 }
 
-fn read_field(path: &Path) -> Result<Field> {
+/// The field in a file.
+///
+/// # Errors
+/// When it cannot be read.
+pub fn read_field(path: &Path) -> Result<Field> {
     let bytes = fs::read(path).with_context(|| format!("cannot read {}", path.display()))?;
     field_file::from_bytes(&bytes).with_context(|| path.display().to_string())
 }
@@ -266,17 +270,29 @@ pub fn is_field(path: &Path) -> bool {
 /// When it cannot be read.
 pub fn read_scene(path: &Path) -> Result<(Model<'static>, bool)> {
     if is_field(path) {
-        return Ok((Model::Field(Cow::Owned(read_field(path)?)), false));
+        let field = read_field(path)?;
+        if matches!(field.config.sampler, Sampler::Given { .. }) {
+            bail!(
+                "{} only adds to splats: name the {SCENE} that it lies beside",
+                path.display()
+            );
+        }
+        return Ok((Model::Field(Cow::Owned(field)), false));
     }
     let cloud = read_splats(path)?;
-    let beside = path.with_file_name(RESIDUAL);
-    let residual = if path.file_name().is_some_and(|name| name == SCENE) && beside.is_file() {
-        Some(Box::new(read_field(&beside)?))
-    } else {
-        None
-    };
     let splats = Cow::Owned(Splats::from_cloud(&cloud));
+    let residual = residual_beside(path)?.map(Box::new);
     Ok((Model::Splats { splats, residual }, cloud.antialiased))
+}
+
+/// What adds to the colours of a run's `scene`, if anything does.
+///
+/// # Errors
+/// When it cannot be read.
+pub fn residual_beside(scene: &Path) -> Result<Option<Field>> {
+    let beside = scene.with_file_name(RESIDUAL);
+    let is_there = scene.file_name().is_some_and(|name| name == SCENE) && beside.is_file();
+    is_there.then(|| read_field(&beside)).transpose()
 }
 
 /// The cameras of the run that `scene` lies in, if it lies in one.

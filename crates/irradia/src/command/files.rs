@@ -1,7 +1,7 @@
 //! `irradia info` and `irradia convert`
 
 use super::describe_field::describe_field;
-use crate::run_folder::{is_field, read_scene, scene_of};
+use crate::run_folder::{RESIDUAL, is_field, read_field, residual_beside, scene_of};
 use crate::terminal::say;
 use anyhow::Result;
 use irradia_formats::{SplatFormat, describe, read_splats, write_splats};
@@ -24,13 +24,15 @@ pub struct ConvertArgs {
 pub fn info(args: &InfoArgs) -> Result<()> {
     let scene = scene_of(&args.path);
     if is_field(&scene) {
-        let (model, _) = read_scene(&scene)?;
         let bytes = std::fs::metadata(&scene).map_or(0, |file| file.len());
-        if let Some(field) = model.field() {
-            return say(describe_field(field, bytes));
-        }
+        return say(describe_field(&read_field(&scene)?, bytes));
     }
-    say(describe(&scene)?)
+    let mut description = describe(&scene)?;
+    if let Some(field) = residual_beside(&scene)? {
+        let adds = format!("{RESIDUAL}, {} parameters", field.len());
+        description.facts.push(("reflections", adds));
+    }
+    say(description)
 }
 
 pub fn convert(args: &ConvertArgs) -> Result<()> {

@@ -88,6 +88,10 @@ fn what_a_field_adds_to_splats_is_kept_beside_them_to_the_bit() {
     irradia(folder.path(), "train --resume run2").well();
     assert!(unbroken == both(&two));
 
+    let told = irradia(folder.path(), "info run1").well().stdout;
+    assert!(told.contains("reflections"), "{told}");
+    irradia(folder.path(), "render run1/residual.safetensors --orbit 1 --out x").refused(1, &["scene.ply"]);
+
     let report = json(&one.join("report.json"));
     irradia(folder.path(), "eval run1 --data data --json whole.json").well();
     let psnr = |file: &str| json(&folder.path().join(file))["psnr"].as_f64().expect("a figure");

@@ -8,22 +8,26 @@ use crate::recipe::{Density, Represents};
 use crate::schedule::{Ahead, StepPlan, ahead};
 use crate::trainer::Trainer;
 
-/// Work of a step, microseconds of a core on which these were fitted (fox_colmap, demo, chair, lund_door; AVX-512): a pixel,
-const PIXEL: f64 = 0.085;
+/// Work of a step, microseconds of a core on which these were fitted (fox_colmap, chair, fern, lund_door; AVX-512): a pixel,
+const PIXEL: f64 = 0.02;
+/// a splat-pixel pair that blending visits,
+const PAIR: f64 = 0.001;
 /// a splat,
 const SPLAT: f64 = 0.11;
 /// each of its parameters in use,
 const PARAMETER: f64 = 0.006;
 /// a pixel that LPIPS looks at,
-const PERCEPTUAL_PIXEL: f64 = 0.9;
+const PERCEPTUAL_PIXEL: f64 = 0.55;
 /// and a sample of a field.
 const SAMPLE: f64 = 2.0;
 /// Parameters of a splat beside its harmonics.
 const GEOMETRY: f64 = 11.0;
+/// Pairs of a pixel go with the number of splats and against the images' sides, both to this power (31 to 780 were seen).
+const PAIRS_POWER: f64 = 0.5;
 /// Moments of the future that are looked at.
 const MOMENTS: usize = 48;
-/// Steps over which the cost is averaged: so many, but not more than the last quarter, for random first splats overlap and cost
-/// three times as much as what they become.
+/// Steps over which costs are averaged: so many, but not more than the last quarter, for random first splats overlap and have five
+/// times the pairs of what they become.
 const WINDOW: u64 = 50;
 /// What a round of `classic` adds grows by this over its first rounds (1.5 on chair, 2.3 on fox_colmap, of 1000 and 2000 steps).
 const FIRST_ROUNDS_GROW: f64 = 1.5;
@@ -41,8 +45,10 @@ pub struct Forecast {
     steps: u64,
     /// The trainer's seconds when it was last looked at.
     seconds: f64,
-    /// Work of the step that comes.
-    work: f64,
+    /// The step that comes and its number of splats.
+    next: Option<(Ahead, f64)>,
+    /// Pairs a pixel of the last steps, a moving mean, at an image scale and a number of splats of 1.
+    overdraw: f64,
     /// Seconds to a unit of work, a moving mean.
     unit: Option<f64>,
     /// Seconds that the rest of the run takes, were each recipe step a step.
@@ -87,17 +93,20 @@ impl Aim {
 impl Forecast {
     /// Takes in what the last step cost; to be called before each step, of which `plan` is the plan.
     pub fn observe(&mut self, trainer: &Trainer, plan: &StepPlan) {
-        if self.work > 0.0 {
-            self.steps += 1;
-            let unit = (trainer.seconds - self.seconds) / self.work;
-            let share = 1.0 / (self.steps / 4).clamp(1, WINDOW) as f64;
-            self.unit = Some(self.unit.map_or(unit, |mean| mean + share * (unit - mean)));
-        }
         if self.pixels == 0.0 {
             let cameras = trainer.train_cameras();
             let sizes = cameras.iter().map(|c| &c.intrinsics);
             let pixels: f64 = sizes.map(|k| f64::from(k.width) * f64::from(k.height)).sum();
             self.pixels = pixels / cameras.len().max(1) as f64;
+        }
+        if let Some((step, count)) = self.next.take() {
+            self.steps += 1;
+            let share = 1.0 / (self.steps / 4).clamp(1, WINDOW) as f64;
+            let pairs = trainer.renderer.pairs() as f64 / (self.pixels * step.image_scale.powi(2));
+            let overdraw = pairs * (step.image_scale / count.max(1.0)).powf(PAIRS_POWER);
+            self.overdraw += share * (overdraw - self.overdraw);
+            let unit = (trainer.seconds - self.seconds) / self.work(trainer, &step, count, pairs);
+            self.unit = Some(self.unit.map_or(unit, |mean| mean + share * (unit - mean)));
         }
         self.seconds = trainer.seconds;
         let (stage, time, count) = (trainer.clock.stage, trainer.clock.time, trainer.state.len() as f64);
@@ -117,7 +126,7 @@ impl Forecast {
         }
         self.image_scale = image_scale;
         let ahead = ahead(&trainer.recipe, &trainer.clock, MOMENTS);
-        self.work = ahead.first().map_or(0.0, |next| self.work(trainer, next, count));
+        self.next = ahead.first().map(|next| (*next, count));
         self.whole = self.look_ahead(trainer, &ahead);
     }
 
@@ -134,26 +143,30 @@ impl Forecast {
         let mut sum = 0.0;
         for stretch in ahead {
             growth.pass(trainer, stretch);
-            sum += stretch.duration * self.work(trainer, stretch, growth.count);
+            let pairs = self.overdraw * (growth.count / stretch.image_scale).powf(PAIRS_POWER);
+            sum += stretch.duration * self.work(trainer, stretch, growth.count, pairs);
         }
         unit * sum
     }
 
     /// Splats added in a recipe step from now on: as in the last round, and more where `classic` has just begun. Without an
-    /// example, and where the number has only fallen (random points that nothing needed), the stage may double it.
+    /// example the stage may double their number; where it falls (random points that nothing needed) it stays as it is.
     fn growth_rate(&self, trainer: &Trainer) -> f64 {
         let Some(stage) = trainer.recipe.stage.get(trainer.clock.stage) else {
             return 0.0;
         };
-        if self.rate <= 0.0 {
+        if self.rate < 0.0 {
+            return 0.0;
+        }
+        if self.rate == 0.0 {
             return trainer.state.len() as f64 / stage.steps as f64;
         }
         let begins = matches!(stage.density, Some(Density::Classic(_))) && self.rounds < FIRST_ROUNDS;
         self.rate * if begins { FIRST_ROUNDS_GROW } else { 1.0 }
     }
 
-    /// Work of a step on `count` splats, microseconds.
-    fn work(&self, trainer: &Trainer, step: &Ahead, count: f64) -> f64 {
+    /// Work of a step on `count` splats with so many pairs a pixel, microseconds.
+    fn work(&self, trainer: &Trainer, step: &Ahead, count: f64, pairs: f64) -> f64 {
         if let (Represents::Field, Some(knobs)) = (trainer.recipe.stage[step.stage].represents, &trainer.recipe.field) {
             return SAMPLE * knobs.samples as f64;
         }
@@ -164,7 +177,7 @@ impl Forecast {
         } else {
             0.0
         };
-        PIXEL * pixels + count.max(1.0) * (SPLAT + PARAMETER * parameters) + perceptual
+        pixels * (PIXEL + PAIR * pairs) + count.max(1.0) * (SPLAT + PARAMETER * parameters) + perceptual
     }
 
     /// Seconds that the rest of the run takes at its present pace.

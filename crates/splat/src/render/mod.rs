@@ -211,7 +211,7 @@ impl Renderer {
         (self.depth_keys[i] != u32::MAX).then(|| self.footprints[i].extent)
     }
 
-    /// Splat-pixel pairs that the last frame's blending visited (whole blocks of 16), for benchmarks.
+    /// Splat-pixel pairs that the last frame's blending visited (whole blocks of 16): what a frame costs.
     pub fn pairs(&self) -> u64 {
         (0..self.bins.tile_count())
             .flat_map(|tile| self.bins.tile(tile))

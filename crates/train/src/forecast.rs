@@ -103,7 +103,12 @@ impl Forecast {
             self.steps += 1;
             let share = 1.0 / (self.steps / 4).clamp(1, WINDOW) as f64;
             let pairs = trainer.renderer.pairs() as f64 / (self.pixels * step.image_scale.powi(2));
-            let overdraw = pairs * (step.image_scale / count.max(1.0)).powf(PAIRS_POWER);
+            // A field has none, and tells nothing of the splats that come after it.
+            let overdraw = if pairs > 0.0 {
+                pairs * (step.image_scale / count.max(1.0)).powf(PAIRS_POWER)
+            } else {
+                self.overdraw
+            };
             self.overdraw += share * (overdraw - self.overdraw);
             let unit = (trainer.seconds - self.seconds) / self.work(trainer, &step, count, pairs);
             self.unit = Some(self.unit.map_or(unit, |mean| mean + share * (unit - mean)));

@@ -164,7 +164,7 @@ impl Mlp {
 
     /// The weights for going back, at the same places: going back is then going forward.
     ///
-    /// A layer's tiles, `[(inputs + again) / 8, outputs, 8]`: see [`product`].
+    /// A layer's tiles, `[(inputs + again) / 8, outputs, 8]`, as the products want them.
     pub fn transposed<T: Scalar>(&self, parameters: &[T]) -> Vec<T> {
         let mut turned = vec![T::default(); parameters.len()];
         for layer in &self.layers {

@@ -37,7 +37,7 @@ pub use space::{Frustum, Measure, Outside, Ray, Space};
 pub use state::FieldState;
 pub use tensors::Tensors;
 pub use to_points::{FieldPoints, PointsOptions, to_points};
-pub use train::{ResidualOptions, Sight, StepLoss, StepOptions, residual_at, train_residual, train_step, train_views};
+pub use train::{Sight, StepLoss, StepOptions, residual_at, train_residual, train_step, train_views};
 
 /// The scalar in a lane of `S`.
 pub(crate) type Num<S> = <<S as irradia_compute::simd::Simd>::F as irradia_compute::simd::Lanes>::Scalar;

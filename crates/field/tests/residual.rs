@@ -2,7 +2,7 @@
 
 use irradia_field::encoding::{DirectionEncoding, Frequency, HashGrid, PositionEncoding};
 use irradia_field::net::{Activation, ColorShape, NetShape};
-use irradia_field::{Field, FieldState, ResidualOptions, Sight, Space, residual_at, train_residual};
+use irradia_field::{Field, FieldState, Sight, Space, StepOptions, residual_at, train_residual};
 use irradia_scene::Rng;
 
 fn net() -> NetShape {
@@ -56,10 +56,11 @@ fn it_adds_nothing_at_first_and_learns_what_depends_on_the_direction() {
     let mut state = fresh();
     assert!(residual_at(&state.field, &sights).iter().flatten().all(|v| *v == 0.0));
     let wanted = |s: &Sight| [0.4 * s.direction[0], -0.3 * s.direction[1], 0.2 * s.point[2].abs()];
-    let options = ResidualOptions {
+    let options = StepOptions {
         table_rate: 1e-2,
         net_rate: 1e-2,
         beta2: 0.99,
+        ..StepOptions::default()
     };
     let mut errors = Vec::new();
     for _ in 0..300 {
@@ -93,10 +94,11 @@ fn a_step_descends_along_the_gradient() {
     // Not at rest: with a last layer of zeros nothing before it has a gradient.
     let sights = sights(200);
     let mut state = fresh();
-    let options = ResidualOptions {
+    let options = StepOptions {
         table_rate: 1e-2,
         net_rate: 1e-2,
         beta2: 0.99,
+        ..StepOptions::default()
     };
     let v: Vec<[f32; 3]> = sights.iter().map(|s| s.direction).collect();
     let value = |state: &FieldState| -> f64 {

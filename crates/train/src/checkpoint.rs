@@ -183,13 +183,7 @@ pub fn from_bytes(bytes: &[u8], dataset: Arc<Dataset>, options: TrainOptions) ->
     {
         return Err(wrong("its columns have different lengths".into()));
     }
-    let whole: Vec<u64> = array("clock.whole", Dtype::U64)?
-        .1
-        .as_chunks()
-        .0
-        .iter()
-        .map(|b| u64::from_le_bytes(*b))
-        .collect();
+    let whole = words(array("clock.whole", Dtype::U64)?.1);
     let real: Vec<f64> = array("clock.real", Dtype::F64)?
         .1
         .as_chunks()
@@ -264,14 +258,7 @@ fn field(file: &SafeTensors, prefix: &str, fresh: Field) -> Result<Option<FieldS
     let Ok(whole) = file.tensor(&format!("{prefix}whole")) else {
         return Ok(None);
     };
-    let numbers: Vec<u64> = whole
-        .data()
-        .as_chunks()
-        .0
-        .iter()
-        .map(|b| u64::from_le_bytes(*b))
-        .collect();
-    let [step, rays] = numbers[..] else {
+    let [step, rays] = words(whole.data())[..] else {
         return Err(TrainError::Checkpoint(format!(
             "the checkpoint is damaged: {prefix}whole has the wrong length"
         )));
@@ -279,6 +266,11 @@ fn field(file: &SafeTensors, prefix: &str, fresh: Field) -> Result<Option<FieldS
     let get = |name: &str| floats(file, &format!("{prefix}{name}"));
     let state = FieldState::from_tensors(fresh.config, fresh.space, step, rays as usize, get)?;
     Ok(Some(state))
+}
+
+/// Little-endian whole numbers.
+fn words(bytes: &[u8]) -> Vec<u64> {
+    bytes.as_chunks().0.iter().map(|b| u64::from_le_bytes(*b)).collect()
 }
 
 fn plane_bytes(planes: &Planes) -> Vec<u8> {

@@ -3,7 +3,7 @@
 use crate::schedule::StepPlan;
 use crate::trainer::{TrainError, Trainer};
 use glam::Vec3;
-use irradia_field::{Field, FieldState, ResidualOptions, Sampler, Sight, Space, residual_at, train_residual};
+use irradia_field::{Field, FieldState, Sampler, Sight, Space, StepOptions, residual_at, train_residual};
 use irradia_scene::{Camera, sh};
 use irradia_splat::{RenderOptions, Renderer, Splats, ViewParams};
 
@@ -61,7 +61,7 @@ impl Trainer {
         let Some(knobs) = self.recipe.residual.clone() else {
             return Ok(None);
         };
-        let transparent = self.photos.get(&self.dataset.train[..1], 1.0)?.alpha.is_some();
+        let transparent = self.transparent()?;
         let space = Space::around(&self.train_cameras(), !transparent).ok_or(TrainError::NoSpace)?;
         let seed = self.options.seed ^ STREAM_RESIDUAL << 40;
         let field = Field::residual(knobs.net, knobs.mirrored, space, seed)?;
@@ -84,10 +84,11 @@ impl Trainer {
             .filter(|i| self.gradients.active[*i as usize] > 0.0 && v_of(*i) != [0.0; 3])
             .collect();
         let v_added: Vec<[f32; 3]> = seen.iter().map(|i| v_of(*i)).collect();
-        let options = ResidualOptions {
+        let options = StepOptions {
             table_rate: plan.field.tables,
             net_rate: plan.field.nets,
             beta2: knobs.beta2,
+            ..StepOptions::default()
         };
         let state = self.residual.as_mut().expect("asked for above");
         let sights = sights(&state.field, &self.state.splats, camera.pose.position, &seen);

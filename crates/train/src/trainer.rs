@@ -165,14 +165,19 @@ impl Trainer {
 
     /// The recipe's field, nothing learnt yet.
     pub(crate) fn first_field(&mut self) -> Result<FieldState, TrainError> {
-        let first = self.photos.get(&self.dataset.train[..1], 1.0)?;
+        let transparent = self.transparent()?;
         let cameras = self.train_cameras();
         let knobs = self
             .recipe
             .field
             .as_ref()
             .expect("validated: a stage of field has its knobs");
-        first_field(knobs, &self.dataset, &cameras, first.alpha.is_some(), self.options.seed)
+        first_field(knobs, &self.dataset, &cameras, transparent, self.options.seed)
+    }
+
+    /// Whether photographs have alpha, as the first one has or has not.
+    pub(crate) fn transparent(&mut self) -> Result<bool, TrainError> {
+        Ok(self.photos.get(&self.dataset.train[..1], 1.0)?.alpha.is_some())
     }
 
     /// How the first splats look.

@@ -19,7 +19,7 @@ mod residual;
 mod update;
 mod worker;
 
-pub use residual::{ResidualOptions, Sight, residual_at, train_residual};
+pub use residual::{Sight, residual_at, train_residual};
 
 /// Groups of a batch: threads that can work at once.
 const GROUPS: usize = 32;
@@ -130,11 +130,22 @@ pub fn train_views(state: &mut FieldState, views: &[TrainView], options: &StepOp
 
 /// Makes one step on `batch`.
 pub fn train_step(state: &mut FieldState, batch: &RayBatch, options: &StepOptions) -> StepLoss {
+    descend(state, options, |level, field, step, workers| {
+        gradients(level, field, batch, options, step, workers)
+    })
+}
+
+/// One step of Adam for what `fill` leaves in the workers; it is told the number of the step. What it finds is handed on.
+fn descend(
+    state: &mut FieldState,
+    options: &StepOptions,
+    fill: impl FnOnce(Level, &Field, u64, &mut [Worker]) -> StepLoss,
+) -> StepLoss {
     let level = Level::detect();
     state.step += 1;
     let mut scratch = std::mem::take(&mut state.scratch);
     scratch.workers.resize_with(GROUPS, Worker::default);
-    let loss = gradients(level, &state.field, batch, options, state.step, &mut scratch);
+    let loss = fill(level, &state.field, state.step, &mut scratch.workers);
     let step = AdamStep {
         beta1: 0.9,
         beta2: options.beta2,
@@ -146,14 +157,14 @@ pub fn train_step(state: &mut FieldState, batch: &RayBatch, options: &StepOption
     loss
 }
 
-/// Leaves every gradient in `scratch`: those of networks, codes and background in its first worker, the tables' with their points.
+/// Leaves every gradient in `workers`: those of networks, codes and background in the first one, the tables' with their points.
 fn gradients(
     level: Level,
     field: &Field,
     batch: &RayBatch,
     options: &StepOptions,
     step: u64,
-    scratch: &mut Scratch,
+    workers: &mut [Worker],
 ) -> StepLoss {
     let turned = field.turned();
     let known = batch.depths.iter().filter(|depth| **depth > 0.0).count();
@@ -166,12 +177,12 @@ fn gradients(
         depth: options.depth / known.max(1) as f32,
     };
     let n = batch.rays.len();
-    scratch.workers.par_iter_mut().enumerate().for_each(|(group, worker)| {
+    workers.par_iter_mut().enumerate().for_each(|(group, worker)| {
         let range = n * group / GROUPS..n * (group + 1) / GROUPS;
         let mut rng = Rng::new(options.seed, (step << 8) + group as u64);
         worker.rays(&task, range, &mut rng);
     });
-    let loss = add_up(&mut scratch.workers);
+    let loss = add_up(workers);
     let mean = 1.0 / n.max(1) as f64;
     StepLoss {
         color: loss.color * mean,

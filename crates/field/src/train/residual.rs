@@ -2,7 +2,7 @@
 //! cannot hold. Only colour is used of its network; where the points are and how much of them shows is others' business.
 
 use super::worker::{Backward, Worker};
-use super::{GROUPS, StepOptions, add_up, update};
+use super::{GROUPS, StepOptions, add_up, descend};
 use crate::field::Field;
 use crate::look::{color_at, units};
 use crate::mlp::PANEL;
@@ -10,7 +10,6 @@ use crate::net::{NetParameters, set3};
 use crate::pass::{Colors, Density};
 use crate::state::FieldState;
 use irradia_compute::Level;
-use irradia_compute::adam::AdamStep;
 use rayon::prelude::*;
 
 /// Points of a block, which stays in cache.
@@ -23,17 +22,6 @@ pub struct Sight {
     pub point: [f32; 3],
     /// Unit direction: of view, or of what a mirror there would show.
     pub direction: [f32; 3],
-}
-
-/// What one step of [`train_residual`] does.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct ResidualOptions {
-    /// Learning rate of tables.
-    pub table_rate: f32,
-    /// Learning rate of networks.
-    pub net_rate: f32,
-    /// Decay of Adam's second moment.
-    pub beta2: f32,
 }
 
 /// What `field` adds to the colours of what is seen: sRGB, within -1..1; zeros where the field does not reach.
@@ -52,40 +40,25 @@ fn added(color: f32) -> f32 {
     2.0 * color - 1.0
 }
 
-/// One step of Adam for the gradients `v_added` of what [`residual_at`] gave for `sights`. The points get no gradient from it.
-pub fn train_residual(state: &mut FieldState, sights: &[Sight], v_added: &[[f32; 3]], options: &ResidualOptions) {
+/// One step of Adam for the gradients `v_added` of what [`residual_at`] gave for `sights`. The points get no gradient from it; of
+/// `options` the rates count.
+pub fn train_residual(state: &mut FieldState, sights: &[Sight], v_added: &[[f32; 3]], options: &StepOptions) {
     assert_eq!(sights.len(), v_added.len(), "a gradient for each");
-    let level = Level::detect();
-    state.step += 1;
-    let mut scratch = std::mem::take(&mut state.scratch);
-    scratch.workers.resize_with(GROUPS, Worker::default);
-    let field = &state.field;
-    let turned = field.turned();
-    let points: Vec<_> = sights.iter().map(|s| s.point).collect();
-    let (units, inside) = units(field, &points);
-    let reached: Vec<usize> = (0..sights.len()).filter(|i| inside[*i]).collect();
-    let n = reached.len();
-    scratch.workers.par_iter_mut().enumerate().for_each(|(group, worker)| {
-        worker.clear(field);
-        for chunk in reached[n * group / GROUPS..n * (group + 1) / GROUPS].chunks(CHUNK) {
-            let points = chunk.iter().map(|i| (units[*i], sights[*i].direction, v_added[*i]));
-            worker.points(level, field, &turned, points);
-        }
+    descend(state, options, |level, field, _, workers| {
+        let turned = field.turned();
+        let points: Vec<_> = sights.iter().map(|s| s.point).collect();
+        let (units, inside) = units(field, &points);
+        let reached: Vec<usize> = (0..sights.len()).filter(|i| inside[*i]).collect();
+        let n = reached.len();
+        workers.par_iter_mut().enumerate().for_each(|(group, worker)| {
+            worker.clear(field);
+            for chunk in reached[n * group / GROUPS..n * (group + 1) / GROUPS].chunks(CHUNK) {
+                let points = chunk.iter().map(|i| (units[*i], sights[*i].direction, v_added[*i]));
+                worker.points(level, field, &turned, points);
+            }
+        });
+        add_up(workers)
     });
-    add_up(&mut scratch.workers);
-    let rates = StepOptions {
-        table_rate: options.table_rate,
-        net_rate: options.net_rate,
-        ..StepOptions::default()
-    };
-    let step = AdamStep {
-        beta1: 0.9,
-        beta2: options.beta2,
-        epsilon: 1e-15,
-        step: state.step,
-    };
-    update::update(level, state, &mut scratch, &rates, step);
-    state.scratch = scratch;
 }
 
 impl Worker {

@@ -37,7 +37,7 @@ pub fn merge(state: &mut SplatState, options: &MergeOptions) -> DensityChange {
 }
 
 fn mean(state: &SplatState, i: usize) -> Vec3 {
-    Vec3::from_array(std::array::from_fn(|c| state.splats.means.get(c, i)))
+    Vec3::from_array(state.splats.mean(i))
 }
 
 fn pairs(state: &SplatState, options: &MergeOptions) -> Vec<(u32, u32)> {

@@ -153,7 +153,7 @@ mod tests {
         }
         splats.opacity_logits.set(0, 0, logit(0.6));
         let halves = long_axis_halves(&splats, &[0]);
-        let mean = |i: usize| Vec3::from_array(std::array::from_fn(|c| halves.means.get(c, i)));
+        let mean = |i: usize| Vec3::from_array(halves.mean(i));
         assert!((mean(0) + mean(1)).length() < 1e-6);
         let axis = q * Vec3::Y;
         let (along, sigma) = (mean(0).dot(axis), halves.log_scales.get(1, 0).exp());

@@ -22,13 +22,16 @@ const PERCEPTUAL_PIXEL: f64 = 0.55;
 const SAMPLE: f64 = 2.0;
 /// Parameters of a splat beside its harmonics.
 const GEOMETRY: f64 = 11.0;
-/// Pairs of a pixel go with the number of splats and against the images' sides, both to this power (31 to 780 were seen).
+/// Pairs of a pixel go with the number of splats and against the images' sides, both to this power (31 to 780 were seen);
 const PAIRS_POWER: f64 = 0.5;
+/// `mcmc` adds splats as large as those it copies (0.7 to 0.9 on fox, lund_door, maryRose).
+const MCMC_PAIRS_POWER: f64 = 0.75;
 /// Moments of the future that are looked at.
 const MOMENTS: usize = 48;
-/// Steps over which costs are averaged: so many, but not more than the last quarter, for random first splats overlap and have five
-/// times the pairs of what they become.
-const WINDOW: u64 = 50;
+/// Steps over which costs are averaged: so many, but not more than the last quarter, for they change fast at first.
+const WINDOW: usize = 50;
+/// What overdraw falls to in the end is not foretold below this share of what it is.
+const LEAST_SETTLED: f64 = 0.25;
 /// What a round of `classic` adds grows by this over its first rounds (1.5 on chair, 2.3 on fox_colmap, of 1000 and 2000 steps).
 const FIRST_ROUNDS_GROW: f64 = 1.5;
 const FIRST_ROUNDS: u32 = 3;
@@ -42,13 +45,13 @@ const SPLATS_FOLLOW: f64 = 0.12;
 #[derive(Clone, Debug, Default)]
 pub struct Forecast {
     /// Steps seen.
-    steps: u64,
+    steps: usize,
     /// The trainer's seconds when it was last looked at.
     seconds: f64,
     /// The step that comes and its number of splats.
     next: Option<(Ahead, f64)>,
-    /// Pairs a pixel of the last steps, a moving mean, at an image scale and a number of splats of 1.
-    overdraw: f64,
+    /// Pairs a pixel of each step on splats, at an image scale and a number of splats of 1.
+    overdraws: Vec<f64>,
     /// Seconds to a unit of work, a moving mean.
     unit: Option<f64>,
     /// Seconds that the rest of the run takes, were each recipe step a step.
@@ -101,15 +104,14 @@ impl Forecast {
         }
         if let Some((step, count)) = self.next.take() {
             self.steps += 1;
-            let share = 1.0 / (self.steps / 4).clamp(1, WINDOW) as f64;
+            let share = 1.0 / window(self.steps) as f64;
             let pairs = trainer.renderer.pairs() as f64 / (self.pixels * step.image_scale.powi(2));
             // A field has none, and tells nothing of the splats that come after it.
-            let overdraw = if pairs > 0.0 {
-                pairs * (step.image_scale / count.max(1.0)).powf(PAIRS_POWER)
-            } else {
-                self.overdraw
-            };
-            self.overdraw += share * (overdraw - self.overdraw);
+            if pairs > 0.0 {
+                let power = pairs_power(trainer);
+                self.overdraws
+                    .push(pairs / (count.max(1.0) / step.image_scale).powf(power));
+            }
             let unit = (trainer.seconds - self.seconds) / self.work(trainer, &step, count, pairs);
             self.unit = Some(self.unit.map_or(unit, |mean| mean + share * (unit - mean)));
         }
@@ -145,13 +147,29 @@ impl Forecast {
             time: trainer.clock.time,
             count: trainer.state.len() as f64,
         };
-        let mut sum = 0.0;
+        let (now, settled) = self.overdraw();
+        let (seen, power) = (self.overdraws.len() as f64, pairs_power(trainer));
+        let (mut sum, mut steps) = (0.0, seen);
         for stretch in ahead {
             growth.pass(trainer, stretch);
-            let pairs = self.overdraw * (growth.count / stretch.image_scale).powf(PAIRS_POWER);
+            steps += stretch.duration / trainer.pace;
+            let overdraw = settled + (now - settled) * seen / steps.max(1.0);
+            let pairs = overdraw * (growth.count / stretch.image_scale).powf(power);
             sum += stretch.duration * self.work(trainer, stretch, growth.count, pairs);
         }
         unit * sum
+    }
+
+    /// [`Self::overdraws`] of late, and what it falls to: random first splats overlap, and have five to twelve times the pairs of what
+    /// they become. They fall as `a + b / step` does, nearly, so that the mean of late and that of half-way tell `a`.
+    fn overdraw(&self) -> (f64, f64) {
+        let mean = |end: usize| {
+            let last = &self.overdraws[end - window(end).min(end)..end];
+            last.iter().sum::<f64>() / last.len().max(1) as f64
+        };
+        let seen = self.overdraws.len();
+        let (now, halfway) = (mean(seen), mean(seen.div_ceil(2)));
+        (now, (2.0 * now - halfway).clamp(LEAST_SETTLED * now, now))
     }
 
     /// Splats added in a recipe step from now on: as in the last round, and more where `classic` has just begun. Without an
@@ -195,6 +213,20 @@ impl Forecast {
         let left = trainer.recipe.total_steps() as f64 - trainer.clock.time;
         // At least one more step, whatever has become of the time.
         (self.whole / seconds.max(1e-6)).min(left)
+    }
+}
+
+/// How many of the last steps count.
+fn window(steps: usize) -> usize {
+    (steps / 4).clamp(1, WINDOW)
+}
+
+fn pairs_power(trainer: &Trainer) -> f64 {
+    let copies = |density: &Option<Density>| matches!(density, Some(Density::Mcmc(_)));
+    if trainer.recipe.stage.iter().any(|stage| copies(&stage.density)) {
+        MCMC_PAIRS_POWER
+    } else {
+        PAIRS_POWER
     }
 }
 

@@ -25,6 +25,7 @@ mod state;
 mod tensors;
 mod to_points;
 mod train;
+mod walk;
 
 pub use background::{background_color, background_vjp};
 pub use batch::{Background, Draw, KnownDepth, RayBatch, TrainView};

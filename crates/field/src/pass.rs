@@ -10,15 +10,18 @@ use crate::mlp::PANEL;
 use crate::net::{Block, Net, NetParameters, exp, get3, place, set3};
 use crate::render::quadrature::weights;
 use crate::sample::importance::importance;
-use crate::sample::march::march;
+use crate::sample::march::March;
 use crate::sample::stratified::stratified;
 use crate::space::Ray;
+use crate::walk::Walks;
 use irradia_compute::Level;
 use irradia_compute::simd::{Kernel, Lanes, Simd};
 use irradia_scene::Rng;
 
 /// Samples at which a chunk is full: 16 panels, whose activations fit the second cache.
 const CHUNK: usize = 512;
+/// Rays that walk through an occupancy grid together: the first of a chunk, and the most.
+const TOGETHER: [usize; 2] = [4, 16];
 
 /// One network's samples on a chunk of rays.
 #[derive(Clone, Debug, Default)]
@@ -39,6 +42,7 @@ pub(crate) struct Pass {
     /// `[panels, 3, 32]`, after [`Self::slope`].
     pub slopes: Rows<f32>,
     kept: Vec<u32>,
+    walks: Walks,
 }
 
 impl Pass {
@@ -197,13 +201,27 @@ pub(crate) fn trace(
             let pass = &mut passes[0];
             let grid = field.occupancy.as_ref().expect("made with the field");
             let mut taken = 0;
+            let march = March {
+                space: &field.space,
+                grid,
+                steps: options.steps,
+            };
             while taken < rays.len() && pass.middles.len() < CHUNK {
-                let offset = rng.as_mut().map_or(0.5, |rng| rng.uniform());
-                let ray = &rays[taken];
-                let (middles, lengths) = (&mut pass.middles, &mut pass.lengths);
-                march(&field.space, grid, &options.steps, ray, offset, middles, lengths);
-                pass.starts.push(pass.middles.len());
-                taken += 1;
+                // As many as fill the chunk, by those that are in it.
+                let missing = (CHUNK - pass.middles.len()) * taken / pass.middles.len().max(1);
+                let count = if taken == 0 {
+                    TOGETHER[0]
+                } else {
+                    missing.clamp(1, TOGETHER[1])
+                };
+                let group = &rays[taken..rays.len().min(taken + count)];
+                let offset = || rng.as_mut().map_or(0.5, |rng| rng.uniform());
+                for walk in pass.walks.go(level, field, &march, group, offset) {
+                    pass.middles.extend_from_slice(&walk.middles);
+                    pass.lengths.extend_from_slice(&walk.lengths);
+                    pass.starts.push(pass.middles.len());
+                }
+                taken += group.len();
             }
             pass.look(level, field, 0, &rays[..taken], true);
             pass.paint(level, field, 0, &rays[..taken], images);
@@ -271,12 +289,13 @@ fn blurred(weights: &[f32]) -> Vec<f32> {
         .collect()
 }
 
-struct Densities<'a> {
-    net: &'a Net,
-    parameters: &'a NetParameters<f32>,
-    lengths: &'a [f32],
-    through: &'a mut Vec<f32>,
-    block: &'a mut Block<f32>,
+/// Positions to densities, and what intervals of `lengths`, as many as the block has panels' samples, let through.
+pub(crate) struct Densities<'a> {
+    pub net: &'a Net,
+    pub parameters: &'a NetParameters<f32>,
+    pub lengths: &'a [f32],
+    pub through: &'a mut Vec<f32>,
+    pub block: &'a mut Block<f32>,
 }
 
 impl Kernel for Densities<'_> {

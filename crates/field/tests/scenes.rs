@@ -5,7 +5,7 @@ use irradia_field::encoding::{DirectionEncoding, HashGrid, PositionEncoding};
 use irradia_field::net::{Activation, ColorShape, NetShape};
 use irradia_field::render::quadrature::{composite, weights};
 use irradia_field::sample::OccupancyGrid;
-use irradia_field::sample::march::{Steps, march};
+use irradia_field::sample::march::{March, Steps};
 use irradia_field::{
     Field, FieldConfig, Occupancy, PointsOptions, RenderOptions, Sampler, Space, density_at, render_view, to_points,
 };
@@ -194,9 +194,22 @@ fn skipping_finds_every_occupied_cell_and_keeps_the_samples_places() {
     for _ in 0..100 {
         let direction = Vec3::new(0.2 * rng.normal(), 0.2 * rng.normal(), 2.0).normalize();
         let ray = space.ray([0.3 * rng.normal(), 0.3 * rng.normal(), -3.0], direction.to_array());
-        let (mut all, mut some) = ((Vec::new(), Vec::new()), (Vec::new(), Vec::new()));
-        march(&space, &full, &steps, &ray, 0.3, &mut all.0, &mut all.1);
-        march(&space, &grid, &steps, &ray, 0.3, &mut some.0, &mut some.1);
+        // In stretches of any length, too.
+        let on = |grid, most| {
+            let march = March {
+                space: &space,
+                grid,
+                steps,
+            };
+            let (mut middles, mut lengths) = (Vec::new(), Vec::new());
+            let mut t = march.first(&ray, 0.3);
+            while t < ray.far {
+                t = march.go(&ray, t, most, &mut middles, &mut lengths);
+            }
+            (middles, lengths)
+        };
+        let (all, some) = (on(&full, usize::MAX), on(&grid, usize::MAX));
+        assert_eq!(some, on(&grid, 3));
         let occupied = |t: &&f32| grid.at(space.unit(ray.at(**t))) == irradia_field::sample::occupancy::Cell::Occupied;
         let want = all.0.iter().filter(occupied).count();
         found += want;

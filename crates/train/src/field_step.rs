@@ -276,6 +276,8 @@ mod tests {
                 "field.sampler.side=32".to_owned(),
                 "field.net.encoding.log2_table=12".to_owned(),
                 "field.space=\"bounded\"".to_owned(),
+                // So few steps do not clear away a field that begins dense.
+                "field.opaque_density_bias=-1".to_owned(),
                 format!("params.depth_weight={weight}"),
             ];
             let recipe = Recipe::parse("hashgrid", text, &overrides).expect("a recipe");

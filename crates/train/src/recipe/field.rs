@@ -22,6 +22,10 @@ pub struct FieldKnobs {
     /// lies behind is fixed or random.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub background_degree: Option<u32>,
+    /// Takes the place of the networks' `density_bias` where photographs have no alpha: there is something in each of their
+    /// pixels, and a field that begins dense enough to hide what lies behind learns at once; absent: as it is.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub opaque_density_bias: Option<f32>,
     /// The network that gives out colour.
     pub net: NetShape,
     /// Where along a ray samples lie.
@@ -68,15 +72,19 @@ pub enum FieldSpace {
 }
 
 impl FieldKnobs {
-    /// For `images` photographs in `space`: steps grow with distance only where space is unbounded, and of what lies behind
-    /// photographs with alpha (`transparent`) there is nothing to learn.
+    /// For `images` photographs in `space`: steps grow with distance only where space is unbounded, and behind photographs with
+    /// alpha (`transparent`) there is nothing to learn or to hide.
     pub fn config(&self, images: usize, space: &Space, transparent: bool) -> FieldConfig {
         let mut sampler = self.sampler.clone();
         if let (Sampler::Occupancy(occupancy), false) = (&mut sampler, space.outside == Outside::Contracted) {
             occupancy.steps.cone = 0.0;
         }
+        let bias = self.opaque_density_bias.filter(|_| !transparent);
         FieldConfig {
-            net: self.net,
+            net: NetShape {
+                density_bias: bias.unwrap_or(self.net.density_bias),
+                ..self.net
+            },
             sampler,
             images,
             background_degree: self.background_degree.filter(|_| !transparent),
@@ -93,5 +101,22 @@ impl FieldKnobs {
         self.config(1, &Space::contracted([0.0; 3], 1.0), false)
             .check()
             .map_err(|error| error.to_string())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use crate::recipe::Recipe;
+    use irradia_field::Space;
+
+    #[test]
+    fn a_field_begins_denser_where_photographs_are_opaque() {
+        let recipe = Recipe::parse("hashgrid", Recipe::built_in("hashgrid").unwrap(), &[]).unwrap();
+        let knobs = recipe.field.unwrap();
+        let space = Space::contracted([0.0; 3], 1.0);
+        let bias = |transparent| knobs.config(1, &space, transparent).net.density_bias;
+        assert_eq!(bias(true), knobs.net.density_bias);
+        assert_eq!(Some(bias(false)), knobs.opaque_density_bias);
+        assert!(bias(false) > bias(true));
     }
 }

@@ -35,6 +35,8 @@ const LEAST_SETTLED: f64 = 0.25;
 /// What a round of `classic` adds grows by this over its first rounds (1.5 on chair, 2.3 on fox_colmap, of 1000 and 2000 steps).
 const FIRST_ROUNDS_GROW: f64 = 1.5;
 const FIRST_ROUNDS: u32 = 3;
+/// Then it fades, to an e-th in so many steps (1,300 on demo, 3,300 on fox_colmap, 5,000 on chair, 6,000 on fern).
+const GROWTH_FADES: f64 = 3000.0;
 /// The strategy `fast` ends with so many splats more where images grow: pixels to this power (2.3 times for images of twice
 /// the side; 1.8 to 2.6 on five scenes),
 const SPLATS_BY_PIXELS: f64 = 0.6;
@@ -268,7 +270,13 @@ impl Growth {
                     Some(_) => self.count,
                 }
             }
-            Some(Density::Classic(_)) => self.count + self.rate * stretch.duration,
+            Some(Density::Classic(_)) => {
+                let fades = GROWTH_FADES * trainer.pace;
+                let left = (-stretch.duration / fades).exp();
+                let added = self.rate * fades * (1.0 - left);
+                self.rate *= left;
+                self.count + added
+            }
         };
         self.count = grown.clamp(1.0, limit);
         self.image_scale = stretch.image_scale;

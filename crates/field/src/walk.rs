@@ -2,7 +2,7 @@
 //!
 //! In an unbounded scene most steps of a ray lie behind what it shows. Rays go on by a stretch at a time, and their densities say
 //! whether there is more to see. What is found is looked at again with all of its chunk: a sample's density costs a tenth of its
-//! training. (Fox, 270 x 480: see RESULTS.md.)
+//! training. (A view of fox, 270 x 480: 4.4 CPU s instead of 12.5.)
 
 use crate::field::Field;
 use crate::mlp::PANEL;

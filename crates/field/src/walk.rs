@@ -8,7 +8,7 @@ use crate::field::Field;
 use crate::mlp::PANEL;
 use crate::net::{Block, set3};
 use crate::pass::Densities;
-use crate::render::quadrature::TRANSMITTANCE_MIN;
+use crate::render::quadrature::{TRANSMITTANCE_MIN, counted};
 use crate::sample::march::March;
 use crate::space::Ray;
 use irradia_compute::Level;
@@ -51,7 +51,8 @@ impl Walks {
         rays: &[Ray],
         mut offset: impl FnMut() -> f32,
     ) -> &[Walk] {
-        self.walks.resize_with(rays.len(), Walk::default);
+        // Never shorter: their lists keep their memory.
+        self.walks.resize_with(self.walks.len().max(rays.len()), Walk::default);
         self.open.clear();
         for (r, (walk, ray)) in self.walks.iter_mut().zip(rays).enumerate() {
             walk.middles.clear();
@@ -68,7 +69,7 @@ impl Walks {
                 walk.next < ray.far
             });
             if self.open.is_empty() {
-                return &self.walks;
+                return &self.walks[..rays.len()];
             }
             self.look(level, field, rays);
         }
@@ -96,13 +97,10 @@ impl Walks {
         let (walks, mut at) = (&mut self.walks, self.through.chunks_exact(STRETCH));
         self.open.retain(|r| {
             let walk = &mut walks[*r];
-            for e in at.next().expect("a stretch for each") {
-                if walk.transmittance < TRANSMITTANCE_MIN as f32 {
-                    break;
-                }
-                walk.transmittance *= e;
-                walk.seen += 1;
-            }
+            let stretch = at.next().expect("a stretch for each");
+            let (count, behind) = counted(stretch, walk.transmittance);
+            walk.seen += count;
+            walk.transmittance = behind;
             walk.middles.truncate(walk.seen);
             walk.lengths.truncate(walk.seen);
             walk.transmittance >= TRANSMITTANCE_MIN as f32

@@ -8,24 +8,34 @@ use irradia_compute::simd::Scalar;
 /// A ray ends where its transmittance falls below this; what lies behind moves a pixel by less than 1/2000.
 pub const TRANSMITTANCE_MIN: f64 = 1e-4;
 
+/// How many of the intervals behind `transmittance` count, front to back, and the transmittance behind those: an interval counts
+/// where what lies before it lets enough through, in [`weights`] too.
+#[inline(always)]
+pub fn counted<T: Scalar>(through: &[T], mut transmittance: T) -> (usize, T) {
+    let end = T::from_f64(TRANSMITTANCE_MIN);
+    for (i, e) in through.iter().enumerate() {
+        if transmittance < end {
+            return (i, transmittance);
+        }
+        transmittance = transmittance * *e;
+    }
+    (through.len(), transmittance)
+}
+
 /// Writes the weights of intervals that let `through` pass, front to back, and returns how many count (the rest have
 /// weight zero) and the transmittance behind them.
 #[inline(always)]
 pub fn weights<T: Scalar>(through: &[T], weights: &mut [T]) -> (usize, T) {
-    let end = T::from_f64(TRANSMITTANCE_MIN);
-    let mut transmittance = T::from_f64(1.0);
-    for (i, e) in through.iter().enumerate() {
-        if transmittance < end {
-            for w in &mut weights[i..through.len()] {
-                *w = T::default();
-            }
-            return (i, transmittance);
-        }
+    let one = T::from_f64(1.0);
+    let (count, behind) = counted(through, one);
+    let mut transmittance = one;
+    for (w, e) in weights.iter_mut().zip(&through[..count]) {
         let next = transmittance * *e;
-        weights[i] = transmittance - next;
+        *w = transmittance - next;
         transmittance = next;
     }
-    (through.len(), transmittance)
+    weights[count..through.len()].fill(T::default());
+    (count, behind)
 }
 
 /// The gradient of `sigma_i delta_i` for the `counted` intervals of [`weights`], given the gradient of the weights.

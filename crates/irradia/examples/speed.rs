@@ -53,7 +53,7 @@ fn steps(data: &str, steps: u64) -> Result<()> {
     }
     println!(
         "{steps} steps, {} splats: {:.2} ms wall, {:.2} ms CPU a step",
-        trainer.state.len(),
+        trainer.engine.len(),
         1e3 * trainer.seconds / steps as f64,
         1e3 * trainer.cpu_seconds / steps as f64,
     );
@@ -73,7 +73,7 @@ fn steps(data: &str, steps: u64) -> Result<()> {
         sh_degree: 0,
         ..RenderOptions::default()
     };
-    let splats = &trainer.state.splats;
+    let splats = &trainer.engine.state().splats;
     report_parts("as trained", splats, &views(1.0), &options);
     report_parts("twice the pixels", splats, &views(std::f32::consts::SQRT_2), &options);
     report_parts(

@@ -22,7 +22,7 @@ pub const FIELD: &str = "field.safetensors";
 pub const RESIDUAL: &str = "residual.safetensors";
 
 /// What a run may leave in its folder.
-const FILES: [&str; 9] = [
+const FILES: [&str; 11] = [
     "run.json",
     "recipe.toml",
     "cameras.json",
@@ -30,6 +30,8 @@ const FILES: [&str; 9] = [
     SCENE,
     FIELD,
     RESIDUAL,
+    "poses.safetensors",
+    "exposure.safetensors",
     "report.json",
     "report.html",
 ];
@@ -179,14 +181,16 @@ impl RunFolder {
         self.write("run.json", &serde_json::to_vec_pretty(config)?)
     }
 
-    /// Writes `cameras.json`, the training views.
-    pub fn write_cameras(&self, dataset: &Dataset) -> Result<()> {
+    /// Writes `cameras.json`, the training views; `camera` knows those of the dataset's views.
+    pub fn write_cameras(&self, dataset: &Dataset, camera: impl Fn(usize) -> Camera) -> Result<()> {
         let records: Vec<CameraRecord> = dataset
             .train
             .iter()
             .map(|i| {
                 let view = &dataset.views[*i];
-                let (k, pose) = (&view.camera.intrinsics, &view.camera.pose);
+                let Camera {
+                    intrinsics: k, pose, ..
+                } = camera(*i);
                 let q = pose.rotation;
                 CameraRecord {
                     name: view.name.clone(),

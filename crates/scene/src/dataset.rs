@@ -89,6 +89,9 @@ pub struct View {
     pub photo: Arc<dyn PhotoSource>,
     /// How near and how far this view's scene lies along +Z, world units, where the source says so.
     pub depth_bounds: Option<[f32; 2]>,
+    /// When it was taken, in the source's own unit (0 to 1 over the capture where transforms.json follows D-NeRF); `None`
+    /// where the source does not say.
+    pub time: Option<f32>,
     /// Indices into [`Dataset::points`] of the points this view is known to see; empty where the source does not say.
     pub points_seen: Vec<u32>,
 }

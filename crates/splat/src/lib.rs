@@ -2,6 +2,7 @@
 #![forbid(unsafe_code)]
 
 pub mod densify;
+mod engine;
 pub mod filter;
 pub mod init;
 pub mod regularize;
@@ -9,6 +10,9 @@ pub mod render;
 mod splats;
 mod state;
 
-pub use render::{CameraGradient, Gather, OutputGradient, RenderOptions, Renderer, Shade, SplatGradients, ViewParams};
-pub use splats::{COLUMN_NAMES, Splats, logit, sigmoid};
+pub use engine::{Engine, Noise, Placement, Update};
+pub use render::{
+    CameraGradient, FramePlanes, Gather, OutputGradient, RenderOptions, Renderer, SplatGradients, ViewParams,
+};
+pub use splats::{COLUMN_NAMES, Splats, Surface, logit, sigmoid};
 pub use state::{Rates, SplatState, Statistics};

@@ -2,6 +2,15 @@ use glam::{Quat, Vec3};
 use irradia_compute::Planes;
 use irradia_scene::{GaussianCloud, sh};
 
+/// The piece of surface that a splat stands for.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Surface {
+    /// The splat's mean, world.
+    pub mean: [f32; 3],
+    /// Its shortest axis, unit length, world; of either sign.
+    pub normal: [f32; 3],
+}
+
 /// 3D Gaussians where they are trained: five planar columns of the same N. Gradients, both Adam moments and nothing else
 /// have this shape too, so that keeping, sorting and appending are written once.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -145,6 +154,15 @@ impl Splats {
         let thinnest = (0..3).min_by(|a, b| scale(a).total_cmp(&scale(b))).unwrap_or(0);
         let turned = Quat::from_xyzw(x, y, z, w) * Vec3::AXES[thinnest];
         turned.normalize_or(Vec3::Z).to_array()
+    }
+
+    /// What the splats `indices` stand for, in that order.
+    pub fn surfaces(&self, indices: &[u32]) -> Vec<Surface> {
+        let surface = |i: &u32| Surface {
+            mean: self.mean(*i as usize),
+            normal: self.shortest_axis(*i as usize),
+        };
+        indices.iter().map(surface).collect()
     }
 
     /// Bytes held.

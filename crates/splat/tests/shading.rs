@@ -36,8 +36,10 @@ fn what_is_added_counts_as_the_dc_coefficient_does_forward_and_back() {
     let options = RenderOptions::default();
     let added = |i: u32| [0, 1, 2].map(|c| 0.2 * ((i + c) as f32).sin());
     let mut shaded = Renderer::new();
-    let shade = |seen: &[u32]| seen.iter().map(|i| added(*i)).collect();
-    shaded.render_shaded(&splats, &view, &options, Some(&shade));
+    shaded.project(&splats, &view, &options);
+    let colors: Vec<[f32; 3]> = shaded.in_view().iter().map(|i| added(*i)).collect();
+    shaded.add_colors(&colors);
+    shaded.composite();
     assert!((1..60).contains(&shaded.in_view().len()), "{}", shaded.in_view().len());
 
     let mut moved = splats.clone();

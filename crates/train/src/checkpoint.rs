@@ -1,12 +1,12 @@
 //! A run on disk: everything that the next step depends on, so that a resumed run writes the bytes that an unbroken one
 //! would have written. Only bytes are made and read here; where they go is the caller's.
 
-use crate::field_file::floats;
+use crate::field_file;
 use crate::recipe::{Param, Recipe};
 use crate::schedule::{Clock, Watch};
+use crate::tensor_file::{NamedTensor, TensorSource};
 use crate::trainer::{TrainError, TrainOptions, Trainer};
 use irradia_compute::Planes;
-use irradia_field::{Field, FieldState};
 use irradia_scene::Dataset;
 use irradia_splat::{COLUMN_NAMES, SplatState, Splats};
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
@@ -16,13 +16,11 @@ use std::sync::Arc;
 const FORMAT: &str = "irradia-checkpoint-4";
 /// What the names of a field's tensors begin with.
 const FIELD: &str = "field.";
-/// Likewise of the residual field's.
-const RESIDUAL: &str = "residual.";
 const OWNERS: [&str; 3] = ["splats", "first_moments", "second_moments"];
 
 /// `trainer` as a safetensors file: columns `[components, N]` of splats and moments, statistics, and the clock.
 pub fn to_bytes(trainer: &Trainer) -> Vec<u8> {
-    let state = &trainer.state;
+    let state = trainer.engine.state();
     let mut arrays: Vec<(String, Dtype, Vec<usize>, Vec<u8>)> = Vec::new();
     for (owner, splats) in OWNERS.iter().zip([&state.splats, &state.moments[0], &state.moments[1]]) {
         for (name, planes) in COLUMN_NAMES.iter().zip(splats.columns()) {
@@ -47,15 +45,15 @@ pub fn to_bytes(trainer: &Trainer) -> Vec<u8> {
         vec![1, state.filter.len()],
         plane_bytes(&state.filter),
     ));
-    for (prefix, field) in [(FIELD, &trainer.field), (RESIDUAL, &trainer.residual)] {
-        let Some(field) = field else { continue };
-        for (name, shape, values) in field.tensors() {
-            let bytes = values.iter().flat_map(|v| v.to_le_bytes()).collect();
-            arrays.push((format!("{prefix}{name}"), Dtype::F32, shape, bytes));
-        }
-        let whole = [field.step, field.rays as u64];
-        let bytes = whole.iter().flat_map(|v| v.to_le_bytes()).collect();
-        arrays.push((format!("{prefix}whole"), Dtype::U64, vec![whole.len()], bytes));
+    let mut tensors: Vec<NamedTensor> = Vec::new();
+    let mut keep = |prefix: &str, owned: Vec<NamedTensor>| {
+        tensors.extend(owned.into_iter().map(|tensor| tensor.prefixed(prefix)));
+    };
+    if let Some(field) = &trainer.field {
+        keep(FIELD, field_file::state_tensors(field));
+    }
+    for occupant in trainer.sockets.occupants() {
+        keep(&format!("{}.", occupant.name()), occupant.tensors());
     }
     let clock = &trainer.clock;
     let whole = [
@@ -97,6 +95,7 @@ pub fn to_bytes(trainer: &Trainer) -> Vec<u8> {
         let view = TensorView::new(*dtype, shape.clone(), bytes).expect("shape and bytes agree");
         (name.as_str(), view)
     });
+    let views = views.chain(tensors.iter().map(NamedTensor::view));
     let metadata = HashMap::from([
         ("format".to_owned(), FORMAT.to_owned()),
         ("recipe".to_owned(), trainer.recipe.to_toml()),
@@ -215,20 +214,21 @@ pub fn from_bytes(bytes: &[u8], dataset: Arc<Dataset>, options: TrainOptions) ->
         .try_into()
         .map_err(|_| wrong("its clock has the wrong length".into()))?;
     let mut trainer = Trainer::unfilled(dataset, recipe, TrainOptions { seed, ..options })?;
-    trainer.state = state;
-    let disagree = || wrong("its field and its recipe do not agree".into());
-    if file.tensor(&format!("{FIELD}whole")).is_ok() {
+    *trainer.engine.state_mut() = state;
+    let tensors = |prefix| TensorSource::new(&file, prefix);
+    if tensors(FIELD).whole("whole").is_some() {
         if trainer.recipe.field.is_none() {
-            return Err(disagree());
+            return Err(wrong("its field and its recipe do not agree".into()));
         }
         let fresh = trainer.first_field()?.field;
-        trainer.field = field(&file, FIELD, fresh)?;
+        let state = field_file::state_from(fresh.config, fresh.space, tensors(FIELD));
+        trainer.field = Some(state.map_err(|why| wrong(format!("{FIELD}{why}")))?);
     }
-    if let Some(fresh) = trainer.first_residual()? {
-        trainer.residual = field(&file, RESIDUAL, fresh.field)?;
-        if trainer.residual.is_none() {
-            return Err(disagree());
-        }
+    trainer.sockets = trainer.first_sockets()?;
+    for occupant in trainer.sockets.occupants_mut() {
+        let prefix = format!("{}.", occupant.name());
+        let restored = occupant.restore(TensorSource::new(&file, &prefix));
+        restored.map_err(|why| wrong(format!("{prefix}{why}")))?;
     }
     (trainer.pace, trainer.seconds, trainer.cpu_seconds) = (*pace, *seconds, *cpu_seconds);
     trainer.clock = Clock {
@@ -251,21 +251,6 @@ pub fn from_bytes(bytes: &[u8], dataset: Arc<Dataset>, options: TrainOptions) ->
     };
     trainer.restore_filter();
     Ok(trainer)
-}
-
-/// The state whose tensors' names begin with `prefix`, of a field like `fresh`; none where there are none.
-fn field(file: &SafeTensors, prefix: &str, fresh: Field) -> Result<Option<FieldState>, TrainError> {
-    let Ok(whole) = file.tensor(&format!("{prefix}whole")) else {
-        return Ok(None);
-    };
-    let [step, rays] = words(whole.data())[..] else {
-        return Err(TrainError::Checkpoint(format!(
-            "the checkpoint is damaged: {prefix}whole has the wrong length"
-        )));
-    };
-    let get = |name: &str| floats(file, &format!("{prefix}{name}"));
-    let state = FieldState::from_tensors(fresh.config, fresh.space, step, rays as usize, get)?;
-    Ok(Some(state))
 }
 
 /// Little-endian whole numbers.

@@ -1,12 +1,12 @@
 //! `field.safetensors`: a radiance field that can be looked at again, with its configuration in the header.
 
+use crate::tensor_file::{self, NamedTensor, TensorSource};
 use crate::trainer::TrainError;
-use irradia_field::{Field, FieldConfig, Space};
-use safetensors::tensor::{Dtype, SafeTensors, TensorView};
+use irradia_field::{Field, FieldConfig, FieldState, Space};
+use safetensors::tensor::SafeTensors;
 use serde::{Deserialize, Serialize};
-use std::collections::HashMap;
 
-/// The header's one key: with several, their order would differ from run to run.
+/// The header's one key.
 const KEY: &str = "irradia_field";
 const FORMAT: u32 = 1;
 
@@ -20,23 +20,17 @@ struct Header {
 
 /// `field` as a safetensors file.
 pub fn to_bytes(field: &Field) -> Vec<u8> {
-    let tensors = field.tensors();
-    let arrays: Vec<(String, Vec<usize>, Vec<u8>)> = tensors
-        .into_iter()
-        .map(|(name, shape, values)| (name, shape, values.iter().flat_map(|v| v.to_le_bytes()).collect()))
+    let tensors = field.tensors().into_iter();
+    let tensors: Vec<NamedTensor> = tensors
+        .map(|(name, shape, values)| NamedTensor::real(name, shape, values))
         .collect();
-    let views = arrays.iter().map(|(name, shape, bytes)| {
-        let view = TensorView::new(Dtype::F32, shape.clone(), bytes).expect("shape and bytes agree");
-        (name.as_str(), view)
-    });
     let header = Header {
         format: FORMAT,
         config: field.config.clone(),
         space: field.space,
     };
     let header = serde_json::to_string(&header).expect("plain values");
-    let metadata = HashMap::from([(KEY.to_owned(), header)]);
-    safetensors::serialize(views, Some(metadata)).expect("in memory")
+    tensor_file::to_bytes(&tensors, (KEY, header))
 }
 
 /// The field of [`to_bytes`].
@@ -65,20 +59,31 @@ pub fn from_bytes(bytes: &[u8]) -> Result<Field, TrainError> {
     if !(scale > 0.0 && scale.is_finite() && center.iter().all(|c| c.is_finite())) {
         return Err(wrong("its space has no size".into()));
     }
+    let tensors = TensorSource::new(&file, "");
     Ok(Field::from_tensors(header.config, header.space, |name| {
-        floats(&file, name)
+        tensors.real(name)
     })?)
 }
 
-/// The tensor `name` of 32-bit floats, if there is one.
-pub(crate) fn floats(file: &SafeTensors, name: &str) -> Option<Vec<f32>> {
-    let view = file.tensor(name).ok().filter(|view| view.dtype() == Dtype::F32)?;
-    Some(
-        view.data()
-            .as_chunks()
-            .0
-            .iter()
-            .map(|b| f32::from_le_bytes(*b))
-            .collect(),
-    )
+/// A field in training, for a checkpoint.
+pub(crate) fn state_tensors(state: &FieldState) -> Vec<NamedTensor> {
+    let tensors = state.tensors().into_iter();
+    let whole = NamedTensor::whole("whole", &[state.step, state.rays as u64]);
+    tensors
+        .map(|(name, shape, values)| NamedTensor::real(name, shape, values))
+        .chain([whole])
+        .collect()
+}
+
+/// The state that [`state_tensors`] gave, of a field of this configuration.
+///
+/// # Errors
+/// One line, when a tensor is missing or has another length.
+pub(crate) fn state_from(config: FieldConfig, space: Space, tensors: TensorSource) -> Result<FieldState, String> {
+    let whole = tensors.whole("whole").unwrap_or_default();
+    let [step, rays] = whole[..] else {
+        return Err("whole is missing or has the wrong length".into());
+    };
+    FieldState::from_tensors(config, space, step, rays as usize, |name| tensors.real(name))
+        .map_err(|error| error.to_string())
 }

@@ -210,7 +210,7 @@ impl Trainer {
         if cloud.is_empty() {
             return Err(TrainError::NoSurface);
         }
-        self.state = SplatState::new(init::from_points(&cloud, &self.init_options()));
+        *self.engine.state_mut() = SplatState::new(init::from_points(&cloud, &self.init_options()));
         self.seconds += started.elapsed().as_secs_f64();
         self.cpu_seconds += cpu_started.elapsed().as_secs_f64();
         Ok(())
@@ -252,6 +252,7 @@ mod tests {
                 ),
                 photo: photo.clone(),
                 depth_bounds: None,
+                time: None,
                 points_seen: (0..400).step_by(2).collect(),
             }
         });
@@ -296,7 +297,7 @@ mod tests {
             let positions = &dataset.points.as_ref().expect("points").positions;
             let mut errors = Vec::new();
             for view in &dataset.views {
-                let frame = trainer.scene().look(&mut Renderer::new(), &view.camera, &look);
+                let frame = trainer.scene().render(&mut Renderer::new(), &view.camera, &look);
                 for point in positions.iter().skip(1).step_by(2) {
                     let (pixel, depth) = view.camera.project(*point).expect("before the camera");
                     if pixel.min_element() >= 0.0 && pixel.max_element() < SIDE as f32 {

@@ -107,7 +107,7 @@ impl Forecast {
         if let Some((step, count)) = self.next.take() {
             self.steps += 1;
             let share = 1.0 / window(self.steps) as f64;
-            let pairs = trainer.renderer.pairs() as f64 / (self.pixels * step.image_scale.powi(2));
+            let pairs = trainer.engine.pairs() as f64 / (self.pixels * step.image_scale.powi(2));
             // A field has none, and tells nothing of the splats that come after it.
             if pairs > 0.0 {
                 let power = pairs_power(trainer);
@@ -118,7 +118,7 @@ impl Forecast {
             self.unit = Some(self.unit.map_or(unit, |mean| mean + share * (unit - mean)));
         }
         self.seconds = trainer.seconds;
-        let (stage, time, count) = (trainer.clock.stage, trainer.clock.time, trainer.state.len() as f64);
+        let (stage, time, count) = (trainer.clock.stage, trainer.clock.time, trainer.engine.len() as f64);
         match self.last_round {
             Some((then, at, before)) if then == stage => {
                 if count != before {
@@ -147,7 +147,7 @@ impl Forecast {
             aim: self.aim,
             image_scale: self.image_scale,
             time: trainer.clock.time,
-            count: trainer.state.len() as f64,
+            count: trainer.engine.len() as f64,
         };
         let (now, settled) = self.overdraw();
         let (seen, power) = (self.overdraws.len() as f64, pairs_power(trainer));
@@ -184,7 +184,7 @@ impl Forecast {
             return 0.0;
         }
         if self.rate == 0.0 {
-            return trainer.state.len() as f64 / stage.steps as f64;
+            return trainer.engine.len() as f64 / stage.steps as f64;
         }
         let begins = matches!(stage.density, Some(Density::Classic(_))) && self.rounds < FIRST_ROUNDS;
         self.rate * if begins { FIRST_ROUNDS_GROW } else { 1.0 }

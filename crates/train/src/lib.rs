@@ -8,14 +8,16 @@ pub mod event;
 pub mod field_file;
 mod field_step;
 mod forecast;
+pub mod half_fit;
 pub mod model;
 mod objective;
 mod photos;
 pub mod recipe;
 pub mod report;
-mod residual;
 mod run;
 pub mod schedule;
+pub mod socket;
+pub mod tensor_file;
 mod trainer;
 
 pub use recipe::{Recipe, RecipeError};

@@ -1,12 +1,12 @@
-//! What a run makes: splats or a field. Every place that treats them differently while looking at them is here.
+//! What a run makes: splats or a field. Every place that renders them differently is here.
 
-use crate::residual;
+use crate::socket::added_colors;
 use irradia_field::{Field, render_view};
 use irradia_scene::{Camera, Image};
-use irradia_splat::{Renderer, Splats};
+use irradia_splat::{Renderer, Splats, ViewParams};
 use std::borrow::Cow;
 
-/// A scene that can be looked at.
+/// A scene that can be rendered.
 #[derive(Clone, Debug)]
 pub enum Model<'a> {
     /// 3D Gaussians.
@@ -20,8 +20,8 @@ pub enum Model<'a> {
     Field(Cow<'a, Field>),
 }
 
-/// How a [`Model`] is looked at: what does not concern its kind is not looked at.
-pub type LookOptions = irradia_splat::RenderOptions;
+/// How a [`Model`] is rendered; what does not concern its kind is ignored.
+pub type RenderOptions = irradia_splat::RenderOptions;
 
 /// What a camera sees of a [`Model`].
 #[derive(Clone, Debug)]
@@ -36,7 +36,7 @@ pub struct Frame {
 
 impl Model<'_> {
     /// What `camera` sees; `renderer` keeps its buffers from frame to frame.
-    pub fn look(&self, renderer: &mut Renderer, camera: &Camera, options: &LookOptions) -> Frame {
+    pub fn render(&self, renderer: &mut Renderer, camera: &Camera, options: &RenderOptions) -> Frame {
         let (width, height) = (camera.intrinsics.width, camera.intrinsics.height);
         let pixels = width as usize * height as usize;
         let image = |planes: &[f32]| {
@@ -45,7 +45,16 @@ impl Model<'_> {
         };
         match self {
             Model::Splats { splats, residual } => {
-                residual::render(renderer, splats, residual.as_deref(), camera, options);
+                let view = ViewParams::new(camera);
+                match residual {
+                    Some(field) => {
+                        renderer.project(splats, &view, options);
+                        let surfaces = splats.surfaces(renderer.in_view());
+                        renderer.add_colors(&added_colors(field, camera.pose.position, &surfaces));
+                        renderer.composite();
+                    }
+                    None => renderer.render(splats, &view, options),
+                }
                 Frame {
                     color: image(renderer.color()),
                     alpha: renderer.alpha().to_vec(),

@@ -7,7 +7,7 @@ use irradia_measure::{
     perceptual,
 };
 use irradia_scene::Rng;
-use irradia_splat::{Gather, OutputGradient, Renderer};
+use irradia_splat::{FramePlanes, Gather, OutputGradient};
 use rayon::prelude::*;
 use std::sync::Arc;
 
@@ -80,10 +80,10 @@ impl Objective {
         }
     }
 
-    /// Compares the last frame of `renderer`; where depth has a weight it was rendered with depth.
+    /// Compares `frame`; where depth has a weight it was rendered with depth.
     pub fn evaluate(
         &mut self,
-        renderer: &Renderer,
+        frame: FramePlanes,
         reference: &Reference,
         losses: &Losses,
         rng: &mut Rng,
@@ -104,7 +104,7 @@ impl Objective {
             truth: Truth::Rgb8(rgb),
             mask: photo.mask.as_deref(),
         };
-        let color = renderer.color();
+        let color = frame.color;
         self.v_color.resize(3 * pixels, 0.0);
         let values = self
             .photometric
@@ -134,25 +134,37 @@ impl Objective {
             self.v_alpha.resize(pixels, 0.0);
         }
         if let Some(alpha) = photo.alpha.as_ref().filter(|_| losses.alpha > 0.0) {
-            total += compare_alpha(renderer.alpha(), alpha, losses.alpha, &mut self.v_alpha);
+            total += compare_alpha(frame.alpha, alpha, losses.alpha, &mut self.v_alpha);
         }
         if depths {
             self.v_depth.clear();
             self.v_depth.resize(pixels, 0.0);
-            let frame = (renderer.depth(), renderer.alpha());
             let (v_depth, v_alpha) = (&mut self.v_depth, &mut self.v_alpha);
             if losses.depth > 0.0 {
                 let kind = DepthKind::Metric;
-                let values =
-                    self.depth
-                        .evaluate(frame.0, frame.1, reference.depths, kind, losses.depth, v_depth, v_alpha);
+                let values = self.depth.evaluate(
+                    frame.depth,
+                    frame.alpha,
+                    reference.depths,
+                    kind,
+                    losses.depth,
+                    v_depth,
+                    v_alpha,
+                );
                 total += f64::from(losses.depth) * values.loss;
             }
             if losses.smooth > 0.0 {
                 let (of, k) = (Smoothed::Disparity, EDGE_SHARPNESS);
-                let loss = self
-                    .smooth
-                    .evaluate(frame.0, frame.1, &target, of, k, losses.smooth, v_depth, v_alpha);
+                let loss = self.smooth.evaluate(
+                    frame.depth,
+                    frame.alpha,
+                    &target,
+                    of,
+                    k,
+                    losses.smooth,
+                    v_depth,
+                    v_alpha,
+                );
                 total += f64::from(losses.smooth) * loss;
             }
         }
@@ -187,7 +199,12 @@ impl Objective {
         self.error.iter().map(|e| f64::from(*e)).sum::<f64>() / self.error.len().max(1) as f64
     }
 
-    /// The gradients of the frame last evaluated; `gather` is left to the caller.
+    /// The gradient of the colour last evaluated, `[3, H, W]`, for what sits between it and the scene's own.
+    pub fn v_color_mut(&mut self) -> &mut [f32] {
+        &mut self.v_color
+    }
+
+    /// The gradients of the frame last evaluated; `gather` and `camera` are left to the caller.
     pub fn gradient(&self) -> OutputGradient<'_> {
         OutputGradient {
             alpha: self.has.alpha.then_some(&self.v_alpha[..]),

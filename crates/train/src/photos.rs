@@ -193,6 +193,7 @@ mod tests {
                 camera,
                 photo: s.clone(),
                 depth_bounds: None,
+                time: None,
                 points_seen: vec![],
             })
             .collect();

@@ -1,8 +1,9 @@
 //! The loop around [`Trainer::step`]: when to stop, when to look, whom to tell.
 
-use crate::eval::{Metrics, evaluate_views};
+use crate::eval::{EvalOptions, Metrics, evaluate_views};
 use crate::event::{Event, Observer, Signal, StepReport};
 use crate::forecast::Forecast;
+use crate::half_fit::HalfFit;
 use crate::schedule::{is_due, plan};
 use crate::trainer::{TrainError, Trainer};
 
@@ -31,11 +32,12 @@ pub fn run(
         recipe: trainer.recipe.name.clone(),
         step: trainer.clock.step,
         total_steps: trainer.total_steps(),
-        splats: trainer.state.len(),
+        splats: trainer.engine.len(),
         parameters: trainer.parameters(),
         views: trainer.dataset.train.len(),
     }];
     if trainer.clock.step == 0 {
+        events.extend(trainer.warnings().into_iter().map(|message| Event::Warned { message }));
         events.push(Event::StageEntered {
             stage: trainer.stage_name().to_owned(),
             step: 0,
@@ -59,7 +61,7 @@ pub fn run(
         };
         events.insert(0, Event::Step(report));
         if looks && !trainer.dataset.test.is_empty() {
-            let (step, seconds, splats) = (trainer.clock.step, trainer.seconds, trainer.state.len());
+            let (step, seconds, splats) = (trainer.clock.step, trainer.seconds, trainer.engine.len());
             let psnr = held_out_psnr(trainer)?;
             events.push(Event::Evaluated {
                 step,
@@ -117,14 +119,17 @@ fn tell(trainer: &Trainer, events: &mut Vec<Event>, observers: &mut [&mut dyn Ob
 
 /// Mean PSNR over the held-out views, with the SH bands in use now.
 fn held_out_psnr(trainer: &Trainer) -> Result<f64, TrainError> {
-    let options = trainer.render_options(plan(&trainer.recipe, &trainer.clock).sh_degree);
+    let options = EvalOptions {
+        render: trainer.render_options(plan(&trainer.recipe, &trainer.clock).sh_degree),
+        metrics: Metrics::Psnr,
+        half_fit: HalfFit::default(),
+    };
     let mut psnr = Vec::new();
     evaluate_views(
         &trainer.scene(),
         &trainer.dataset,
         &trainer.dataset.test,
         &options,
-        Metrics::Psnr,
         |view| {
             psnr.push(view.metrics.psnr);
         },

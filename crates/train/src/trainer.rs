@@ -2,12 +2,13 @@
 
 use crate::event::{Event, StepReport};
 use crate::field_step::{first_field, is_field};
+use crate::half_fit::HalfFit;
 use crate::model::Model;
 use crate::objective::{Objective, Reference};
 use crate::photos::{PhotoCache, Prepared};
 use crate::recipe::{Density, Recipe};
-use crate::residual;
 use crate::schedule::{Clock, Round, Signal, StepPlan, coming_views, plan};
+use crate::socket::{Residual, Sockets};
 use cpu_time::ProcessTime;
 use irradia_compute::adam::AdamStep;
 use irradia_field::{FieldError, FieldState, KnownDepth};
@@ -16,7 +17,7 @@ use irradia_scene::{Camera, Dataset, LoadError, PointCloud, Rng, View, sh};
 use irradia_splat::densify::{DensityChange, classic, fast, mcmc, merge, taming};
 use irradia_splat::init::{self, InitOptions, Look};
 use irradia_splat::{
-    Gather, RenderOptions, Renderer, SplatGradients, SplatState, Splats, Statistics, ViewParams, filter, regularize,
+    Engine, FramePlanes, Gather, Noise, RenderOptions, SplatState, Splats, Statistics, Update, ViewParams, filter,
 };
 use std::borrow::Cow;
 use std::collections::HashMap;
@@ -91,11 +92,11 @@ pub struct Trainer {
     /// The data.
     pub dataset: Arc<Dataset>,
     /// The splats; none while a field is trained.
-    pub state: SplatState,
+    pub engine: Engine,
     /// The field, in the stages that train one.
     pub field: Option<FieldState>,
-    /// What adds to the splats' colours, where the recipe has it.
-    pub residual: Option<FieldState>,
+    /// What is trained beside the splats.
+    pub sockets: Sockets,
     /// Where the run stands.
     pub clock: Clock,
     /// As given.
@@ -113,9 +114,7 @@ pub struct Trainer {
     pub(crate) photos: PhotoCache,
     /// What is known of depth in the views that a field is trained on, by view, width and height.
     pub(crate) depths: HashMap<(usize, u32, u32), Arc<[KnownDepth]>>,
-    pub(crate) renderer: Renderer,
     objective: Objective,
-    pub(crate) gradients: SplatGradients,
 }
 
 impl Trainer {
@@ -129,9 +128,9 @@ impl Trainer {
             trainer.field = Some(trainer.first_field()?);
         } else {
             let splats = trainer.first_splats()?;
-            trainer.state = SplatState::new(splats);
+            *trainer.engine.state_mut() = SplatState::new(splats);
         }
-        trainer.residual = trainer.first_residual()?;
+        trainer.sockets = trainer.first_sockets()?;
         Ok(trainer)
     }
 
@@ -151,12 +150,10 @@ impl Trainer {
             photos: PhotoCache::new(dataset.clone(), recipe.render.background, options.photo_budget),
             cap: cap(&recipe, &cameras),
             depths: HashMap::new(),
-            renderer: Renderer::new(),
             objective: Objective::new(options.lpips.clone()),
-            gradients: SplatGradients::default(),
-            state: SplatState::new(Splats::zeros(0, sh::MAX_DEGREE)),
+            engine: Engine::new(SplatState::new(Splats::zeros(0, sh::MAX_DEGREE))),
             field: None,
-            residual: None,
+            sockets: Sockets::default(),
             recipe,
             dataset,
             options,
@@ -173,6 +170,13 @@ impl Trainer {
             .as_ref()
             .expect("validated: a stage of field has its knobs");
         first_field(knobs, &self.dataset, &cameras, transparent, self.options.seed)
+    }
+
+    /// What the recipe has in the sockets of a step, nothing learnt yet.
+    pub(crate) fn first_sockets(&mut self) -> Result<Sockets, TrainError> {
+        // Only a residual field's space depends on it; photographs are not read for the others.
+        let transparent = self.recipe.residual.is_some() && self.transparent()?;
+        Sockets::new(&self.recipe, &self.dataset, transparent, self.options.seed)
     }
 
     /// Whether photographs have alpha, as the first one has or has not.
@@ -290,8 +294,9 @@ impl Trainer {
         let photo = self.photos.get(&coming, plan.image_scale)?;
         let (started, cpu_started) = (Instant::now(), ProcessTime::now());
         let mut rng = Rng::new(self.options.seed ^ self.clock.step << 20, STREAM_STEP);
-        let camera = self.scaled_camera(coming[0], plan.image_scale);
-        let view = ViewParams::new(&camera);
+        let view = coming[0];
+        let placement = self.sockets.place(view, &self.scaled_camera(view, plan.image_scale));
+        let camera = placement.camera;
         if plan.refilter {
             self.update_filter();
         }
@@ -305,32 +310,35 @@ impl Trainer {
             depth: plan.losses.depth > 0.0 || plan.losses.smooth > 0.0,
             ..self.render_options(plan.sh_degree)
         };
-        let residual = residual::in_force(&self.residual, &plan);
-        residual::render(&mut self.renderer, &self.state.splats, residual, &camera, &options);
+        self.sockets.render(&mut self.engine, view, placement, &options, &plan);
         let reference = Reference {
             photo: &photo,
             background,
-            depths: &self.known_depths(coming[0], &camera, &plan),
+            depths: &self.known_depths(view, &camera, &plan),
         };
-        let loss = self
-            .objective
-            .evaluate(&self.renderer, &reference, &plan.losses, &mut rng);
+        let frame = FramePlanes {
+            color: self.sockets.frame_color(&self.engine),
+            ..self.engine.frame()
+        };
+        let loss = self.objective.evaluate(frame, &reference, &plan.losses, &mut rng);
         if plan.gathers == Some(Statistics::Error) {
-            self.objective
-                .error(self.renderer.color(), &photo, background.is_some());
+            self.objective.error(frame.color, &photo, background.is_some());
         }
+        self.sockets
+            .step_after_blending(&self.engine, view, self.objective.v_color_mut(), &plan.sockets);
         let mut v_out = self.objective.gradient();
+        v_out.camera = self.sockets.needs_camera_gradient();
         v_out.gather = match plan.gathers {
             Some(Statistics::AbsoluteGradient) => Gather::Absolute,
             Some(Statistics::Error) => self.objective.gather_error(),
             Some(Statistics::Gradient) | None => Gather::Nothing,
         };
-        self.renderer.backward(&self.state.splats, &v_out, &mut self.gradients);
-        let visible = self.renderer.visible();
-        self.train_residual(&plan, &camera);
-        self.update(&plan, &view);
+        self.engine.backward(&v_out);
+        self.sockets
+            .step_before_blending(&mut self.engine, view, &camera, self.extent, &plan);
+        self.engine.update(&self.update(&plan));
         if let Some(change) = self.control_density(&plan) {
-            events.push(Event::densified(self.clock.step + 1, change, self.state.len()));
+            events.push(Event::densified(self.clock.step + 1, change, self.engine.len()));
         }
         self.seconds += started.elapsed().as_secs_f64();
         self.cpu_seconds += cpu_started.elapsed().as_secs_f64();
@@ -348,61 +356,51 @@ impl Trainer {
             step: self.clock.step + 1,
             seconds: self.seconds,
             seconds_left: 0.0,
-            view: coming[0],
+            view,
             loss: loss.total,
             mse: loss.mse,
-            splats: self.state.len(),
+            splats: self.engine.len(),
             parameters: None,
-            visible,
-            non_finite: self.gradients.non_finite,
+            visible: self.engine.visible(),
+            non_finite: self.engine.non_finite(),
         };
         Ok((report, signal))
     }
 
-    /// Adam, and what goes with it, for the gradients of the frame of `view`.
-    fn update(&mut self, plan: &StepPlan, view: &ViewParams) {
-        let level = self.renderer.level;
-        if let Some(statistics) = plan.gathers {
-            let renderer = &self.renderer;
-            let extent = |i: usize| renderer.screen_extent(i).map_or(0.0, |e| e[0].max(e[1]));
-            self.state
-                .gather_statistics(statistics, &self.gradients, view.width, view.height, extent);
-        }
-        if !plan.regularizers.is_zero() {
-            let (weights, gradients) = (&plan.regularizers, &mut self.gradients);
-            regularize::add_gradients(level, &self.state.splats, weights, self.extent, gradients);
-        }
-        if plan.trained_share < 1.0 {
-            regularize::rest_small(&self.state.splats, plan.trained_share, &mut self.gradients);
-        }
+    /// What this step does to the splats with their gradients.
+    fn update(&self, plan: &StepPlan) -> Update {
         let mut rates = plan.rates;
         rates.means *= self.extent;
         let adam = &self.recipe.adam;
-        let step = AdamStep {
-            beta1: adam.beta1,
-            beta2: adam.beta2,
-            epsilon: adam.epsilon,
-            step: self.clock.step + 1,
-        };
-        self.state.step(level, &self.gradients, &rates, plan.sh_degree, step);
-        if plan.noise > 0.0 {
-            mcmc::add_noise(
-                &mut self.state,
-                plan.noise * rates.means,
-                self.options.seed,
-                self.clock.step,
-            );
-        }
-        if let Some(limit) = plan.condition_cap {
-            regularize::cap_condition(&mut self.state.splats, limit);
+        Update {
+            statistics: plan.gathers,
+            regularizers: plan.regularizers,
+            extent: self.extent,
+            trained_fraction: plan.trained_share,
+            rates,
+            sh_degree: plan.sh_degree,
+            adam: AdamStep {
+                beta1: adam.beta1,
+                beta2: adam.beta2,
+                epsilon: adam.epsilon,
+                step: self.clock.step + 1,
+            },
+            noise: (plan.noise > 0.0).then_some(Noise {
+                amount: plan.noise * rates.means,
+                seed: self.options.seed,
+                step: self.clock.step,
+            }),
+            condition_cap: plan.condition_cap,
         }
     }
 
     fn control_density(&mut self, plan: &StepPlan) -> Option<DensityChange> {
         let change = plan.densify.as_ref().map(|round| self.densify(round));
-        let merged = plan.merge.map(|knobs| merge::merge(&mut self.state, &knobs.options()));
+        let merged = plan
+            .merge
+            .map(|knobs| merge::merge(self.engine.state_mut(), &knobs.options()));
         if let Some(ceiling) = plan.reset_opacity {
-            classic::reset_opacity(&mut self.state, ceiling);
+            classic::reset_opacity(self.engine.state_mut(), ceiling);
         }
         if change.is_some() && self.recipe.render.smoothing_filter {
             self.update_filter();
@@ -419,7 +417,7 @@ impl Trainer {
     fn densify(&mut self, round: &Round) -> DensityChange {
         let limit = self.limit(self.clock.stage, round.count_share);
         let mut rng = Rng::new(self.options.seed ^ self.clock.step << 20, STREAM_DENSIFY);
-        let state = &mut self.state;
+        let state = self.engine.state_mut();
         match round.density {
             Density::Classic(knobs) => {
                 let options = knobs.options(self.extent, round.prune_large, limit);
@@ -449,15 +447,13 @@ impl Trainer {
             .iter()
             .map(|i| ViewParams::new(&self.dataset.views[*i].camera))
             .collect();
-        filter::update(&mut self.state, &views);
+        filter::update(self.engine.state_mut(), &views);
         self.restore_filter();
     }
 
     /// Gives the state's filter to the renderer.
     pub(crate) fn restore_filter(&mut self) {
-        if self.recipe.render.smoothing_filter {
-            self.renderer.set_filter(self.state.filter.plane(0));
-        }
+        self.engine.use_filter(self.recipe.render.smoothing_filter);
     }
 
     /// The training views' cameras.
@@ -503,11 +499,11 @@ impl Trainer {
                 .collect();
             let photo = self.photos.get(&order, plan.image_scale)?;
             let (started, cpu_started) = (Instant::now(), ProcessTime::now());
-            let camera = self.scaled_camera(view, plan.image_scale);
+            let placement = self.sockets.place(view, &self.scaled_camera(view, plan.image_scale));
             let options = self.render_options(plan.sh_degree);
-            let residual = residual::in_force(&self.residual, plan);
-            residual::render(&mut self.renderer, &self.state.splats, residual, &camera, &options);
-            self.objective.error(self.renderer.color(), &photo, false);
+            self.sockets.render(&mut self.engine, view, placement, &options, plan);
+            let color = self.sockets.frame_color(&self.engine);
+            self.objective.error(color, &photo, false);
             sum += self.objective.mean_error();
             count += 1;
             self.seconds += started.elapsed().as_secs_f64();
@@ -538,6 +534,29 @@ impl Trainer {
         }
     }
 
+    /// Camera number `view` of the dataset, at full size, as the run has come to know it.
+    pub fn camera(&self, view: usize) -> Camera {
+        self.sockets.place(view, &self.dataset.views[view].camera).camera
+    }
+
+    /// What of the held-out views must be fitted to them before they can be compared.
+    pub fn half_fit(&self) -> HalfFit {
+        HalfFit {
+            exposure: self.sockets.exposure.is_some(),
+            pose: self.sockets.poses.is_some(),
+        }
+    }
+
+    /// What the recipe makes no use of and should be known: one line each.
+    pub fn warnings(&self) -> Vec<String> {
+        let moves = self.dataset.train.iter().any(|i| self.dataset.views[*i].time.is_some());
+        let line = format!(
+            "the photographs were taken at different times and recipe {} has no use for time: what moves becomes a blur",
+            self.recipe.name
+        );
+        if moves { vec![line] } else { Vec::new() }
+    }
+
     /// The scene as a file holds it and held-out views show it: with the smoothing filter made part of it.
     pub fn scene(&self) -> Model<'_> {
         if let Some(state) = &self.field {
@@ -545,15 +564,16 @@ impl Trainer {
         }
         Model::Splats {
             splats: if self.recipe.render.smoothing_filter {
-                Cow::Owned(filter::baked(&self.state))
+                Cow::Owned(filter::baked(self.engine.state()))
             } else {
-                Cow::Borrowed(&self.state.splats)
+                Cow::Borrowed(&self.engine.state().splats)
             },
             residual: self
+                .sockets
                 .residual
                 .as_ref()
-                .filter(|state| state.step > 0)
-                .map(|state| Box::new(state.field.clone())),
+                .and_then(Residual::learnt)
+                .map(|field| Box::new(field.clone())),
         }
     }
 }

@@ -172,6 +172,7 @@ fn finish(view: DeclaredView, probed: &Probed, downscale: f32, max_side: Option<
         camera: Camera::new(view.pose?, intrinsics),
         photo: Arc::new(photo),
         depth_bounds: view.depth_bounds.and_then(usable_bounds),
+        time: view.time,
         points_seen: view.points_seen,
     })
 }

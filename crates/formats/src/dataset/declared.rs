@@ -29,6 +29,8 @@ pub(super) struct DeclaredView {
     pub camera: DeclaredCamera,
     /// Nearest and farthest depth along +Z, world units, as the file has them.
     pub depth_bounds: Option<[f64; 2]>,
+    /// In the source's own unit.
+    pub time: Option<f32>,
     pub points_seen: Vec<u32>,
     /// `None` when the dataset does not say.
     pub split: Option<Split>,

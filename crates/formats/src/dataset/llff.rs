@@ -98,6 +98,7 @@ pub(super) fn read(root: &Path, downscale: f32) -> Result<Declared, FormatError>
                     lens: Lens::Pinhole,
                 },
                 depth_bounds: Some(pose.bounds),
+                time: None,
                 points_seen: Vec::new(),
                 split: None,
             }

@@ -113,6 +113,7 @@ pub(super) fn declared_views(
                 pose: frame.pose(),
                 camera,
                 depth_bounds: None,
+                time: frame.time.map(|time| time as f32).filter(|time| time.is_finite()),
                 points_seen: Vec::new(),
                 split: split_of(&frame.file_path),
             })

@@ -33,6 +33,8 @@ pub struct Frame {
     pub transform_matrix: Vec<Vec<Option<f64>>>,
     /// The mask, relative to the file; white is kept.
     pub mask_path: Option<String>,
+    /// When it was taken (D-NeRF: 0 to 1 over the capture).
+    pub time: Option<f64>,
     /// Intrinsics of this frame alone.
     #[serde(flatten)]
     pub camera: CameraKeys,
@@ -275,6 +277,7 @@ mod tests {
             file_path: String::new(),
             transform_matrix: rows.map(|row| row.map(Some).to_vec()).to_vec(),
             mask_path: None,
+            time: None,
             camera: CameraKeys::default(),
         };
         let good = [[2.0, 0.0, 0.0, 0.0], [0.0, 2.0, 0.0, 0.0], [0.0, 0.0, 2.0, 0.0]];

@@ -94,7 +94,7 @@ pub fn run(args: &Args) -> Result<()> {
         Ok(())
     };
     for (name, camera) in &cameras {
-        let frame = model.look(&mut renderer, camera, &options);
+        let frame = model.render(&mut renderer, camera, &options);
         let image = frame.color;
         write(name, "", &image)?;
         let alpha = Image::new(image.width, image.height, 1, frame.alpha);

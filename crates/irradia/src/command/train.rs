@@ -4,7 +4,7 @@ use super::journal::Journal;
 use super::progress::{Progress, size_in_words};
 use super::{DataArgs, file_stem, lpips, lpips_path, thread_count, use_threads};
 use crate::Usage;
-use crate::run_folder::{FIELD, RESIDUAL, RunConfig, RunFolder, SCENE};
+use crate::run_folder::{FIELD, RunConfig, RunFolder, SCENE};
 use crate::terminal::{note, one_line, say};
 use anyhow::{Context, Result, anyhow};
 use clap::builder::RangedU64ValueParser;
@@ -12,7 +12,7 @@ use irradia_compute::Level;
 use irradia_formats::{write_png, write_splats};
 use irradia_measure::{Evaluation, Lpips};
 use irradia_scene::{Image, sh};
-use irradia_train::eval::{EvaluatedView, Metrics, evaluate_views, mean};
+use irradia_train::eval::{EvalOptions, EvaluatedView, Metrics, evaluate_views, mean, mean_half_fit};
 use irradia_train::event::Observer;
 use irradia_train::model::Model;
 use irradia_train::recipe::Param;
@@ -167,7 +167,7 @@ fn begin(args: &Args, lpips: Option<Arc<Lpips>>) -> Result<(RunFolder, RunConfig
     };
     folder.write_config(&config)?;
     folder.write("recipe.toml", trainer.recipe.to_toml().as_bytes())?;
-    folder.write_cameras(&trainer.dataset)?;
+    folder.write_cameras(&trainer.dataset, |view| trainer.camera(view))?;
     Ok((folder, config, trainer))
 }
 
@@ -244,13 +244,15 @@ fn finish(folder: RunFolder, mut config: RunConfig, mut trainer: Trainer, starte
     journal.finish();
 
     match trainer.scene() {
-        Model::Splats { splats, residual } => {
+        Model::Splats { splats, .. } => {
             let mut cloud = splats.to_cloud();
             cloud.antialiased = trainer.recipe.render.antialias;
             write_splats(&folder.file(SCENE), &cloud)?;
-            if let Some(field) = residual {
-                folder.write(RESIDUAL, &field_file::to_bytes(&field))?;
+            for (name, bytes) in trainer.sockets.files() {
+                folder.write(&name, &bytes)?;
             }
+            // With the poses that the run has come to.
+            folder.write_cameras(&trainer.dataset, |view| trainer.camera(view))?;
         }
         Model::Field(field) => folder.write(FIELD, &field_file::to_bytes(&field))?,
     }
@@ -259,20 +261,25 @@ fn finish(folder: RunFolder, mut config: RunConfig, mut trainer: Trainer, starte
     let lpips = trainer.options.lpips.clone();
     let mut views = Vec::new();
     let mut metrics: Vec<Evaluation> = Vec::new();
-    let options = trainer.render_options(sh::MAX_DEGREE);
+    let mut half_fits = Vec::new();
+    let options = EvalOptions {
+        render: trainer.render_options(sh::MAX_DEGREE),
+        metrics: Metrics::All(lpips.as_deref()),
+        half_fit: trainer.half_fit(),
+    };
     let mut outcome = Ok(());
     evaluate_views(
         &trainer.scene(),
         &trainer.dataset,
         &trainer.dataset.test,
         &options,
-        Metrics::All(lpips.as_deref()),
         |view| {
             let report = write_view(&folder, &view);
             match report {
                 Ok(report) => views.push(report),
                 Err(error) => outcome = Err(error),
             }
+            half_fits.extend(view.half_fit_psnr);
             metrics.push(view.metrics);
         },
     )?;
@@ -294,12 +301,13 @@ fn finish(folder: RunFolder, mut config: RunConfig, mut trainer: Trainer, starte
         seconds: trainer.seconds,
         cpu_seconds: trainer.cpu_seconds,
         total_seconds: started.elapsed().as_secs_f64(),
-        splats: trainer.state.len() as u64,
+        splats: trainer.engine.len() as u64,
         parameters: trainer.parameters().map(|n| n as u64),
         peak_rss_bytes: peak_rss_bytes(),
         psnr: mean.psnr,
         ssim: mean.ssim,
         lpips: mean.lpips,
+        half_fit_psnr: mean_half_fit(&half_fits),
         views,
         schedule: schedule(
             &trainer.recipe,
@@ -318,10 +326,13 @@ fn finish(folder: RunFolder, mut config: RunConfig, mut trainer: Trainer, starte
     config.complete = trainer.finished();
     folder.write_config(&config)?;
     say(format_args!(
-        "held-out PSNR {:.2} dB, SSIM {:.4}{}; {}, {:.1} s of training",
+        "held-out PSNR {:.2} dB, SSIM {:.4}{}{}; {}, {:.1} s of training",
         report.psnr,
         report.ssim,
         report.lpips.map_or(String::new(), |l| format!(", LPIPS {l:.4}")),
+        report.half_fit_psnr.map_or(String::new(), |psnr| format!(
+            ", {psnr:.2} dB on right halves fitted on left ones"
+        )),
         size_in_words(report.splats, report.parameters),
         report.seconds
     ))?;
@@ -360,6 +371,7 @@ fn write_view(folder: &RunFolder, view: &EvaluatedView) -> Result<ViewReport> {
         psnr: view.metrics.psnr,
         ssim: view.metrics.ssim,
         lpips: view.metrics.lpips,
+        half_fit_psnr: view.half_fit_psnr,
         truth: write("truth", &view.truth)?,
         render: write("render", &view.render)?,
         error: write("error", &error_image(view))?,

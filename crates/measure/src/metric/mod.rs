@@ -1,9 +1,11 @@
 //! Metrics for reports: PSNR, SSIM and LPIPS of a render against its photograph.
 
+mod affine;
 mod lpips;
 mod psnr;
 mod ssim;
 
+pub use affine::Affine;
 pub use lpips::{Lpips, LpipsError};
 pub(crate) use lpips::{Map, Network};
 pub use psnr::{psnr, psnr_masked};

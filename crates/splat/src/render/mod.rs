@@ -52,9 +52,6 @@ impl Default for RenderOptions {
     }
 }
 
-/// What is added to the colours of the splats it is told, `[r, g, b]` each.
-pub type Shade<'a> = &'a dyn Fn(&[u32]) -> Vec<[f32; 3]>;
-
 /// Gradients of the loss with regard to a frame.
 #[derive(Clone, Copy, Debug)]
 pub struct OutputGradient<'a> {
@@ -81,6 +78,17 @@ impl<'a> OutputGradient<'a> {
             camera: false,
         }
     }
+}
+
+/// A rendered frame, plane by plane.
+#[derive(Clone, Copy, Debug)]
+pub struct FramePlanes<'a> {
+    /// `[3, H, W]`, not clamped.
+    pub color: &'a [f32],
+    /// `[H, W]`, one minus the transmittance that is left.
+    pub alpha: &'a [f32],
+    /// `[H, W]`, depth along +Z accumulated with the blending weights; empty when not asked for.
+    pub depth: &'a [f32],
 }
 
 /// What backward sums up for density control, beside the gradients.
@@ -196,6 +204,15 @@ impl Renderer {
         &self.depth
     }
 
+    /// The last frame.
+    pub fn frame(&self) -> FramePlanes<'_> {
+        FramePlanes {
+            color: &self.color,
+            alpha: &self.alpha,
+            depth: &self.depth,
+        }
+    }
+
     /// Splats that touched the last frame.
     pub fn visible(&self) -> usize {
         self.bins.visible()
@@ -204,6 +221,11 @@ impl Renderer {
     /// Splat-tile pairs of the last frame.
     pub fn tile_entries(&self) -> usize {
         self.bins.entry_count()
+    }
+
+    /// Width and height of the last frame, pixels.
+    pub(crate) fn size(&self) -> Option<[u32; 2]> {
+        self.view.as_ref().map(|view| [view.width, view.height])
     }
 
     /// Half size of splat `i`'s box in the last frame in pixels, `None` where it was not visible.
@@ -221,41 +243,57 @@ impl Renderer {
 
     /// Renders `splats` into this renderer's buffers.
     pub fn render(&mut self, splats: &Splats, view: &ViewParams, options: &RenderOptions) {
-        self.render_shaded(splats, view, options, None);
+        self.project_chunks(splats, view, options, true);
+        self.composite();
     }
 
-    /// As [`Self::render`], with something added to colours before they are clamped at 0: `shade` is told the splats in view,
-    /// in ascending order, and gives `[r, g, b]` for each. The gradient of what it gives is that of the splats' DC
-    /// coefficient over [`irradia_scene::sh::C0`].
-    pub fn render_shaded(&mut self, splats: &Splats, view: &ViewParams, options: &RenderOptions, shade: Option<Shade>) {
-        assert!(
-            self.filter.is_empty() || self.filter.len() == splats.stride(),
-            "a filter for every splat, with padding"
-        );
-        self.project(splats, view, options, shade.is_none());
-        if let Some(shade) = shade {
-            self.in_view.clear();
-            let seen = |i: &u32| self.depth_keys[*i as usize] != u32::MAX;
-            self.in_view.extend((0..splats.len() as u32).filter(seen));
-            for (i, added) in self.in_view.iter().zip(shade(&self.in_view)) {
-                let color = &mut self.footprints[*i as usize].color;
-                *color = std::array::from_fn(|c| (color[c] + added[c]).max(0.0));
-            }
-        }
-        self.bins
-            .build(self.level, view.width, view.height, &self.footprints, &self.depth_keys);
-        self.blend(view, options);
-        self.view = Some(view.clone());
-        self.options = *options;
+    /// The first half of a frame to whose colours something is added: `splats` are projected, colours not yet clamped.
+    /// [`Self::add_colors`] and [`Self::composite`] must follow.
+    pub fn project(&mut self, splats: &Splats, view: &ViewParams, options: &RenderOptions) {
+        self.project_chunks(splats, view, options, false);
+        self.in_view.clear();
+        let seen = |i: &u32| self.depth_keys[*i as usize] != u32::MAX;
+        self.in_view.extend((0..splats.len() as u32).filter(seen));
     }
 
-    /// Splats in view of the last [`Self::render_shaded`] with a shade, ascending.
+    /// Splats in view of the last [`Self::project`], ascending.
     pub fn in_view(&self) -> &[u32] {
         &self.in_view
     }
 
-    fn project(&mut self, splats: &Splats, view: &ViewParams, options: &RenderOptions, clamp: bool) {
+    /// Adds `[r, g, b]` to the colour of each of [`Self::in_view`], then clamps it at 0. The gradient of what is added is
+    /// that of the splat's DC coefficient over [`irradia_scene::sh::C0`].
+    ///
+    /// # Panics
+    /// When there is not one colour a splat in view.
+    pub fn add_colors(&mut self, added: &[[f32; 3]]) {
+        assert_eq!(added.len(), self.in_view.len(), "a colour for each splat in view");
+        for (i, added) in self.in_view.iter().zip(added) {
+            let color = &mut self.footprints[*i as usize].color;
+            *color = std::array::from_fn(|c| (color[c] + added[c]).max(0.0));
+        }
+    }
+
+    /// The second half of a frame: what was projected is binned and blended.
+    ///
+    /// # Panics
+    /// When nothing was projected.
+    pub fn composite(&mut self) {
+        let view = self.view.clone().expect("projection comes first");
+        let options = self.options;
+        self.bins
+            .build(self.level, view.width, view.height, &self.footprints, &self.depth_keys);
+        self.blend(&view, &options);
+    }
+
+    fn project_chunks(&mut self, splats: &Splats, view: &ViewParams, options: &RenderOptions, clamp: bool) {
         let stride = splats.stride();
+        assert!(
+            self.filter.is_empty() || self.filter.len() == stride,
+            "a filter for every splat, with padding"
+        );
+        self.view = Some(view.clone());
+        self.options = *options;
         self.footprints.resize(stride, Footprint2d::default());
         self.depth_keys.resize(stride, u32::MAX);
         let (level, filter) = (self.level, &self.filter);

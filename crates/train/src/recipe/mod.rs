@@ -88,6 +88,12 @@ pub struct Recipe {
     /// The radiance field of the stages that train one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub field: Option<FieldKnobs>,
+    /// Each photograph has an exposure and white balance of its own, an affine map of colours.
+    #[serde(default, skip_serializing_if = "is_false")]
+    pub exposure: bool,
+    /// The photographs put their cameras' poses right.
+    #[serde(default, skip_serializing_if = "is_false")]
+    pub refine_poses: bool,
     /// What adds to the splats' colours.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub residual: Option<ResidualKnobs>,
@@ -247,9 +253,31 @@ impl Recipe {
             }
         })?;
         recipe.validate().map_err(invalid)?;
+        recipe.complete_sockets();
         let ingredients = recipe.ingredients;
         ingredients.apply(&mut recipe);
         Ok(recipe)
+    }
+
+    /// Gives what sits in a socket a rate where the recipe has none: a value that falls over the run, as all others do.
+    fn complete_sockets(&mut self) {
+        let mut default = |wanted: bool, param: Param, from: f64, to: f64| {
+            if wanted {
+                let shape = Shape::Log;
+                let ramp = Knob::Ramp {
+                    from: Some(from),
+                    to,
+                    shape,
+                };
+                self.params.entry(param).or_insert(ramp);
+            }
+        };
+        let (exposure, poses) = (self.exposure, self.refine_poses);
+        // A photograph comes up 30 to 100 times in a run, and gains of 1.6 must be reached in them.
+        default(exposure, Param::RateExposure, 0.03, 0.001);
+        default(exposure, Param::ExposureReg, 0.01, 0.001);
+        // Half a degree (9e-3) within as many steps.
+        default(poses, Param::RatePoses, 1e-3, 1e-5);
     }
 
     /// The resolved recipe as TOML, to be written into the run.
@@ -328,6 +356,10 @@ impl Recipe {
         }
         Ok(())
     }
+}
+
+fn is_false(value: &bool) -> bool {
+    !value
 }
 
 impl Recipe {

@@ -75,11 +75,17 @@ pub enum Param {
     DistortionWeight,
     /// From 0.5 on, for the rest of the run, the residual field of a recipe that has one adds to the splats' colours.
     Residual,
+    /// Learning rate of the photographs' exposures, where the recipe has `exposure`.
+    RateExposure,
+    /// Weight of the mean squared difference of a photograph's exposure from none.
+    ExposureReg,
+    /// Learning rate of the poses, radians and units of the scene's extent, where the recipe has `refine_poses`.
+    RatePoses,
 }
 
 impl Param {
     /// All of them, in order.
-    pub const ALL: [Param; 32] = [
+    pub const ALL: [Param; 35] = [
         Param::ImageScale,
         Param::ShDegree,
         Param::CountShare,
@@ -112,6 +118,9 @@ impl Param {
         Param::InterlevelWeight,
         Param::DistortionWeight,
         Param::Residual,
+        Param::RateExposure,
+        Param::ExposureReg,
+        Param::RatePoses,
     ];
 
     /// As recipes write it.

@@ -56,6 +56,10 @@ pub struct Report {
     pub ssim: f64,
     /// Mean over the held-out views; `None` without the network's weights.
     pub lpips: Option<f64>,
+    /// PSNR in dB over the right halves of the held-out views, after their exposure or pose was fitted on their left
+    /// halves; `None` where the recipe learns neither.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub half_fit_psnr: Option<f64>,
     /// The held-out views.
     pub views: Vec<ViewReport>,
     /// The stages of the recipe, in order.
@@ -84,6 +88,9 @@ pub struct ViewReport {
     pub ssim: f64,
     /// Perceptual distance, where there are weights.
     pub lpips: Option<f64>,
+    /// PSNR in dB of the right half after a fit on the left half, where the report has it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub half_fit_psnr: Option<f64>,
     /// The photograph, a path relative to the report with forward slashes; empty where none was written.
     pub truth: String,
     /// The rendering, likewise.

@@ -74,6 +74,8 @@ pub struct StepPlan {
     pub rates: Rates,
     /// What a stage of field is trained by.
     pub field: FieldPlan,
+    /// What sits in the sockets of a step is trained by.
+    pub sockets: SocketPlan,
     /// Density statistics to gather.
     pub gathers: Option<Statistics>,
     /// A round of density control, after the step.
@@ -109,6 +111,17 @@ pub struct FieldPlan {
     pub look: bool,
     /// The residual field adds to the splats' colours.
     pub residual: bool,
+}
+
+/// Rates and weights of what sits in the sockets of a step.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct SocketPlan {
+    /// Learning rate of the exposures.
+    pub exposure_rate: f32,
+    /// Weight of the mean squared difference of exposures from the identity.
+    pub exposure_reg: f32,
+    /// Learning rate of the poses, radians, and units of the scene's extent.
+    pub pose_rate: f32,
 }
 
 /// Weights of what a frame is compared by.
@@ -318,6 +331,11 @@ pub fn plan(recipe: &Recipe, clock: &Clock) -> StepPlan {
             distortion: of(Param::DistortionWeight) as f32,
             look: is_due(clock, LOOK_EVERY),
             residual: of(Param::Residual) >= 0.5,
+        },
+        sockets: SocketPlan {
+            exposure_rate: of(Param::RateExposure) as f32,
+            exposure_reg: of(Param::ExposureReg) as f32,
+            pose_rate: of(Param::RatePoses) as f32,
         },
         gathers: density.map(|density| density.statistics()),
         densify: density

@@ -154,6 +154,7 @@ pub(super) fn read(root: &Path, downscale: f32) -> Result<Declared, FormatError>
             pose: pose(&image),
             camera,
             depth_bounds: None,
+            time: None,
             points_seen,
             split: None,
         });

@@ -1,0 +1,139 @@
+//! Writes a copy of a dataset with made-up faults, to measure what cures them:
+//!
+//! ```text
+//! cargo run --release --example injure -- DATA OUT --gains 0.6,1.6 --balance 0.15      # exposure and white balance a photograph
+//! cargo run --release --example injure -- DATA OUT --pose-noise 0.5,0.005              # degrees, fraction of the scene's extent
+//! ```
+//!
+//! The copy is a nerfstudio folder with the split of the original, undistorted PNG images and its points. Faults hit all
+//! photographs, held-out ones too. Known tracks of points are not copied.
+
+use anyhow::{Context, Result, bail};
+use clap::Parser;
+use glam::{Mat4, Quat, Vec3};
+use irradia_formats::{DatasetOptions, read_dataset, write_atomic, write_png};
+use irradia_scene::{Camera, Dataset, PointCloud, Rng};
+use irradia_splat::init::camera_extent;
+use rayon::prelude::*;
+use serde_json::{Value, json};
+use std::path::{Path, PathBuf};
+
+#[derive(Parser)]
+struct Args {
+    /// The dataset
+    data: PathBuf,
+    /// Folder for the copy
+    out: PathBuf,
+    /// Divide the images' sides by this
+    #[arg(long, default_value_t = 1.0)]
+    downscale: f32,
+    /// A factor a photograph on its sRGB colours, log-uniform between these
+    #[arg(long, value_name = "FROM,TO", value_delimiter = ',', num_args = 2)]
+    gains: Option<Vec<f32>>,
+    /// A factor a channel and photograph, uniform between 1 - this and 1 + this
+    #[arg(long, default_value_t = 0.0)]
+    balance: f32,
+    /// Standard deviations of the poses' rotation in degrees and of their position in extents of the scene
+    #[arg(long, value_name = "DEG,FRACTION", value_delimiter = ',', num_args = 2)]
+    pose_noise: Option<Vec<f32>>,
+    /// Random seed
+    #[arg(long, default_value_t = 0)]
+    seed: u64,
+}
+
+fn main() -> Result<()> {
+    let args = Args::parse();
+    let options = DatasetOptions {
+        downscale: args.downscale,
+        ..DatasetOptions::default()
+    };
+    let dataset = read_dataset(&args.data, &options)?;
+    if args.out.join("transforms.json").exists() {
+        bail!("{} already holds a dataset: give another folder", args.out.display());
+    }
+    std::fs::create_dir_all(args.out.join("images")).with_context(|| format!("cannot make {}", args.out.display()))?;
+    let frames: Vec<Value> = (0..dataset.views.len())
+        .into_par_iter()
+        .map(|view| write_view(&args, &dataset, view))
+        .collect::<Result<_>>()?;
+    let files = |views: &[usize]| -> Vec<Value> { views.iter().map(|i| frames[*i]["file_path"].clone()).collect() };
+    let mut transforms = json!({
+        "train_filenames": files(&dataset.train), "test_filenames": files(&dataset.test),
+        "val_filenames": [], "frames": frames,
+    });
+    if let Some(points) = &dataset.points {
+        transforms["ply_file_path"] = json!("points.ply");
+        write_points(&args.out.join("points.ply"), points)?;
+    }
+    let bytes = serde_json::to_vec_pretty(&transforms)?;
+    write_atomic(&args.out.join("transforms.json"), |file| file.write_all(&bytes))?;
+    println!("{}: {} photographs", args.out.display(), dataset.views.len());
+    Ok(())
+}
+
+/// Writes one photograph; its frame of `transforms.json`.
+fn write_view(args: &Args, dataset: &Dataset, view: usize) -> Result<Value> {
+    let cameras: Vec<Camera> = dataset.train.iter().map(|i| dataset.views[*i].camera).collect();
+    let extent = camera_extent(&cameras);
+    let mut rng = Rng::new(args.seed, view as u64);
+    let gain = args
+        .gains
+        .as_ref()
+        .map_or(1.0, |range| rng.range(range[0].ln(), range[1].ln()).exp());
+    let factors = [0; 3].map(|_| gain * rng.range(1.0 - args.balance, 1.0 + args.balance));
+    let source = &dataset.views[view];
+    let mut photo = source.photo.load()?;
+    let channels = photo.channels as usize;
+    for pixel in photo.data.chunks_exact_mut(channels) {
+        for (value, factor) in pixel.iter_mut().zip(factors) {
+            *value = (f32::from(*value) * factor).round().min(255.0) as u8;
+        }
+    }
+    let name = format!("images/{view:05}.png");
+    write_png(
+        &args.out.join(&name),
+        photo.width,
+        photo.height,
+        photo.channels,
+        &photo.data,
+    )?;
+
+    let Camera {
+        mut pose,
+        intrinsics: k,
+        ..
+    } = source.camera;
+    if let Some(noise) = &args.pose_noise {
+        let vector = |rng: &mut Rng| Vec3::from_array([0; 3].map(|_| rng.normal()));
+        // Each axis has a third of the variance.
+        let turn = vector(&mut rng) * (noise[0].to_radians() / 3f32.sqrt());
+        pose.rotation *= Quat::from_scaled_axis(turn);
+        pose.position += vector(&mut rng) * (noise[1] * extent / 3f32.sqrt());
+    }
+    // OpenGL axes: y up, z backward.
+    let rotation = pose.rotation * Quat::from_rotation_x(std::f32::consts::PI);
+    let matrix = Mat4::from_rotation_translation(rotation, pose.position);
+    let mut frame = json!({
+        "file_path": name, "transform_matrix": matrix.transpose().to_cols_array_2d(),
+        "w": k.width, "h": k.height, "fl_x": k.fx, "fl_y": k.fy, "cx": k.cx, "cy": k.cy,
+    });
+    if let Some(mask) = &photo.mask {
+        let name = format!("images/{view:05}.mask.png");
+        write_png(&args.out.join(&name), photo.width, photo.height, 1, mask)?;
+        frame["mask_path"] = json!(name);
+    }
+    Ok(frame)
+}
+
+fn write_points(path: &Path, points: &PointCloud) -> Result<()> {
+    let mut text = format!(
+        "ply\nformat ascii 1.0\nelement vertex {}\nproperty float x\nproperty float y\nproperty float z\n\
+         property uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n",
+        points.len()
+    );
+    for (p, c) in points.positions.iter().zip(&points.colors) {
+        text += &format!("{} {} {} {} {} {}\n", p.x, p.y, p.z, c[0], c[1], c[2]);
+    }
+    write_atomic(path, |file| file.write_all(text.as_bytes()))?;
+    Ok(())
+}

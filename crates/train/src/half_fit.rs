@@ -1,0 +1,209 @@
+//! What a held-out photograph alone can say of itself is fitted on its left half, and the right half is measured.
+//!
+//! Training cannot know the exposure or the exact pose of a photograph that it never saw. Where a recipe learns these for
+//! its training views, held-out views are therefore given theirs from pixels that are then not scored (Martin-Brualla et
+//! al. 2021, "NeRF in the Wild", section 5, do so for appearance codes).
+
+use crate::model::{Model, RenderOptions};
+use crate::socket::{PerViewAdam, tangent_gradient, turned};
+use irradia_measure::{Affine, psnr_masked};
+use irradia_scene::{Camera, Image, Photo};
+use irradia_splat::{OutputGradient, Renderer, SplatGradients};
+
+/// What is fitted.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct HalfFit {
+    /// An affine map of colours.
+    pub exposure: bool,
+    /// The camera's pose; of a field it stays as it is.
+    pub pose: bool,
+}
+
+/// Steps of the pose's descent: the first half of them at half size.
+const STEPS: usize = 100;
+/// Their rates in radians, and in units of the scene's extent: from, to.
+const RATES: [f32; 2] = [1e-3, 1e-5];
+
+impl HalfFit {
+    /// Whether anything is fitted.
+    pub fn any(self) -> bool {
+        self.exposure || self.pose
+    }
+}
+
+/// A photograph that was not trained on.
+#[derive(Clone, Copy)]
+pub struct HeldOut<'a> {
+    /// Its camera, as the dataset has it.
+    pub camera: &'a Camera,
+    /// The photograph over the background, `[H, W, 3]`.
+    pub truth: &'a Image,
+    /// `[H, W]`, 0 where the photograph does not count.
+    pub mask: Option<&'a [u8]>,
+    /// How the scene is rendered.
+    pub options: &'a RenderOptions,
+    /// Size of the scene, world units.
+    pub extent: f32,
+}
+
+/// PSNR in dB over the right half of a held-out view, after what `fit` says was fitted on its left half.
+pub fn half_fit_psnr(model: &Model, renderer: &mut Renderer, view: &HeldOut, fit: HalfFit) -> f64 {
+    let HeldOut {
+        truth, mask, options, ..
+    } = *view;
+    let camera = if fit.pose {
+        fitted_pose(model, renderer, view, fit)
+    } else {
+        *view.camera
+    };
+    let render = model.render(renderer, &camera, options).color;
+    let width = truth.width as usize;
+    let counts = |i: usize| mask.is_none_or(|mask| mask[i] != 0);
+    let render = if fit.exposure {
+        Affine::fit(&render, truth, |i| counts(i) && is_left(i, width)).apply_to(&render)
+    } else {
+        render
+    };
+    let right: Vec<u8> = (0..width * truth.height as usize)
+        .map(|i| u8::from(counts(i) && !is_left(i, width)) * 255)
+        .collect();
+    psnr_masked(&render.rounded_to_8_bits(), truth, Some(&right))
+}
+
+fn is_left(pixel: usize, width: usize) -> bool {
+    pixel % width < width / 2
+}
+
+/// The pose at which the left half is met best, by gradient descent from `camera`.
+fn fitted_pose(model: &Model, renderer: &mut Renderer, view: &HeldOut, fit: HalfFit) -> Camera {
+    let HeldOut {
+        truth,
+        mask,
+        options,
+        extent,
+        ..
+    } = *view;
+    let Some(splats) = model.splats() else {
+        return *view.camera;
+    };
+    let (mut camera, size) = (*view.camera, view.camera.intrinsics);
+    let mut adam = PerViewAdam::<6>::new(1);
+    let mut gradients = SplatGradients::default();
+    let photo = Photo {
+        width: truth.width,
+        height: truth.height,
+        channels: 3,
+        data: truth.to_u8(),
+        mask: mask.map(<[u8]>::to_vec),
+    };
+    for (step, scale) in (0..STEPS).map(|step| (step, if 2 * step < STEPS { 0.5 } else { 1.0 })) {
+        camera.intrinsics = size.scaled(scale);
+        let (width, height) = (camera.intrinsics.width, camera.intrinsics.height);
+        let target = photo.resized(width, height);
+        let truth = Image::new(
+            width,
+            height,
+            3,
+            target.data.iter().map(|v| f32::from(*v) / 255.0).collect(),
+        );
+        let counts = |i: usize| is_left(i, width as usize) && target.mask.as_ref().is_none_or(|mask| mask[i] != 0);
+        let render = model.render(renderer, &camera, options).color;
+        let map = if fit.exposure {
+            Affine::fit(&render, &truth, counts)
+        } else {
+            Affine::IDENTITY
+        };
+        let v_color = squared_error_gradient(&render, &truth, &map, counts);
+        let v_out = OutputGradient {
+            camera: true,
+            ..OutputGradient::of_color(&v_color)
+        };
+        renderer.backward(splats, &v_out, &mut gradients);
+        let gradient = gradients.camera.unwrap_or_default();
+        let passed = step as f32 / STEPS as f32;
+        let rate = RATES[0] * (RATES[1] / RATES[0]).powf(passed);
+        let shift = rate * extent;
+        let v = tangent_gradient(&camera, &gradient);
+        let change = adam.step(0, v, [rate, rate, rate, shift, shift, shift]);
+        camera = turned(&camera, change);
+    }
+    camera.intrinsics = size;
+    camera
+}
+
+/// The gradient `[3, H, W]` of the sum of squared differences between `map` of `render` and `truth` over the pixels that count.
+fn squared_error_gradient(render: &Image, truth: &Image, map: &Affine, counts: impl Fn(usize) -> bool) -> Vec<f32> {
+    let pixels = (render.width * render.height) as usize;
+    let mut v_color = vec![0.0; 3 * pixels];
+    let both = render.data.as_chunks::<3>().0.iter().zip(truth.data.as_chunks::<3>().0);
+    for (i, (x, y)) in both.enumerate().filter(|(i, _)| counts(*i)) {
+        let mapped = map.apply(*x);
+        for k in 0..3 {
+            let v = (0..3)
+                .map(|c| map.matrix[c][k] as f32 * (mapped[c] - y[c]))
+                .sum::<f32>();
+            v_color[k * pixels + i] = 2.0 * v;
+        }
+    }
+    v_color
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use glam::Vec3;
+    use irradia_scene::{Intrinsics, Pose, Rng};
+    use irradia_splat::Splats;
+    use std::borrow::Cow;
+
+    /// Opaque blobs of many colours before a camera.
+    fn scene() -> (Model<'static>, Camera) {
+        let mut rng = Rng::new(5, 5);
+        let mut splats = Splats::zeros(400, 0);
+        for i in 0..400 {
+            splats.quats.set(0, i, 1.0);
+            splats.opacity_logits.set(0, i, 3.0);
+            for c in 0..3 {
+                splats.means.set(c, i, rng.range(-1.0, 1.0));
+                splats.log_scales.set(c, i, rng.range(-2.5, -1.5));
+                splats.sh.set(c, i, rng.range(-1.2, 1.2));
+            }
+        }
+        let camera = Camera::new(
+            Pose::look_at(Vec3::new(0.0, 0.0, -3.0), Vec3::ZERO, Vec3::NEG_Y),
+            Intrinsics::from_fov_x(96, 64, 0.7),
+        );
+        let splats = Cow::Owned(splats);
+        (Model::Splats { splats, residual: None }, camera)
+    }
+
+    #[test]
+    fn a_turned_camera_and_a_darker_photograph_are_found_from_the_left_half() {
+        let (model, camera) = scene();
+        let (mut renderer, options) = (Renderer::new(), RenderOptions::default());
+        let mut truth = model.render(&mut renderer, &camera, &options).color;
+        truth.data.iter_mut().for_each(|v| *v *= 0.7);
+        let truth = truth.rounded_to_8_bits();
+        let off = turned(&camera, [0.006, -0.008, 0.004, 0.01, 0.0, -0.01]);
+        let mut psnr = |exposure, pose| {
+            let fit = HalfFit { exposure, pose };
+            let view = HeldOut {
+                camera: &off,
+                truth: &truth,
+                mask: None,
+                options: &options,
+                extent: 1.0,
+            };
+            half_fit_psnr(&model, &mut renderer, &view, fit)
+        };
+        let [neither, exposure, pose, both] = [
+            psnr(false, false),
+            psnr(true, false),
+            psnr(false, true),
+            psnr(true, true),
+        ];
+        eprintln!("neither {neither:.1}, exposure {exposure:.1}, pose {pose:.1}, both {both:.1} dB");
+        assert!(exposure > neither + 2.0 && both > exposure + 8.0 && both > pose + 8.0);
+        assert!(both > 38.0, "8 bits allow about 50 dB, the descent's last rate less");
+    }
+}

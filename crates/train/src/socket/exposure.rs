@@ -1,0 +1,237 @@
+//! After blending: an affine map of colours for each photograph.
+//!
+//! What a camera's automatic exposure and white balance did to a photograph (Kerbl et al., "Hierarchical 3D Gaussians",
+//! 2024, train the same 3 x 4 matrix): `y = A x + b` in the photograph's own, sRGB-encoded colours. Above 1 a photograph is
+//! white, and so is `y`.
+
+use super::Occupant;
+use super::per_view::PerViewAdam;
+use crate::schedule::SocketPlan;
+use crate::tensor_file::{NamedTensor, TensorSource, to_bytes};
+use irradia_measure::Affine;
+use rayon::prelude::*;
+
+/// Numbers of a view: A row by row, then b.
+const N: usize = 12;
+const IDENTITY: [f32; N] = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0];
+/// Pixels whose gradients are added up together: a fixed number, so that threads change no bit of the sum.
+const PIECE: usize = 4096;
+
+/// An affine map of colours for each view, the identity at first.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Exposure {
+    /// `[views][N]`.
+    maps: Vec<[f32; N]>,
+    adam: PerViewAdam<N>,
+}
+
+impl Exposure {
+    /// For `views` views.
+    pub fn new(views: usize) -> Self {
+        Self {
+            maps: vec![IDENTITY; views],
+            adam: PerViewAdam::new(views),
+        }
+    }
+
+    /// The map of `view`.
+    pub fn of(&self, view: usize) -> Affine {
+        let m = self.maps[view].map(f64::from);
+        Affine {
+            matrix: std::array::from_fn(|i| std::array::from_fn(|j| m[3 * i + j])),
+            offset: [m[9], m[10], m[11]],
+        }
+    }
+
+    /// `color` `[3, H, W]` as the photograph of `view` shows it, at most 1.
+    pub fn develop(&self, view: usize, color: &[f32], to: &mut Vec<f32>) {
+        let (m, pixels) = (&self.maps[view], color.len() / 3);
+        to.resize(color.len(), 0.0);
+        to.par_chunks_mut(pixels.max(1)).enumerate().for_each(|(c, plane)| {
+            let row = [m[3 * c], m[3 * c + 1], m[3 * c + 2]];
+            for (i, y) in plane.iter_mut().enumerate() {
+                let x = [color[i], color[pixels + i], color[2 * pixels + i]];
+                *y = affine(row, m[9 + c], x).min(1.0);
+            }
+        });
+    }
+
+    /// The vector-Jacobian product of [`Self::develop`]: `v` `[3, H, W]` becomes the gradient of `color`; returns that of the
+    /// view's numbers. Where the photograph is white at most, only what makes it darker passes.
+    pub fn vjp(&self, view: usize, color: &[f32], v: &mut [f32]) -> [f32; N] {
+        let (m, pixels) = (&self.maps[view], color.len() / 3);
+        let (red, rest) = v.split_at_mut(pixels);
+        let (green, blue) = rest.split_at_mut(pixels);
+        let pieces = red
+            .par_chunks_mut(PIECE)
+            .zip(green.par_chunks_mut(PIECE))
+            .zip(blue.par_chunks_mut(PIECE));
+        let sums: Vec<[f64; N]> = pieces
+            .enumerate()
+            .map(|(piece, ((red, green), blue))| {
+                let mut sum = [0.0f64; N];
+                for i in 0..red.len() {
+                    let at = piece * PIECE + i;
+                    let x = [color[at], color[pixels + at], color[2 * pixels + at]];
+                    let mut v_y = [red[i], green[i], blue[i]];
+                    for c in 0..3 {
+                        let y = affine([m[3 * c], m[3 * c + 1], m[3 * c + 2]], m[9 + c], x);
+                        if y > 1.0 {
+                            v_y[c] = v_y[c].max(0.0);
+                        }
+                        for k in 0..3 {
+                            sum[3 * c + k] += f64::from(v_y[c] * x[k]);
+                        }
+                        sum[9 + c] += f64::from(v_y[c]);
+                    }
+                    let v_x: [f32; 3] = std::array::from_fn(|k| m[k] * v_y[0] + m[3 + k] * v_y[1] + m[6 + k] * v_y[2]);
+                    (red[i], green[i], blue[i]) = (v_x[0], v_x[1], v_x[2]);
+                }
+                sum
+            })
+            .collect();
+        let mut total = [0.0f64; N];
+        for sum in sums {
+            for (total, sum) in total.iter_mut().zip(sum) {
+                *total += sum;
+            }
+        }
+        total.map(|v| v as f32)
+    }
+
+    /// [`Self::vjp`] and a step of Adam on `view`, drawn to the identity by the plan's weight on the mean squared difference.
+    pub fn step(&mut self, view: usize, color: &[f32], v: &mut [f32], plan: &SocketPlan) {
+        let mut gradient = self.vjp(view, color, v);
+        for ((g, value), identity) in gradient.iter_mut().zip(self.maps[view]).zip(IDENTITY) {
+            *g += plan.exposure_reg * 2.0 / N as f32 * (value - identity);
+        }
+        let change = self.adam.step(view, gradient, [plan.exposure_rate; N]);
+        for (value, change) in self.maps[view].iter_mut().zip(change) {
+            *value += change;
+        }
+    }
+}
+
+fn affine(row: [f32; 3], offset: f32, x: [f32; 3]) -> f32 {
+    row[0] * x[0] + row[1] * x[1] + row[2] * x[2] + offset
+}
+
+impl Occupant for Exposure {
+    fn name(&self) -> &'static str {
+        "exposure"
+    }
+
+    fn tensors(&self) -> Vec<NamedTensor> {
+        let maps = NamedTensor::real("maps", vec![self.maps.len(), N], self.maps.as_flattened());
+        std::iter::once(maps).chain(self.adam.tensors()).collect()
+    }
+
+    fn restore(&mut self, tensors: TensorSource) -> Result<(), String> {
+        self.maps = tensors.rows::<N>("maps", self.maps.len())?;
+        self.adam.restore(tensors)
+    }
+
+    fn export(&self) -> Option<Vec<u8>> {
+        let maps = NamedTensor::real("maps", vec![self.maps.len(), N], self.maps.as_flattened());
+        Some(to_bytes(&[maps], ("irradia_exposure", "1".into())))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use irradia_scene::Rng;
+
+    const PIXELS: usize = 37;
+
+    fn example() -> (Exposure, Vec<f32>, Vec<f32>) {
+        let mut rng = Rng::new(3, 3);
+        let mut exposure = Exposure::new(2);
+        for value in &mut exposure.maps[1] {
+            *value += rng.range(-0.2, 0.2);
+        }
+        let color = (0..3 * PIXELS).map(|_| rng.range(0.0, 0.6)).collect();
+        let weights = (0..3 * PIXELS).map(|_| rng.range(-1.0, 1.0)).collect();
+        (exposure, color, weights)
+    }
+
+    fn loss(exposure: &Exposure, color: &[f32], weights: &[f32]) -> f64 {
+        let mut y = Vec::new();
+        exposure.develop(1, color, &mut y);
+        y.iter().zip(weights).map(|(y, w)| f64::from(*y) * f64::from(*w)).sum()
+    }
+
+    #[test]
+    fn a_view_that_nothing_was_learnt_of_stays_as_it_is() {
+        let (exposure, color, _) = example();
+        let mut y = Vec::new();
+        exposure.develop(0, &color, &mut y);
+        assert_eq!(y, color);
+    }
+
+    #[test]
+    fn gradients_agree_with_finite_differences() {
+        let (exposure, color, weights) = example();
+        let mut v = weights.clone();
+        let of_map = exposure.vjp(1, &color, &mut v);
+        // Colours stay below 1, so that the map is linear and a wide step costs nothing but rounding.
+        let h = 1e-2f32;
+        for i in 0..N {
+            let at = |sign: f32| {
+                let mut moved = exposure.clone();
+                moved.maps[1][i] += sign * h;
+                loss(&moved, &color, &weights)
+            };
+            let want = (at(1.0) - at(-1.0)) / f64::from(2.0 * h);
+            assert!(
+                (f64::from(of_map[i]) - want).abs() < 1e-3,
+                "{i}: {} and {want}",
+                of_map[i]
+            );
+        }
+        for i in (0..color.len()).step_by(7) {
+            let at = |sign: f32| {
+                let mut moved = color.clone();
+                moved[i] += sign * h;
+                loss(&exposure, &moved, &weights)
+            };
+            let want = (at(1.0) - at(-1.0)) / f64::from(2.0 * h);
+            assert!((f64::from(v[i]) - want).abs() < 1e-3, "{i}: {} and {want}", v[i]);
+        }
+    }
+
+    #[test]
+    fn what_is_white_is_only_made_darker() {
+        let exposure = Exposure::new(1);
+        let color = [1.5, 1.5, 0.5];
+        let mut y = Vec::new();
+        exposure.develop(0, &color, &mut y);
+        assert_eq!(y, [1.0, 1.0, 0.5]);
+        let mut v = [-1.0, 2.0, -1.0];
+        exposure.vjp(0, &color, &mut v);
+        assert_eq!(v, [0.0, 2.0, -1.0]);
+    }
+
+    #[test]
+    fn steps_find_the_gain_of_each_photograph() {
+        let mut rng = Rng::new(4, 4);
+        let color: Vec<f32> = (0..3 * PIXELS).map(|_| rng.range(0.0, 0.6)).collect();
+        let mut exposure = Exposure::new(2);
+        let plan = SocketPlan {
+            exposure_rate: 0.02,
+            ..SocketPlan::default()
+        };
+        for _ in 0..400 {
+            for (view, gain) in [(0, 0.7), (1, 1.5)] {
+                let mut y = Vec::new();
+                exposure.develop(view, &color, &mut y);
+                let mut v: Vec<f32> = y.iter().zip(&color).map(|(y, x)| y - gain * x).collect();
+                exposure.step(view, &color, &mut v, &plan);
+            }
+        }
+        for (view, gain) in [(0, 0.7), (1, 1.5)] {
+            let got = exposure.of(view).apply([0.5; 3]);
+            assert!(got.iter().all(|v| (v - gain * 0.5).abs() < 0.01), "{got:?}");
+        }
+    }
+}

@@ -1,0 +1,181 @@
+//! Where something trained can sit in a step on splats.
+//!
+//! | socket | gives | gets back |
+//! |---|---|---|
+//! | before projection | a [`Placement`]: the camera, and the splats where they move | gradients of the camera and of the moved splats |
+//! | at colour | a colour to add to each splat in view, by its [`irradia_splat::Surface`] | the gradients of these colours |
+//! | after blending | the frame as the photograph shows it | the gradient of that frame, which it turns into that of the scene's |
+//!
+//! Each occupant has its forward pass, the vector-Jacobian product beside it, its own Adam, and named tensors. What keeps a
+//! run (checkpoints, resume, files beside the scene) sees occupants through [`Occupant`] alone, and what renders asks
+//! [`Sockets`]: a new one is a file here, a field of [`Sockets`] and an arm in the method of its socket.
+
+mod exposure;
+mod per_view;
+mod poses;
+mod residual;
+
+pub use exposure::Exposure;
+pub(crate) use per_view::PerViewAdam;
+pub use poses::PoseRefinement;
+pub(crate) use poses::{tangent_gradient, turned};
+pub use residual::{Residual, added_colors};
+
+use crate::recipe::Recipe;
+use crate::schedule::{SocketPlan, StepPlan};
+use crate::tensor_file::{NamedTensor, TensorSource};
+use crate::trainer::TrainError;
+use irradia_field::Space;
+use irradia_scene::{Camera, Dataset};
+use irradia_splat::{Engine, Placement, RenderOptions};
+
+/// Names of the files that occupants may leave beside a scene.
+pub const FILES: [&str; 3] = ["poses.safetensors", "residual.safetensors", "exposure.safetensors"];
+
+/// What keeps a run sees of whatever sits in a socket.
+pub trait Occupant {
+    /// What its tensors' names begin with in a checkpoint, and what its file beside the scene is called.
+    fn name(&self) -> &'static str;
+
+    /// Parameters, moments and counts.
+    fn tensors(&self) -> Vec<NamedTensor>;
+
+    /// Takes over what [`Self::tensors`] gave.
+    ///
+    /// # Errors
+    /// One line, when a tensor is missing or has another shape.
+    fn restore(&mut self, tensors: TensorSource) -> Result<(), String>;
+
+    /// A safetensors file for beside the scene; `None` where nothing was learnt.
+    fn export(&self) -> Option<Vec<u8>>;
+}
+
+/// What is trained beside the splats, by socket.
+#[derive(Default)]
+pub struct Sockets {
+    /// Before projection: the cameras' poses.
+    pub poses: Option<PoseRefinement>,
+    /// At colour: a small field.
+    pub residual: Option<Residual>,
+    /// After blending: each photograph's exposure.
+    pub exposure: Option<Exposure>,
+    /// The frame after [`Exposure`], `[3, H, W]`.
+    developed: Vec<f32>,
+}
+
+impl Sockets {
+    /// What `recipe` asks for, nothing learnt yet. `transparent`: photographs have alpha.
+    ///
+    /// # Errors
+    /// When a residual field finds no space that the cameras share.
+    pub fn new(recipe: &Recipe, dataset: &Dataset, transparent: bool, seed: u64) -> Result<Self, TrainError> {
+        let views = dataset.views.len();
+        let residual = match &recipe.residual {
+            Some(knobs) => {
+                let cameras: Vec<Camera> = dataset.train.iter().map(|i| dataset.views[*i].camera).collect();
+                let space = Space::around(&cameras, !transparent).ok_or(TrainError::NoSpace)?;
+                Some(Residual::new(knobs, space, seed)?)
+            }
+            None => None,
+        };
+        Ok(Self {
+            poses: recipe.refine_poses.then(|| PoseRefinement::new(views)),
+            residual,
+            exposure: recipe.exposure.then(|| Exposure::new(views)),
+            developed: Vec::new(),
+        })
+    }
+
+    /// Everything that is trained, to be kept and restored.
+    pub fn occupants(&self) -> Vec<&dyn Occupant> {
+        let poses = self.poses.as_ref().map(|o| o as &dyn Occupant);
+        let residual = self.residual.as_ref().map(|o| o as &dyn Occupant);
+        let exposure = self.exposure.as_ref().map(|o| o as &dyn Occupant);
+        [poses, residual, exposure].into_iter().flatten().collect()
+    }
+
+    /// Likewise, to be written.
+    pub fn occupants_mut(&mut self) -> Vec<&mut dyn Occupant> {
+        let poses = self.poses.as_mut().map(|o| o as &mut dyn Occupant);
+        let residual = self.residual.as_mut().map(|o| o as &mut dyn Occupant);
+        let exposure = self.exposure.as_mut().map(|o| o as &mut dyn Occupant);
+        [poses, residual, exposure].into_iter().flatten().collect()
+    }
+
+    /// The files for beside the scene: name and bytes.
+    pub fn files(&self) -> Vec<(String, Vec<u8>)> {
+        let file = |occupant: &dyn Occupant| Some((format!("{}.safetensors", occupant.name()), occupant.export()?));
+        self.occupants().into_iter().filter_map(file).collect()
+    }
+
+    /// Before projection: the splats and the camera of `view` at its time, as they have been learnt to be.
+    pub fn place(&self, view: usize, camera: &Camera) -> Placement {
+        match &self.poses {
+            Some(poses) => poses.refined(view, camera).into(),
+            None => (*camera).into(),
+        }
+    }
+
+    /// Renders what `placement` shows, with what is added at colour and done after blending; [`Self::frame_color`] is the
+    /// outcome.
+    pub fn render(
+        &mut self,
+        engine: &mut Engine,
+        view: usize,
+        placement: Placement,
+        options: &RenderOptions,
+        plan: &StepPlan,
+    ) {
+        match self.residual.as_ref().filter(|residual| residual.acts(plan)) {
+            Some(residual) => {
+                let center = placement.camera.pose.position;
+                engine.project(placement, options);
+                engine.composite(&residual.colors(center, &engine.surfaces_in_view()));
+            }
+            None => engine.render(placement, options),
+        }
+        if let Some(exposure) = &self.exposure {
+            exposure.develop(view, engine.frame().color, &mut self.developed);
+        }
+    }
+
+    /// The last frame's colour as the photograph shows it, `[3, H, W]`.
+    pub fn frame_color<'a>(&'a self, engine: &'a Engine) -> &'a [f32] {
+        match self.exposure {
+            Some(_) => &self.developed,
+            None => engine.frame().color,
+        }
+    }
+
+    /// Whether the camera's gradient is needed.
+    pub fn needs_camera_gradient(&self) -> bool {
+        self.poses.is_some()
+    }
+
+    /// One step of what sits after blending: `v_color` is the gradient of [`Self::frame_color`], and becomes that of the
+    /// scene's own colours.
+    pub fn step_after_blending(&mut self, engine: &Engine, view: usize, v_color: &mut [f32], plan: &SocketPlan) {
+        if let Some(exposure) = &mut self.exposure {
+            exposure.step(view, engine.frame().color, v_color, plan);
+        }
+    }
+
+    /// One step of what sits before and at projection, after the frame's backward pass. `camera` is the one that was rendered,
+    /// `extent` the scene's size in world units.
+    pub fn step_before_blending(
+        &mut self,
+        engine: &mut Engine,
+        view: usize,
+        camera: &Camera,
+        extent: f32,
+        plan: &StepPlan,
+    ) {
+        if let Some(residual) = self.residual.as_mut().filter(|residual| residual.acts(plan)) {
+            let (surfaces, v_colors) = engine.color_gradients();
+            residual.step(camera.pose.position, &surfaces, &v_colors, plan);
+        }
+        if let (Some(poses), Some(gradient)) = (&mut self.poses, engine.camera_gradient()) {
+            poses.step(view, camera, &gradient, extent, &plan.sockets);
+        }
+    }
+}

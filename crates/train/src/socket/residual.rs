@@ -1,0 +1,106 @@
+//! At colour: what a small field adds to the splats' colours, by place and direction of view.
+
+use super::Occupant;
+use crate::field_file;
+use crate::recipe::ResidualKnobs;
+use crate::schedule::StepPlan;
+use crate::tensor_file::{NamedTensor, TensorSource};
+use crate::trainer::TrainError;
+use glam::Vec3;
+use irradia_field::{Field, FieldState, Sampler, Sight, Space, StepOptions, residual_at, train_residual};
+use irradia_splat::Surface;
+
+/// Stream of the run's seed.
+const STREAM_RESIDUAL: u64 = 8;
+
+/// A residual field in training.
+#[derive(Clone)]
+pub struct Residual {
+    state: FieldState,
+    beta2: f32,
+}
+
+/// The colours that `field` adds to `surfaces` seen from `center`, world.
+pub fn added_colors(field: &Field, center: Vec3, surfaces: &[Surface]) -> Vec<[f32; 3]> {
+    residual_at(field, &sights(field, center, surfaces))
+}
+
+/// How `field` is asked about `surfaces` seen from `center`.
+fn sights(field: &Field, center: Vec3, surfaces: &[Surface]) -> Vec<Sight> {
+    let mirrored = matches!(field.config.sampler, Sampler::Given { mirrored: true });
+    let sight = |surface: &Surface| {
+        let view = (Vec3::from(surface.mean) - center).normalize_or_zero();
+        let direction = if mirrored {
+            let normal = Vec3::from(surface.normal);
+            view - 2.0 * view.dot(normal) * normal
+        } else {
+            view
+        };
+        Sight {
+            point: surface.mean,
+            direction: direction.to_array(),
+        }
+    };
+    surfaces.iter().map(sight).collect()
+}
+
+impl Residual {
+    /// A field that adds nothing yet, in `space`.
+    ///
+    /// # Errors
+    /// When the field's configuration is invalid.
+    pub fn new(knobs: &ResidualKnobs, space: Space, seed: u64) -> Result<Self, TrainError> {
+        let field = Field::residual(knobs.net, knobs.mirrored, space, seed ^ STREAM_RESIDUAL << 40)?;
+        Ok(Self {
+            state: FieldState::new(field),
+            beta2: knobs.beta2,
+        })
+    }
+
+    /// Whether it adds to what `plan` renders. Once it has begun it stays.
+    pub fn acts(&self, plan: &StepPlan) -> bool {
+        plan.field.residual || self.state.step > 0
+    }
+
+    /// The field, once it has learnt something.
+    pub fn learnt(&self) -> Option<&Field> {
+        (self.state.step > 0).then_some(&self.state.field)
+    }
+
+    /// Forward: the colours to add to `surfaces` seen from `center`.
+    pub fn colors(&self, center: Vec3, surfaces: &[Surface]) -> Vec<[f32; 3]> {
+        added_colors(&self.state.field, center, surfaces)
+    }
+
+    /// The vector-Jacobian product of [`Self::colors`] and a step of Adam, for the gradients of the colours.
+    pub fn step(&mut self, center: Vec3, surfaces: &[Surface], v_colors: &[[f32; 3]], plan: &StepPlan) {
+        let options = StepOptions {
+            table_rate: plan.field.tables,
+            net_rate: plan.field.nets,
+            beta2: self.beta2,
+            ..StepOptions::default()
+        };
+        let sights = sights(&self.state.field, center, surfaces);
+        train_residual(&mut self.state, &sights, v_colors, &options);
+    }
+}
+
+impl Occupant for Residual {
+    fn name(&self) -> &'static str {
+        "residual"
+    }
+
+    fn tensors(&self) -> Vec<NamedTensor> {
+        field_file::state_tensors(&self.state)
+    }
+
+    fn restore(&mut self, tensors: TensorSource) -> Result<(), String> {
+        let Field { config, space, .. } = &self.state.field;
+        self.state = field_file::state_from(config.clone(), *space, tensors)?;
+        Ok(())
+    }
+
+    fn export(&self) -> Option<Vec<u8>> {
+        self.learnt().map(field_file::to_bytes)
+    }
+}

@@ -1,0 +1,117 @@
+//! Named tensors in safetensors files: of checkpoints, and of what lies beside a scene.
+
+use safetensors::tensor::{Dtype, SafeTensors, TensorView};
+use std::collections::HashMap;
+
+/// Numbers with a name and a shape.
+#[derive(Clone, Debug, PartialEq)]
+pub struct NamedTensor {
+    /// Unique within its owner.
+    pub name: String,
+    /// Lengths of the dimensions.
+    pub shape: Vec<usize>,
+    dtype: Dtype,
+    bytes: Vec<u8>,
+}
+
+impl NamedTensor {
+    /// Of 32-bit floats, as many as `shape` has.
+    pub fn real(name: impl Into<String>, shape: Vec<usize>, values: &[f32]) -> Self {
+        Self {
+            name: name.into(),
+            shape,
+            dtype: Dtype::F32,
+            bytes: values.iter().flat_map(|v| v.to_le_bytes()).collect(),
+        }
+    }
+
+    /// Of counts, in one dimension.
+    pub fn whole(name: impl Into<String>, values: &[u64]) -> Self {
+        Self {
+            name: name.into(),
+            shape: vec![values.len()],
+            dtype: Dtype::U64,
+            bytes: values.iter().flat_map(|v| v.to_le_bytes()).collect(),
+        }
+    }
+
+    /// The same under a longer name.
+    pub fn prefixed(self, prefix: &str) -> Self {
+        let name = format!("{prefix}{}", self.name);
+        Self { name, ..self }
+    }
+
+    /// Its name, and itself as the safetensors crate takes it.
+    ///
+    /// # Panics
+    /// When shape and values do not agree: a bug of its owner.
+    pub(crate) fn view(&self) -> (&str, TensorView<'_>) {
+        let view = TensorView::new(self.dtype, self.shape.clone(), &self.bytes).expect("shape and values agree");
+        (&self.name, view)
+    }
+}
+
+/// `tensors` as a safetensors file with `metadata` in its header: one pair, since the order of several would differ from run
+/// to run.
+pub fn to_bytes(tensors: &[NamedTensor], (key, value): (&str, String)) -> Vec<u8> {
+    let metadata = HashMap::from([(key.to_owned(), value)]);
+    safetensors::serialize(tensors.iter().map(NamedTensor::view), Some(metadata)).expect("in memory")
+}
+
+/// The tensors of a file whose names begin with a prefix.
+#[derive(Clone, Copy)]
+pub struct TensorSource<'a> {
+    file: &'a SafeTensors<'a>,
+    prefix: &'a str,
+}
+
+impl<'a> TensorSource<'a> {
+    /// Those of `file` that begin with `prefix`.
+    pub fn new(file: &'a SafeTensors<'a>, prefix: &'a str) -> Self {
+        Self { file, prefix }
+    }
+
+    fn view(&self, name: &str, dtype: Dtype) -> Option<TensorView<'a>> {
+        let view = self.file.tensor(&format!("{}{name}", self.prefix)).ok()?;
+        (view.dtype() == dtype).then_some(view)
+    }
+
+    /// The 32-bit floats called `name`.
+    pub fn real(&self, name: &str) -> Option<Vec<f32>> {
+        let view = self.view(name, Dtype::F32)?;
+        Some(
+            view.data()
+                .as_chunks()
+                .0
+                .iter()
+                .map(|b| f32::from_le_bytes(*b))
+                .collect(),
+        )
+    }
+
+    /// The 32-bit floats called `name`, of the shape `[rows, N]`.
+    ///
+    /// # Errors
+    /// One line, when they are missing or have another shape.
+    pub fn rows<const N: usize>(&self, name: &str, rows: usize) -> Result<Vec<[f32; N]>, String> {
+        let view = self.view(name, Dtype::F32).ok_or(format!("{name} is missing"))?;
+        if view.shape() != [rows, N] {
+            return Err(format!("{name} has the shape {:?}, not [{rows}, {N}]", view.shape()));
+        }
+        let values = self.real(name).unwrap_or_default();
+        Ok(values.as_chunks().0.to_vec())
+    }
+
+    /// The counts called `name`.
+    pub fn whole(&self, name: &str) -> Option<Vec<u64>> {
+        let view = self.view(name, Dtype::U64)?;
+        Some(
+            view.data()
+                .as_chunks()
+                .0
+                .iter()
+                .map(|b| u64::from_le_bytes(*b))
+                .collect(),
+        )
+    }
+}

@@ -2,7 +2,7 @@
 //! would have written. Only bytes are made and read here; where they go is the caller's.
 
 use crate::field_file::floats;
-use crate::recipe::{Param, Recipe};
+use crate::recipe::{Param, Recipe, Values};
 use crate::schedule::{Clock, Watch};
 use crate::trainer::{TrainError, TrainOptions, Trainer};
 use irradia_compute::Planes;
@@ -13,7 +13,46 @@ use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use std::collections::HashMap;
 use std::sync::Arc;
 
-const FORMAT: &str = "irradia-checkpoint-4";
+const FORMAT: &str = "irradia-checkpoint-5";
+/// The format before, which is still read: the values that the clock carries have no names but this order, after the
+/// numbers of `clock.real`.
+const FORMAT_4: &str = "irradia-checkpoint-4";
+const FORMAT_4_PARAMS: [Param; 32] = [
+    Param::ImageScale,
+    Param::ShDegree,
+    Param::CountShare,
+    Param::TrainedShare,
+    Param::PhotoWeight,
+    Param::SsimWeight,
+    Param::MseWeight,
+    Param::CoarseWeight,
+    Param::CoarseFactor,
+    Param::PerceptualWeight,
+    Param::AlphaWeight,
+    Param::DepthWeight,
+    Param::SmoothWeight,
+    Param::RandomBackground,
+    Param::OpacityReg,
+    Param::OpacitySquareReg,
+    Param::ScaleReg,
+    Param::CovarianceReg,
+    Param::ConditionCap,
+    Param::Noise,
+    Param::RateMeans,
+    Param::RateQuats,
+    Param::RateScales,
+    Param::RateOpacities,
+    Param::RateShDc,
+    Param::RateShRest,
+    Param::RateTables,
+    Param::RateNets,
+    Param::RateCodes,
+    Param::InterlevelWeight,
+    Param::DistortionWeight,
+    Param::Residual,
+];
+/// What the names of the values that the clock carries begin with; a parameter's name follows.
+const CARRIED: &str = "carried.";
 /// What the names of a field's tensors begin with.
 const FIELD: &str = "field.";
 /// Likewise of the residual field's.
@@ -65,7 +104,7 @@ pub fn to_bytes(trainer: &Trainer) -> Vec<u8> {
         u64::from(clock.was_reset),
         clock.watch.steps,
     ];
-    let real: Vec<f64> = [
+    let real = [
         clock.time,
         clock.stage_time,
         clock.progress,
@@ -77,10 +116,7 @@ pub fn to_bytes(trainer: &Trainer) -> Vec<u8> {
         trainer.pace,
         trainer.seconds,
         trainer.cpu_seconds,
-    ]
-    .into_iter()
-    .chain(clock.carried)
-    .collect();
+    ];
     arrays.push((
         "clock.whole".into(),
         Dtype::U64,
@@ -93,6 +129,10 @@ pub fn to_bytes(trainer: &Trainer) -> Vec<u8> {
         vec![real.len()],
         real.iter().flat_map(|v| v.to_le_bytes()).collect(),
     ));
+    for param in Param::ALL {
+        let bytes = clock.carried[param].to_le_bytes().to_vec();
+        arrays.push((format!("{CARRIED}{}", param.name()), Dtype::F64, vec![1], bytes));
+    }
     let views = arrays.iter().map(|(name, dtype, shape, bytes)| {
         let view = TensorView::new(*dtype, shape.clone(), bytes).expect("shape and bytes agree");
         (name.as_str(), view)
@@ -113,7 +153,8 @@ pub fn recipe_of(bytes: &[u8]) -> Result<(Recipe, u64), TrainError> {
     let wrong = |why: &str| TrainError::Checkpoint(format!("not a checkpoint of this program: {why}"));
     let (_, header) = SafeTensors::read_metadata(bytes).map_err(|e| wrong(&e.to_string()))?;
     let metadata = header.metadata().as_ref().ok_or_else(|| wrong("no metadata"))?;
-    if metadata.get("format").map(String::as_str) != Some(FORMAT) {
+    let format = metadata.get("format").map_or("", String::as_str);
+    if ![FORMAT, FORMAT_4].contains(&format) {
         return Err(wrong(&format!("its format is not {FORMAT}")));
     }
     let text = metadata.get("recipe").ok_or_else(|| wrong("no recipe"))?;
@@ -184,13 +225,7 @@ pub fn from_bytes(bytes: &[u8], dataset: Arc<Dataset>, options: TrainOptions) ->
         return Err(wrong("its columns have different lengths".into()));
     }
     let whole = words(array("clock.whole", Dtype::U64)?.1);
-    let real: Vec<f64> = array("clock.real", Dtype::F64)?
-        .1
-        .as_chunks()
-        .0
-        .iter()
-        .map(|b| f64::from_le_bytes(*b))
-        .collect();
+    let real = reals(array("clock.real", Dtype::F64)?.1);
     let (
         [step, stage, stage_step, was_reset, watched],
         [
@@ -205,15 +240,13 @@ pub fn from_bytes(bytes: &[u8], dataset: Arc<Dataset>, options: TrainOptions) ->
             pace,
             seconds,
             cpu_seconds,
-            carried @ ..,
+            unnamed @ ..,
         ],
     ) = (&whole[..], &real[..])
     else {
         return Err(wrong("its clock has the wrong length".into()));
     };
-    let carried: [f64; Param::ALL.len()] = carried
-        .try_into()
-        .map_err(|_| wrong("its clock has the wrong length".into()))?;
+    let carried = carried(&file, unnamed)?;
     let mut trainer = Trainer::unfilled(dataset, recipe, TrainOptions { seed, ..options })?;
     trainer.state = state;
     let disagree = || wrong("its field and its recipe do not agree".into());
@@ -268,9 +301,48 @@ fn field(file: &SafeTensors, prefix: &str, fresh: Field) -> Result<Option<FieldS
     Ok(Some(state))
 }
 
+/// The values that the clock carries, by name, or `unnamed` in the order of the format before. A parameter that is newer than
+/// the checkpoint has its default: the recipe in there does not name it.
+fn carried(file: &SafeTensors, unnamed: &[f64]) -> Result<Values, TrainError> {
+    let mut values = Values::default_values();
+    if !unnamed.is_empty() {
+        if unnamed.len() != FORMAT_4_PARAMS.len() {
+            return Err(TrainError::Checkpoint(
+                "the checkpoint is damaged: its clock has the wrong length".into(),
+            ));
+        }
+        for (param, value) in FORMAT_4_PARAMS.into_iter().zip(unnamed) {
+            values[param] = *value;
+        }
+    }
+    for (name, view) in file.iter() {
+        let Some(name) = name.strip_prefix(CARRIED) else {
+            continue;
+        };
+        let param = Param::named(name).ok_or_else(|| {
+            TrainError::Checkpoint(format!(
+                "the checkpoint carries a value of `{name}`, which this version does not know: resume it with the version that \
+                 wrote it"
+            ))
+        })?;
+        let ([value], Dtype::F64) = (&reals(view.data())[..], view.dtype()) else {
+            return Err(TrainError::Checkpoint(format!(
+                "the checkpoint is damaged: {CARRIED}{name} is not one number"
+            )));
+        };
+        values[param] = *value;
+    }
+    Ok(values)
+}
+
 /// Little-endian whole numbers.
 fn words(bytes: &[u8]) -> Vec<u64> {
     bytes.as_chunks().0.iter().map(|b| u64::from_le_bytes(*b)).collect()
+}
+
+/// Little-endian numbers in double precision.
+fn reals(bytes: &[u8]) -> Vec<f64> {
+    bytes.as_chunks().0.iter().map(|b| f64::from_le_bytes(*b)).collect()
 }
 
 fn plane_bytes(planes: &Planes) -> Vec<u8> {

@@ -1,5 +1,6 @@
 //! What a small field adds to the splats' colours, by place and direction of view.
 
+use crate::recipe::Param;
 use crate::schedule::StepPlan;
 use crate::trainer::{TrainError, Trainer};
 use glam::Vec3;
@@ -52,7 +53,7 @@ pub(crate) fn render(
 /// The field that adds to what `plan` renders, if one does. Once it has begun it stays.
 pub(crate) fn in_force<'a>(state: &'a Option<FieldState>, plan: &StepPlan) -> Option<&'a Field> {
     let state = state.as_ref()?;
-    (plan.field.residual || state.step > 0).then_some(&state.field)
+    (plan.is_on(Param::Residual) || state.step > 0).then_some(&state.field)
 }
 
 impl Trainer {
@@ -85,8 +86,8 @@ impl Trainer {
             .collect();
         let v_added: Vec<[f32; 3]> = seen.iter().map(|i| v_of(*i)).collect();
         let options = StepOptions {
-            table_rate: plan.field.tables,
-            net_rate: plan.field.nets,
+            table_rate: plan.value(Param::RateTables),
+            net_rate: plan.value(Param::RateNets),
             beta2: knobs.beta2,
             ..StepOptions::default()
         };

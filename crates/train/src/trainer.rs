@@ -5,7 +5,7 @@ use crate::field_step::{first_field, is_field};
 use crate::model::Model;
 use crate::objective::{Objective, Reference};
 use crate::photos::{PhotoCache, Prepared};
-use crate::recipe::{Density, Recipe};
+use crate::recipe::{Density, Param, Recipe};
 use crate::residual;
 use crate::schedule::{Clock, Round, Signal, StepPlan, coming_views, plan};
 use cpu_time::ProcessTime;
@@ -297,12 +297,12 @@ impl Trainer {
         }
 
         let background = plan
-            .random_background
+            .is_on(Param::RandomBackground)
             .then(|| std::array::from_fn(|_| rng.uniform()))
             .filter(|_| photo.alpha.is_some());
         let options = RenderOptions {
             background: background.unwrap_or(self.recipe.render.background),
-            depth: plan.losses.depth > 0.0 || plan.losses.smooth > 0.0,
+            depth: plan.compares_depth(),
             ..self.render_options(plan.sh_degree)
         };
         let residual = residual::in_force(&self.residual, &plan);
@@ -312,9 +312,7 @@ impl Trainer {
             background,
             depths: &self.known_depths(coming[0], &camera, &plan),
         };
-        let loss = self
-            .objective
-            .evaluate(&self.renderer, &reference, &plan.losses, &mut rng);
+        let loss = self.objective.evaluate(&self.renderer, &reference, &plan, &mut rng);
         if plan.gathers == Some(Statistics::Error) {
             self.objective
                 .error(self.renderer.color(), &photo, background.is_some());
@@ -368,14 +366,15 @@ impl Trainer {
             self.state
                 .gather_statistics(statistics, &self.gradients, view.width, view.height, extent);
         }
-        if !plan.regularizers.is_zero() {
-            let (weights, gradients) = (&plan.regularizers, &mut self.gradients);
-            regularize::add_gradients(level, &self.state.splats, weights, self.extent, gradients);
+        let (regularizers, gradients) = (plan.regularizers(), &mut self.gradients);
+        if !regularizers.is_zero() {
+            regularize::add_gradients(level, &self.state.splats, &regularizers, self.extent, gradients);
         }
-        if plan.trained_share < 1.0 {
-            regularize::rest_small(&self.state.splats, plan.trained_share, &mut self.gradients);
+        let share = plan.value(Param::TrainedShare);
+        if share < 1.0 {
+            regularize::rest_small(&self.state.splats, share, &mut self.gradients);
         }
-        let mut rates = plan.rates;
+        let mut rates = plan.rates();
         rates.means *= self.extent;
         let adam = &self.recipe.adam;
         let step = AdamStep {
@@ -385,15 +384,12 @@ impl Trainer {
             step: self.clock.step + 1,
         };
         self.state.step(level, &self.gradients, &rates, plan.sh_degree, step);
-        if plan.noise > 0.0 {
-            mcmc::add_noise(
-                &mut self.state,
-                plan.noise * rates.means,
-                self.options.seed,
-                self.clock.step,
-            );
+        let noise = plan.value(Param::Noise);
+        if noise > 0.0 {
+            mcmc::add_noise(&mut self.state, noise * rates.means, self.options.seed, self.clock.step);
         }
-        if let Some(limit) = plan.condition_cap {
+        let limit = plan.value(Param::ConditionCap);
+        if limit > 0.0 {
             regularize::cap_condition(&mut self.state.splats, limit);
         }
     }
@@ -473,7 +469,12 @@ impl Trainer {
 
     /// Depths of the points that view number `view` is known to see, where the plan has a use for them.
     pub(crate) fn known_depths(&self, view: usize, camera: &Camera, plan: &StepPlan) -> Vec<DepthSample> {
-        let Some(points) = self.dataset.points.as_ref().filter(|_| plan.losses.depth > 0.0) else {
+        let Some(points) = self
+            .dataset
+            .points
+            .as_ref()
+            .filter(|_| plan.value(Param::DepthWeight) > 0.0)
+        else {
             return Vec::new();
         };
         let seen = &self.dataset.views[view].points_seen;

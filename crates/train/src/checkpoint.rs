@@ -1,8 +1,12 @@
 //! A run on disk: everything that the next step depends on, so that a resumed run writes the bytes that an unbroken one
 //! would have written. Only bytes are made and read here; where they go is the caller's.
 
+mod carried;
+#[cfg(test)]
+mod tests;
+
 use crate::field_file::floats;
-use crate::recipe::{Param, Recipe, Values};
+use crate::recipe::Recipe;
 use crate::schedule::{Clock, Watch};
 use crate::trainer::{TrainError, TrainOptions, Trainer};
 use irradia_compute::Planes;
@@ -14,45 +18,8 @@ use std::collections::HashMap;
 use std::sync::Arc;
 
 const FORMAT: &str = "irradia-checkpoint-5";
-/// The format before, which is still read: the values that the clock carries have no names but this order, after the
-/// numbers of `clock.real`.
+/// The format before, which is still read ([`carried`]).
 const FORMAT_4: &str = "irradia-checkpoint-4";
-const FORMAT_4_PARAMS: [Param; 32] = [
-    Param::ImageScale,
-    Param::ShDegree,
-    Param::CountShare,
-    Param::TrainedShare,
-    Param::PhotoWeight,
-    Param::SsimWeight,
-    Param::MseWeight,
-    Param::CoarseWeight,
-    Param::CoarseFactor,
-    Param::PerceptualWeight,
-    Param::AlphaWeight,
-    Param::DepthWeight,
-    Param::SmoothWeight,
-    Param::RandomBackground,
-    Param::OpacityReg,
-    Param::OpacitySquareReg,
-    Param::ScaleReg,
-    Param::CovarianceReg,
-    Param::ConditionCap,
-    Param::Noise,
-    Param::RateMeans,
-    Param::RateQuats,
-    Param::RateScales,
-    Param::RateOpacities,
-    Param::RateShDc,
-    Param::RateShRest,
-    Param::RateTables,
-    Param::RateNets,
-    Param::RateCodes,
-    Param::InterlevelWeight,
-    Param::DistortionWeight,
-    Param::Residual,
-];
-/// What the names of the values that the clock carries begin with; a parameter's name follows.
-const CARRIED: &str = "carried.";
 /// What the names of a field's tensors begin with.
 const FIELD: &str = "field.";
 /// Likewise of the residual field's.
@@ -129,9 +96,8 @@ pub fn to_bytes(trainer: &Trainer) -> Vec<u8> {
         vec![real.len()],
         real.iter().flat_map(|v| v.to_le_bytes()).collect(),
     ));
-    for param in Param::ALL {
-        let bytes = clock.carried[param].to_le_bytes().to_vec();
-        arrays.push((format!("{CARRIED}{}", param.name()), Dtype::F64, vec![1], bytes));
+    for (name, value) in carried::named(&clock.carried) {
+        arrays.push((name, Dtype::F64, vec![1], value.to_le_bytes().to_vec()));
     }
     let views = arrays.iter().map(|(name, dtype, shape, bytes)| {
         let view = TensorView::new(*dtype, shape.clone(), bytes).expect("shape and bytes agree");
@@ -246,7 +212,7 @@ pub fn from_bytes(bytes: &[u8], dataset: Arc<Dataset>, options: TrainOptions) ->
     else {
         return Err(wrong("its clock has the wrong length".into()));
     };
-    let carried = carried(&file, unnamed)?;
+    let carried = carried::read(&file, unnamed)?;
     let mut trainer = Trainer::unfilled(dataset, recipe, TrainOptions { seed, ..options })?;
     trainer.state = state;
     let disagree = || wrong("its field and its recipe do not agree".into());
@@ -299,40 +265,6 @@ fn field(file: &SafeTensors, prefix: &str, fresh: Field) -> Result<Option<FieldS
     let get = |name: &str| floats(file, &format!("{prefix}{name}"));
     let state = FieldState::from_tensors(fresh.config, fresh.space, step, rays as usize, get)?;
     Ok(Some(state))
-}
-
-/// The values that the clock carries, by name, or `unnamed` in the order of the format before. A parameter that is newer than
-/// the checkpoint has its default: the recipe in there does not name it.
-fn carried(file: &SafeTensors, unnamed: &[f64]) -> Result<Values, TrainError> {
-    let mut values = Values::default_values();
-    if !unnamed.is_empty() {
-        if unnamed.len() != FORMAT_4_PARAMS.len() {
-            return Err(TrainError::Checkpoint(
-                "the checkpoint is damaged: its clock has the wrong length".into(),
-            ));
-        }
-        for (param, value) in FORMAT_4_PARAMS.into_iter().zip(unnamed) {
-            values[param] = *value;
-        }
-    }
-    for (name, view) in file.iter() {
-        let Some(name) = name.strip_prefix(CARRIED) else {
-            continue;
-        };
-        let param = Param::named(name).ok_or_else(|| {
-            TrainError::Checkpoint(format!(
-                "the checkpoint carries a value of `{name}`, which this version does not know: resume it with the version that \
-                 wrote it"
-            ))
-        })?;
-        let ([value], Dtype::F64) = (&reals(view.data())[..], view.dtype()) else {
-            return Err(TrainError::Checkpoint(format!(
-                "the checkpoint is damaged: {CARRIED}{name} is not one number"
-            )));
-        };
-        values[param] = *value;
-    }
-    Ok(values)
 }
 
 /// Little-endian whole numbers.

@@ -65,7 +65,7 @@ documented! {
     #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
     #[serde(deny_unknown_fields)]
     pub struct ClassicKnobs {
-        /// Steps (of the run, not stretched) between rounds.
+        /// Steps (of the run, not stretched) between rounds, at least 1.
         pub every: u64,
         /// Mean screen gradient, normalised device coordinates, from which a splat is densified.
         pub gradient_threshold: f32,
@@ -85,7 +85,7 @@ documented! {
         pub max_scale: f32,
         /// Steps (of the run, not stretched) between resets of the opacities; 0 for never.
         pub reset_every: u64,
-        /// What opacities are lowered to.
+        /// Opacity that a reset leaves at most.
         pub reset_to: f32,
     }
 }
@@ -110,7 +110,7 @@ documented! {
     #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
     #[serde(deny_unknown_fields)]
     pub struct McmcKnobs {
-        /// Steps (of the run, not stretched) between rounds.
+        /// Steps (of the run, not stretched) between rounds, at least 1.
         pub every: u64,
         /// Factor on the number of splats in `every` recipe steps.
         pub growth: f32,
@@ -135,7 +135,7 @@ documented! {
     #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
     #[serde(deny_unknown_fields)]
     pub struct TamingKnobs {
-        /// Steps (of the run, not stretched) between rounds.
+        /// Steps (of the run, not stretched) between rounds, at least 1.
         pub every: u64,
         /// Size that divides what is cloned from what is split, in units of the scene's extent.
         pub small: f32,
@@ -181,7 +181,7 @@ documented! {
     #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
     #[serde(deny_unknown_fields)]
     pub struct FastKnobs {
-        /// Steps (of the run, not stretched) between rounds.
+        /// Steps (of the run, not stretched) between rounds, at least 1.
         pub every: u64,
         /// Opacity below which a splat is removed.
         pub min_opacity: f32,
@@ -212,11 +212,11 @@ documented! {
     #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
     #[serde(deny_unknown_fields)]
     pub struct MergeKnobs {
-        /// Steps (of the run, not stretched) between rounds.
+        /// Steps (of the run, not stretched) between rounds, at least 1.
         pub every: u64,
-        /// How near, in units of the smaller splat's median axis.
+        /// Largest distance of splats that are merged, in units of the smaller one's median axis.
         pub distance: f32,
-        /// How alike, in any channel of the base colour.
+        /// Largest difference of splats that are merged, in any channel of the base colour.
         pub color: f32,
     }
 }

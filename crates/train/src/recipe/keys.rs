@@ -87,6 +87,11 @@ macro_rules! documented {
 }
 pub(super) use documented;
 
+/// A doc comment without the escapes that rustdoc needs.
+fn prose(doc: &str) -> String {
+    doc.trim().replace("\\[", "[").replace("\\]", "]")
+}
+
 impl Documented {
     fn key(&self, section: &str, table: &str) -> Key {
         let bare = self
@@ -118,7 +123,7 @@ impl Documented {
             value: value.to_owned(),
             default: default.to_owned(),
             bounds: String::new(),
-            doc: self.doc.trim().to_owned(),
+            doc: prose(self.doc),
             source: String::new(),
         }
     }
@@ -147,7 +152,7 @@ impl Param {
             } else {
                 format!("{low} to {high}")
             },
-            doc: row.doc.trim().to_owned(),
+            doc: prose(row.doc),
             source: row.source.to_owned(),
         }
     }
@@ -176,8 +181,13 @@ pub fn keys() -> Vec<Key> {
         .flat_map(|(section, table, keys)| keys.iter().map(|key| key.key(section, table)));
     let of_exits = Exit::VARIANTS.iter().flat_map(|(name, about, keys)| {
         let when = name.to_lowercase();
-        let section = format!("Early end of a stage, `when = \"{when}\"`: {}", about.trim());
-        keys.iter().map(move |key| key.key(&section, "stage.STAGE.exit"))
+        let section =
+            format!("Early end of a stage by S, the mean L1 error over the training views: `when = \"{when}\"`");
+        keys.iter().map(move |key| {
+            let key = key.key(&section, "stage.STAGE.exit");
+            let doc = format!("The stage ends when {} {}", about.trim(), key.doc);
+            Key { doc, ..key }
+        })
     });
     // Rows of a group that stand apart in the table stand together here.
     let params: Vec<Key> = Param::ALL.into_iter().map(Param::key).collect();

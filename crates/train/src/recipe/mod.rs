@@ -72,14 +72,14 @@ documented! {
         pub name: String,
         /// What it is and where it comes from.
         pub about: String,
-        /// Never more splats than this.
+        /// Never more splats than this; at least 1.
         pub max_splats: usize,
-        /// Nor than this many for each pixel of a training image, all views' mean; no such limit when absent.
+        /// Never more splats than this for each pixel of a training image, all views' mean; no such limit when absent.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         pub splats_per_pixel: Option<f32>,
-        /// Held-out views are looked at every so many steps while training.
+        /// Steps between evaluations of held-out views while training; at least 1.
         pub eval_every: u64,
-        /// A checkpoint is written every so many steps.
+        /// Steps between checkpoints; at least 1.
         pub checkpoint_every: u64,
         /// How frames are rendered.
         pub render: RenderKnobs,
@@ -123,14 +123,14 @@ documented! {
     #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
     #[serde(deny_unknown_fields)]
     pub struct InitKnobs {
-        /// Their opacity.
+        /// Opacity, between 0 and 1.
         pub opacity: f32,
-        /// Likewise where they are random, most of them in empty space; the same when absent.
+        /// Opacity of splats at random places, most of them in empty space; `init.opacity` when absent.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         pub random_opacity: Option<f32>,
-        /// Factor on the distance to the nearest neighbours that makes their size.
+        /// Size as a factor on the distance to the nearest neighbours, above 0.
         pub scale: f32,
-        /// How many, where the dataset has no points.
+        /// Number of splats where the dataset has no points.
         pub random_points: usize,
     }
 }
@@ -144,7 +144,7 @@ documented! {
         pub beta1: f32,
         /// Decay of the second moment.
         pub beta2: f32,
-        /// Added to the root.
+        /// Added to the root of the second moment.
         pub epsilon: f32,
     }
 }
@@ -156,7 +156,7 @@ documented! {
     pub struct Stage {
         /// Short name, unique in the recipe.
         pub name: String,
-        /// Its length in recipe steps: `--steps` and `--budget` stretch or shrink the whole run.
+        /// Its length in recipe steps, at least 1: `--steps` and `--budget` stretch or shrink the whole run.
         pub steps: u64,
         /// What it trains, `splats` or `field`. Splats that come after a field begin as its surfaces.
         #[serde(default, skip_serializing_if = "Represents::is_splats")]

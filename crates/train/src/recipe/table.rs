@@ -236,7 +236,7 @@ table! {
     /// Weight of the mean standard deviation, in units of the scene's extent.
     ScaleReg {
         name: "scale_reg",
-        unit: "1 / extent",
+        unit: "",
         default: 0.0,
         bounds: NOT_NEGATIVE,
         group: Group::Regularizer,
@@ -246,7 +246,7 @@ table! {
     /// Weight of the mean squared Frobenius norm of the covariance, in units of the scene's extent to the fourth.
     CovarianceReg {
         name: "covariance_reg",
-        unit: "1 / extent^4",
+        unit: "",
         default: 0.0,
         bounds: NOT_NEGATIVE,
         group: Group::Regularizer,
@@ -392,5 +392,77 @@ table! {
         group: Group::Switch,
         curve: None,
         source: "Irradia",
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::recipe::{Knob, Recipe, keys::keys};
+    use crate::schedule::{Clock, plan};
+
+    fn classic(overrides: &[String]) -> Recipe {
+        Recipe::parse("classic", Recipe::built_in("classic").unwrap(), overrides).unwrap()
+    }
+
+    #[test]
+    fn every_parameter_has_one_row_that_says_all() {
+        for param in Param::ALL {
+            let row = param.row();
+            let same = |text: fn(&Row) -> Option<&str>| ROWS.iter().filter(|other| text(other) == text(row)).count();
+            assert_eq!(same(|row| Some(row.name)), 1, "{}", row.name);
+            assert!(
+                row.curve.is_none() || same(|row| row.curve) == 1,
+                "{}: two curves of one name",
+                row.name
+            );
+            assert!(row.bounds.contains(&row.default), "{}", row.name);
+            assert!(row.doc.trim().ends_with('.') && !row.source.is_empty(), "{}", row.name);
+            let plain = |c: char| c.is_ascii_lowercase() || c == '_';
+            assert!(row.name.chars().all(plain), "{}", row.name);
+            if let Group::PartOf(loss) = row.group {
+                assert_eq!(loss.row().group, Group::Loss, "{}", row.name);
+            }
+        }
+    }
+
+    #[test]
+    fn every_parameter_can_be_set_within_its_bounds_and_reaches_a_step() {
+        for param in Param::ALL {
+            let (name, bounds) = (param.name(), &param.row().bounds);
+            let value = bounds.end().min(3.0);
+            let recipe = classic(&[format!("params.{name}={value}")]);
+            assert_eq!(recipe.params[&param], Knob::Const(value), "{name}");
+            assert_eq!(plan(&recipe, &Clock::new(&recipe)).values[param], value, "{name}");
+            for outside in [bounds.start() - 1.0, f64::NAN] {
+                let overrides = [format!("params.{name}={outside:?}").replace("NaN", "nan")];
+                let text = Recipe::built_in("classic").unwrap();
+                let message = Recipe::parse("classic", text, &overrides).unwrap_err().to_string();
+                assert!(message.contains(&format!("params.{name}: ")), "{message}");
+            }
+        }
+    }
+
+    #[test]
+    fn every_parameter_is_listed_and_drawn() {
+        let keys = keys();
+        let page = include_str!("../report/page.js");
+        for param in Param::ALL {
+            let (row, path) = (param.row(), format!("params.{}", param.name()));
+            assert_eq!(keys.iter().filter(|key| key.path == path).count(), 1, "{path}");
+            match row.curve {
+                Some(curve) => {
+                    let (chart, label) = curve.split_once('.').expect("chart.label");
+                    assert!(
+                        page.contains(&format!("[\"{chart}\", ")) && !label.is_empty(),
+                        "{curve} has no chart in page.js"
+                    );
+                }
+                None => assert!(
+                    matches!(row.group, Group::Switch | Group::PartOf(_)),
+                    "{path} has no curve"
+                ),
+            }
+        }
     }
 }

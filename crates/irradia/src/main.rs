@@ -25,7 +25,7 @@ enum Command {
     Train(command::train::Args),
     /// Train several recipes under the same conditions and say how they did
     Compare(command::compare::Args),
-    /// List the recipes, or show what one does when
+    /// List the recipes, show what one does when, or explain their keys
     Recipe(command::recipe::Args),
     /// Measure a scene against photographs: PSNR, SSIM, LPIPS
     Eval(command::eval::Args),

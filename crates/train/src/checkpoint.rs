@@ -1,8 +1,12 @@
 //! A run on disk: everything that the next step depends on, so that a resumed run writes the bytes that an unbroken one
 //! would have written. Only bytes are made and read here; where they go is the caller's.
 
+mod carried;
+#[cfg(test)]
+mod tests;
+
 use crate::field_file;
-use crate::recipe::{Param, Recipe};
+use crate::recipe::Recipe;
 use crate::schedule::{Clock, Watch};
 use crate::tensor_file::{NamedTensor, TensorSource};
 use crate::trainer::{TrainError, TrainOptions, Trainer};
@@ -13,7 +17,9 @@ use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use std::collections::HashMap;
 use std::sync::Arc;
 
-const FORMAT: &str = "irradia-checkpoint-4";
+const FORMAT: &str = "irradia-checkpoint-5";
+/// The format before, which is still read ([`carried`]).
+const FORMAT_4: &str = "irradia-checkpoint-4";
 /// What the names of a field's tensors begin with.
 const FIELD: &str = "field.";
 const OWNERS: [&str; 3] = ["splats", "first_moments", "second_moments"];
@@ -63,7 +69,7 @@ pub fn to_bytes(trainer: &Trainer) -> Vec<u8> {
         u64::from(clock.was_reset),
         clock.watch.steps,
     ];
-    let real: Vec<f64> = [
+    let real = [
         clock.time,
         clock.stage_time,
         clock.progress,
@@ -75,10 +81,7 @@ pub fn to_bytes(trainer: &Trainer) -> Vec<u8> {
         trainer.pace,
         trainer.seconds,
         trainer.cpu_seconds,
-    ]
-    .into_iter()
-    .chain(clock.carried)
-    .collect();
+    ];
     arrays.push((
         "clock.whole".into(),
         Dtype::U64,
@@ -91,6 +94,9 @@ pub fn to_bytes(trainer: &Trainer) -> Vec<u8> {
         vec![real.len()],
         real.iter().flat_map(|v| v.to_le_bytes()).collect(),
     ));
+    for (name, value) in carried::named(&clock.carried) {
+        arrays.push((name, Dtype::F64, vec![1], value.to_le_bytes().to_vec()));
+    }
     let views = arrays.iter().map(|(name, dtype, shape, bytes)| {
         let view = TensorView::new(*dtype, shape.clone(), bytes).expect("shape and bytes agree");
         (name.as_str(), view)
@@ -112,7 +118,8 @@ pub fn recipe_of(bytes: &[u8]) -> Result<(Recipe, u64), TrainError> {
     let wrong = |why: &str| TrainError::Checkpoint(format!("not a checkpoint of this program: {why}"));
     let (_, header) = SafeTensors::read_metadata(bytes).map_err(|e| wrong(&e.to_string()))?;
     let metadata = header.metadata().as_ref().ok_or_else(|| wrong("no metadata"))?;
-    if metadata.get("format").map(String::as_str) != Some(FORMAT) {
+    let format = metadata.get("format").map_or("", String::as_str);
+    if ![FORMAT, FORMAT_4].contains(&format) {
         return Err(wrong(&format!("its format is not {FORMAT}")));
     }
     let text = metadata.get("recipe").ok_or_else(|| wrong("no recipe"))?;
@@ -183,13 +190,7 @@ pub fn from_bytes(bytes: &[u8], dataset: Arc<Dataset>, options: TrainOptions) ->
         return Err(wrong("its columns have different lengths".into()));
     }
     let whole = words(array("clock.whole", Dtype::U64)?.1);
-    let real: Vec<f64> = array("clock.real", Dtype::F64)?
-        .1
-        .as_chunks()
-        .0
-        .iter()
-        .map(|b| f64::from_le_bytes(*b))
-        .collect();
+    let real = reals(array("clock.real", Dtype::F64)?.1);
     let (
         [step, stage, stage_step, was_reset, watched],
         [
@@ -204,15 +205,13 @@ pub fn from_bytes(bytes: &[u8], dataset: Arc<Dataset>, options: TrainOptions) ->
             pace,
             seconds,
             cpu_seconds,
-            carried @ ..,
+            unnamed @ ..,
         ],
     ) = (&whole[..], &real[..])
     else {
         return Err(wrong("its clock has the wrong length".into()));
     };
-    let carried: [f64; Param::ALL.len()] = carried
-        .try_into()
-        .map_err(|_| wrong("its clock has the wrong length".into()))?;
+    let carried = carried::read(&file, unnamed)?;
     let mut trainer = Trainer::unfilled(dataset, recipe, TrainOptions { seed, ..options })?;
     *trainer.engine.state_mut() = state;
     let tensors = |prefix| TensorSource::new(&file, prefix);
@@ -256,6 +255,11 @@ pub fn from_bytes(bytes: &[u8], dataset: Arc<Dataset>, options: TrainOptions) ->
 /// Little-endian whole numbers.
 fn words(bytes: &[u8]) -> Vec<u64> {
     bytes.as_chunks().0.iter().map(|b| u64::from_le_bytes(*b)).collect()
+}
+
+/// Little-endian numbers in double precision.
+fn reals(bytes: &[u8]) -> Vec<f64> {
+    bytes.as_chunks().0.iter().map(|b| f64::from_le_bytes(*b)).collect()
 }
 
 fn plane_bytes(planes: &Planes) -> Vec<u8> {

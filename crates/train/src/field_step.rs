@@ -1,7 +1,7 @@
 //! A stage of radiance field: its steps, and how splats begin where it ends.
 
 use crate::photos::Prepared;
-use crate::recipe::{FieldKnobs, FieldSpace, Recipe};
+use crate::recipe::{FieldKnobs, FieldSpace, Param, Recipe};
 use crate::schedule::{Signal, StepPlan, coming_views, plan};
 use crate::trainer::{TrainError, Trainer};
 use crate::{event::StepReport, recipe::Represents};
@@ -107,20 +107,20 @@ impl Trainer {
             .as_ref()
             .expect("validated: a stage of field has its knobs");
         let options = StepOptions {
-            table_rate: plan.field.tables,
-            net_rate: plan.field.nets,
-            code_rate: plan.field.codes,
+            table_rate: plan.value(Param::RateTables),
+            net_rate: plan.value(Param::RateNets),
+            code_rate: plan.value(Param::RateCodes),
             beta2: knobs.beta2,
-            interlevel: plan.field.interlevel,
-            distortion: plan.field.distortion,
-            depth: plan.losses.depth,
-            background: if plan.random_background {
+            interlevel: plan.value(Param::InterlevelWeight),
+            distortion: plan.value(Param::DistortionWeight),
+            depth: plan.value(Param::DepthWeight),
+            background: if plan.is_on(Param::RandomBackground) {
                 Background::Random
             } else {
                 Background::Fixed(self.recipe.render.background)
             },
             samples: knobs.samples,
-            look: plan.field.look,
+            look: plan.update_occupancy,
             seed: self.options.seed,
         };
         let state = self.field.as_mut().expect("a stage of field has one");
@@ -149,7 +149,7 @@ impl Trainer {
 
     /// What [`Trainer::known_depths`] says of a view, worked out once a size: all views take part in each step.
     fn field_depths(&mut self, view: usize, camera: &Camera, plan: &StepPlan) -> Arc<[KnownDepth]> {
-        if plan.losses.depth <= 0.0 {
+        if plan.value(Param::DepthWeight) <= 0.0 {
             return Arc::default();
         }
         let key = (view, camera.intrinsics.width, camera.intrinsics.height);

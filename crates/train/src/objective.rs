@@ -1,10 +1,11 @@
 //! What a frame is compared by: every loss of the plan, added up with its gradients.
 
 use crate::photos::Prepared;
-use crate::schedule::Losses;
+use crate::recipe::Param;
+use crate::schedule::StepPlan;
 use irradia_measure::{
-    CoarseLoss, Crop, DepthKind, DepthLoss, DepthSample, Lpips, PhotometricLoss, SmoothLoss, Smoothed, Target, Truth,
-    perceptual,
+    CoarseLoss, Crop, DepthKind, DepthLoss, DepthSample, LossWeights, Lpips, PhotometricLoss, SmoothLoss, Smoothed,
+    Target, Truth, perceptual,
 };
 use irradia_scene::Rng;
 use irradia_splat::{FramePlanes, Gather, OutputGradient};
@@ -85,7 +86,7 @@ impl Objective {
         &mut self,
         frame: FramePlanes,
         reference: &Reference,
-        losses: &Losses,
+        plan: &StepPlan,
         rng: &mut Rng,
     ) -> ObjectiveValues {
         let photo = reference.photo;
@@ -106,66 +107,65 @@ impl Objective {
         };
         let color = frame.color;
         self.v_color.resize(3 * pixels, 0.0);
-        let values = self
-            .photometric
-            .evaluate(color, &target, &losses.photometric, &mut self.v_color);
+        let weights = LossWeights {
+            l1: plan.value(Param::PhotoWeight),
+            ssim: plan.value(Param::SsimWeight),
+            mse: plan.value(Param::MseWeight),
+        };
+        let values = self.photometric.evaluate(color, &target, &weights, &mut self.v_color);
         let mut total = values.total;
-        if losses.coarse > 0.0 {
-            let factor = losses.coarse_factor;
-            let loss = self
-                .coarse
-                .evaluate(color, &target, factor, losses.coarse, &mut self.v_color);
-            total += f64::from(losses.coarse) * loss;
+        let weight = plan.value(Param::CoarseWeight);
+        if weight > 0.0 {
+            let factor = plan.values[Param::CoarseFactor] as usize;
+            let loss = self.coarse.evaluate(color, &target, factor, weight, &mut self.v_color);
+            total += f64::from(weight) * loss;
         }
-        if let Some(lpips) = self.lpips.as_ref().filter(|_| losses.perceptual > 0.0) {
+        let weight = plan.value(Param::PerceptualWeight);
+        if let Some(lpips) = self.lpips.as_ref().filter(|_| weight > 0.0) {
             let crop = Crop::random(width, height, PATCH, rng);
             // An image too small for the network has no perceptual loss.
-            if let Ok(loss) = perceptual(lpips, color, &target, crop, losses.perceptual, &mut self.v_color) {
-                total += f64::from(losses.perceptual) * loss;
+            if let Ok(loss) = perceptual(lpips, color, &target, crop, weight, &mut self.v_color) {
+                total += f64::from(weight) * loss;
             }
         }
-        let depths = losses.depth > 0.0 || losses.smooth > 0.0;
+        let depths = plan.compares_depth();
+        let weight = plan.value(Param::AlphaWeight);
         self.has = Has {
             depth: depths,
-            alpha: depths || losses.alpha > 0.0 && photo.alpha.is_some(),
+            alpha: depths || weight > 0.0 && photo.alpha.is_some(),
         };
         if self.has.alpha {
             self.v_alpha.clear();
             self.v_alpha.resize(pixels, 0.0);
         }
-        if let Some(alpha) = photo.alpha.as_ref().filter(|_| losses.alpha > 0.0) {
-            total += compare_alpha(frame.alpha, alpha, losses.alpha, &mut self.v_alpha);
+        if let Some(alpha) = photo.alpha.as_ref().filter(|_| weight > 0.0) {
+            total += compare_alpha(frame.alpha, alpha, weight, &mut self.v_alpha);
         }
         if depths {
             self.v_depth.clear();
             self.v_depth.resize(pixels, 0.0);
             let (v_depth, v_alpha) = (&mut self.v_depth, &mut self.v_alpha);
-            if losses.depth > 0.0 {
+            let weight = plan.value(Param::DepthWeight);
+            if weight > 0.0 {
                 let kind = DepthKind::Metric;
                 let values = self.depth.evaluate(
                     frame.depth,
                     frame.alpha,
                     reference.depths,
                     kind,
-                    losses.depth,
+                    weight,
                     v_depth,
                     v_alpha,
                 );
-                total += f64::from(losses.depth) * values.loss;
+                total += f64::from(weight) * values.loss;
             }
-            if losses.smooth > 0.0 {
+            let weight = plan.value(Param::SmoothWeight);
+            if weight > 0.0 {
                 let (of, k) = (Smoothed::Disparity, EDGE_SHARPNESS);
-                let loss = self.smooth.evaluate(
-                    frame.depth,
-                    frame.alpha,
-                    &target,
-                    of,
-                    k,
-                    losses.smooth,
-                    v_depth,
-                    v_alpha,
-                );
-                total += f64::from(losses.smooth) * loss;
+                let loss = self
+                    .smooth
+                    .evaluate(frame.depth, frame.alpha, &target, of, k, weight, v_depth, v_alpha);
+                total += f64::from(weight) * loss;
             }
         }
         ObjectiveValues {

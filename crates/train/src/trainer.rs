@@ -6,7 +6,7 @@ use crate::half_fit::HalfFit;
 use crate::model::Model;
 use crate::objective::{Objective, Reference};
 use crate::photos::{PhotoCache, Prepared};
-use crate::recipe::{Density, Recipe};
+use crate::recipe::{Density, Param, Recipe};
 use crate::schedule::{Clock, Round, Signal, StepPlan, coming_views, plan};
 use crate::socket::{Residual, Sockets};
 use cpu_time::ProcessTime;
@@ -302,12 +302,12 @@ impl Trainer {
         }
 
         let background = plan
-            .random_background
+            .is_on(Param::RandomBackground)
             .then(|| std::array::from_fn(|_| rng.uniform()))
             .filter(|_| photo.alpha.is_some());
         let options = RenderOptions {
             background: background.unwrap_or(self.recipe.render.background),
-            depth: plan.losses.depth > 0.0 || plan.losses.smooth > 0.0,
+            depth: plan.compares_depth(),
             ..self.render_options(plan.sh_degree)
         };
         self.sockets.render(&mut self.engine, view, placement, &options, &plan);
@@ -320,12 +320,12 @@ impl Trainer {
             color: self.sockets.frame_color(&self.engine),
             ..self.engine.frame()
         };
-        let loss = self.objective.evaluate(frame, &reference, &plan.losses, &mut rng);
+        let loss = self.objective.evaluate(frame, &reference, &plan, &mut rng);
         if plan.gathers == Some(Statistics::Error) {
             self.objective.error(frame.color, &photo, background.is_some());
         }
         self.sockets
-            .step_after_blending(&self.engine, view, self.objective.v_color_mut(), &plan.sockets);
+            .step_after_blending(&self.engine, view, self.objective.v_color_mut(), &plan);
         let mut v_out = self.objective.gradient();
         v_out.camera = self.sockets.needs_camera_gradient();
         v_out.gather = match plan.gathers {
@@ -369,14 +369,15 @@ impl Trainer {
 
     /// What this step does to the splats with their gradients.
     fn update(&self, plan: &StepPlan) -> Update {
-        let mut rates = plan.rates;
+        let mut rates = plan.rates();
         rates.means *= self.extent;
         let adam = &self.recipe.adam;
+        let (noise, limit) = (plan.value(Param::Noise), plan.value(Param::ConditionCap));
         Update {
             statistics: plan.gathers,
-            regularizers: plan.regularizers,
+            regularizers: plan.regularizers(),
             extent: self.extent,
-            trained_fraction: plan.trained_share,
+            trained_fraction: plan.value(Param::TrainedShare),
             rates,
             sh_degree: plan.sh_degree,
             adam: AdamStep {
@@ -385,12 +386,12 @@ impl Trainer {
                 epsilon: adam.epsilon,
                 step: self.clock.step + 1,
             },
-            noise: (plan.noise > 0.0).then_some(Noise {
-                amount: plan.noise * rates.means,
+            noise: (noise > 0.0).then_some(Noise {
+                amount: noise * rates.means,
                 seed: self.options.seed,
                 step: self.clock.step,
             }),
-            condition_cap: plan.condition_cap,
+            condition_cap: (limit > 0.0).then_some(limit),
         }
     }
 
@@ -469,7 +470,12 @@ impl Trainer {
 
     /// Depths of the points that view number `view` is known to see, where the plan has a use for them.
     pub(crate) fn known_depths(&self, view: usize, camera: &Camera, plan: &StepPlan) -> Vec<DepthSample> {
-        let Some(points) = self.dataset.points.as_ref().filter(|_| plan.losses.depth > 0.0) else {
+        let Some(points) = self
+            .dataset
+            .points
+            .as_ref()
+            .filter(|_| plan.value(Param::DepthWeight) > 0.0)
+        else {
             return Vec::new();
         };
         let seen = &self.dataset.views[view].points_seen;

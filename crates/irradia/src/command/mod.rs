@@ -8,6 +8,7 @@ pub mod files;
 mod journal;
 mod progress;
 pub mod recipe;
+mod recipe_keys;
 pub mod render;
 pub mod train;
 

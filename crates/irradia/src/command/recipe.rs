@@ -1,10 +1,11 @@
 //! `irradia recipe`
 
+use super::recipe_keys;
 use super::train::read_recipe;
 use crate::terminal::say;
 use anyhow::Result;
 use irradia_train::Recipe;
-use irradia_train::recipe::{BUILT_IN, Density, Exit, Param, Represents, Stage};
+use irradia_train::recipe::{BUILT_IN, Density, Exit, Group, Param, Represents, Stage};
 use irradia_train::report::columns;
 use irradia_train::schedule::{Moment, outline};
 
@@ -20,6 +21,8 @@ enum Action {
     List,
     /// Show what a recipe does when
     Show(ShowArgs),
+    /// Say what may stand in a recipe: each key with unit, default, bounds and source
+    Keys(recipe_keys::Args),
 }
 
 #[derive(clap::Args)]
@@ -41,6 +44,7 @@ pub struct ShowArgs {
 pub fn run(args: &Args) -> Result<()> {
     match &args.action {
         Action::List => list(),
+        Action::Keys(args) => recipe_keys::run(args),
         Action::Show(args) => {
             let recipe = read_recipe(&args.recipe, &args.set)?;
             if args.toml {
@@ -86,7 +90,7 @@ fn plan(recipe: &Recipe, steps: u64) -> String {
     text += &columns(&stages(recipe, &moments, pace), 6);
 
     let (still, moving): (Vec<Param>, Vec<Param>) = Param::ALL.into_iter().partition(|param| {
-        let value = |moment: &Moment| moment.values[*param as usize];
+        let value = |moment: &Moment| moment.values[*param];
         moments.iter().all(|moment| value(moment) == value(&moments[0]))
     });
     let shown = distinct(&moments, pace);
@@ -97,16 +101,16 @@ fn plan(recipe: &Recipe, steps: u64) -> String {
         names.extend(shown.iter().map(|moment| recipe.stage[moment.stage].name.clone()));
         let mut lines = vec![heads, names];
         for param in moving {
-            let mut line = vec![param.name()];
-            line.extend(shown.iter().map(|moment| figure(moment.values[param as usize])));
+            let mut line = vec![param.name().to_owned()];
+            line.extend(shown.iter().map(|moment| figure(moment.values[param])));
             lines.push(line);
         }
         text += &format!("\nWhat changes:\n{}", columns(&lines, 1));
     }
     let lines: Vec<Vec<String>> = still
         .iter()
-        .filter(|param| moments[0].values[**param as usize] != 0.0)
-        .map(|param| vec![param.name(), figure(moments[0].values[*param as usize])])
+        .filter(|param| moments[0].values[**param] != 0.0)
+        .map(|param| vec![param.name().to_owned(), figure(moments[0].values[*param])])
         .collect();
     text + &format!("\nWhat stays:\n{}", columns(&lines, 1))
 }
@@ -137,7 +141,7 @@ fn stages(recipe: &Recipe, moments: &[Moment], pace: f64) -> Vec<Vec<String>> {
 
 /// The value of a knob in a stage, or its first and its last.
 fn course(within: &[&Moment], param: Param) -> String {
-    let value = |moment: Option<&&Moment>| moment.map_or(0.0, |moment| moment.values[param as usize]);
+    let value = |moment: Option<&&Moment>| moment.map_or(0.0, |moment| moment.values[param]);
     let (first, last) = (value(within.first()), value(within.last()));
     if first == last {
         figure(first)
@@ -147,27 +151,27 @@ fn course(within: &[&Moment], param: Param) -> String {
 }
 
 fn losses(within: &[&Moment]) -> String {
-    let names = [
-        (Param::PhotoWeight, "photo"),
-        (Param::MseWeight, "mse"),
-        (Param::CoarseWeight, "coarse"),
-        (Param::PerceptualWeight, "perceptual"),
-        (Param::AlphaWeight, "alpha"),
-        (Param::DepthWeight, "depth"),
-        (Param::SmoothWeight, "smooth"),
-    ];
-    let mut parts = Vec::new();
-    for (param, name) in names {
-        if within.iter().all(|moment| moment.values[param as usize] == 0.0) {
+    let with_group = |group: Group| Param::ALL.into_iter().filter(move |param| param.row().group == group);
+    let mut losses = Vec::new();
+    for loss in with_group(Group::Loss) {
+        if within.iter().all(|moment| moment.values[loss] == 0.0) {
             continue;
         }
-        let ssim = match param {
-            Param::PhotoWeight => format!(" (SSIM {})", course(within, Param::SsimWeight)),
-            _ => String::new(),
+        let named = |param: Param| {
+            let name = param.name();
+            let (name, kind) = name.rsplit_once('_').unwrap_or((name, ""));
+            let name = if kind == "weight" { name } else { kind };
+            format!("{name} {}", course(within, param))
         };
-        parts.push(format!("{name} {}{ssim}", course(within, param)));
+        let parts: Vec<String> = with_group(Group::PartOf(loss)).map(named).collect();
+        let parts = if parts.is_empty() {
+            String::new()
+        } else {
+            format!(" ({})", parts.join(", "))
+        };
+        losses.push(named(loss) + &parts);
     }
-    parts.join(", ")
+    losses.join(", ")
 }
 
 fn density(stage: &Stage) -> String {
@@ -200,8 +204,10 @@ fn exit(exit: Exit) -> String {
 /// The moments without those at the end of a stage that the next one begins as.
 fn distinct(moments: &[Moment], pace: f64) -> Vec<&Moment> {
     let step = |moment: &Moment| (moment.time / pace).round();
-    let equal = |(a, b): (&f64, &f64)| (a - b).abs() <= 1e-6 * a.abs();
-    let same = |a: &Moment, b: &Moment| step(a) == step(b) && a.values.iter().zip(&b.values).all(equal);
+    let equal = |a: f64, b: f64| (a - b).abs() <= 1e-6 * a.abs();
+    let same = |a: &Moment, b: &Moment| {
+        step(a) == step(b) && Param::ALL.iter().all(|param| equal(a.values[*param], b.values[*param]))
+    };
     let shown = moments
         .iter()
         .enumerate()

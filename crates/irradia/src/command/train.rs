@@ -347,7 +347,7 @@ fn finish(folder: RunFolder, mut config: RunConfig, mut trainer: Trainer, starte
 
 /// What is left out of the recipe because LPIPS has no weights.
 fn missing_weights(trainer: &Trainer) -> Option<String> {
-    let weighs = |moment: &Moment| moment.values[Param::PerceptualWeight as usize] > 0.0;
+    let weighs = |moment: &Moment| moment.values[Param::PerceptualWeight] > 0.0;
     let missing = trainer.options.lpips.is_none() && outline(&trainer.recipe, 1000).iter().any(weighs);
     missing.then(|| {
         format!(

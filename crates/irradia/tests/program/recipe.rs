@@ -35,6 +35,29 @@ fn recipes_are_listed_and_shown() {
 }
 
 #[test]
+fn the_page_of_keys_is_what_the_program_prints() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let printed = irradia(folder.path(), "recipe keys --markdown").well();
+    let page = concat!(env!("CARGO_MANIFEST_DIR"), "/../../docs/recipe-keys.md");
+    let page = fs::read_to_string(page).expect("docs/recipe-keys.md");
+    assert!(
+        printed.stdout == page,
+        "docs/recipe-keys.md is out of date: irradia recipe keys --markdown > docs/recipe-keys.md"
+    );
+}
+
+#[test]
+fn keys_are_found_by_a_part_of_their_name() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let found = irradia(folder.path(), "recipe keys ssim").well();
+    assert!(
+        found.stdout.contains("params.ssim_weight: fraction, default 0, 0 to 1") && !found.stdout.contains("init."),
+        "{found:?}"
+    );
+    irradia(folder.path(), "recipe keys ssim_wieght").refused(2, &["ssim_wieght", "params.ssim_weight"]);
+}
+
+#[test]
 fn a_shown_recipe_is_a_file_to_train_with() {
     let folder = with_data();
     let toml = irradia(folder.path(), "recipe show fast --toml --set max_splats=4321").well();

@@ -1,20 +1,31 @@
 //! Switches that take one ingredient out of a curriculum, so that its share in the outcome can be measured.
 
-use super::{Param, Recipe};
+use super::keys::documented;
+use super::{Group, Param, Recipe};
 use serde::{Deserialize, Serialize};
 
-/// Which ingredients of a curriculum are in force; all when nothing is said.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct Ingredients {
-    /// Large splats are trained first (`trained_share`).
-    pub parameter_groups: bool,
-    /// Images and the number of splats grow (`image_scale`, `count_share`).
-    pub data_schedule: bool,
-    /// Losses change from stage to stage; the last stage's hold throughout otherwise.
-    pub loss_schedule: bool,
-    /// Stages end when they have done their work (`exit`).
-    pub adaptive_transitions: bool,
+documented! {
+    /// Which ingredients of a curriculum are in force; all when nothing is said.
+    #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+    #[serde(deny_unknown_fields)]
+    pub struct Ingredients {
+        /// Large splats are trained first (`trained_share`).
+        #[serde(default = "on")]
+        pub parameter_groups: bool,
+        /// Images and the number of splats grow (`image_scale`, `count_share`).
+        #[serde(default = "on")]
+        pub data_schedule: bool,
+        /// Losses change from stage to stage; the last stage's hold throughout otherwise.
+        #[serde(default = "on")]
+        pub loss_schedule: bool,
+        /// Stages end when they have done their work (`exit`).
+        #[serde(default = "on")]
+        pub adaptive_transitions: bool,
+    }
+}
+
+fn on() -> bool {
+    true
 }
 
 impl Default for Ingredients {
@@ -28,19 +39,6 @@ impl Default for Ingredients {
     }
 }
 
-/// The knobs that say what a frame is compared by.
-const LOSSES: [Param; 9] = [
-    Param::PhotoWeight,
-    Param::SsimWeight,
-    Param::MseWeight,
-    Param::CoarseWeight,
-    Param::CoarseFactor,
-    Param::PerceptualWeight,
-    Param::AlphaWeight,
-    Param::DepthWeight,
-    Param::SmoothWeight,
-];
-
 impl Ingredients {
     /// Whether nothing is switched off.
     pub fn are_all(&self) -> bool {
@@ -50,21 +48,21 @@ impl Ingredients {
     /// Takes out of `recipe` what is switched off.
     pub(super) fn apply(self, recipe: &mut Recipe) {
         if !self.parameter_groups {
-            forget(recipe, &[Param::TrainedShare]);
+            forget(recipe, |param| param == Param::TrainedShare);
         }
         if !self.data_schedule {
-            forget(recipe, &[Param::ImageScale, Param::CountShare]);
+            forget(recipe, |param| param.row().group == Group::Data);
         }
         if !self.loss_schedule {
             // A knob that the last stage does not name holds from the last stage that does.
-            for param in LOSSES {
+            for param in Param::ALL.into_iter().filter(|param| param.is_of_loss()) {
                 let last = recipe
                     .stage
                     .iter()
                     .rev()
                     .find_map(|stage| stage.params.get(&param).cloned());
                 if let Some(knob) = last {
-                    forget(recipe, &[param]);
+                    forget(recipe, |other| other == param);
                     recipe.params.insert(param, knob);
                 }
             }
@@ -77,10 +75,10 @@ impl Ingredients {
     }
 }
 
-fn forget(recipe: &mut Recipe, params: &[Param]) {
+fn forget(recipe: &mut Recipe, forgotten: impl Fn(Param) -> bool) {
     let stages = recipe.stage.iter_mut().map(|stage| &mut stage.params);
     for knobs in stages.chain([&mut recipe.params]) {
-        knobs.retain(|param, _| !params.contains(param));
+        knobs.retain(|param, _| !forgotten(*param));
     }
 }
 
@@ -100,7 +98,7 @@ mod tests {
         let exits = |recipe: &Recipe| recipe.stage.iter().any(|stage| stage.exit.is_some());
         let stage_losses = |recipe: &Recipe| {
             let mut knobs = recipe.stage.iter().flat_map(|stage| stage.params.keys());
-            knobs.any(|param| LOSSES.contains(param))
+            knobs.any(|param| param.is_of_loss())
         };
         let found = |recipe: &Recipe| {
             [

@@ -1,5 +1,6 @@
 //! How a stage adds, removes and merges splats: the knobs of each strategy, with sizes in units of the scene's extent.
 
+use super::keys::documented;
 use irradia_splat::Statistics;
 use irradia_splat::densify::classic::ClassicOptions;
 use irradia_splat::densify::fast::FastOptions;
@@ -59,32 +60,34 @@ impl Density {
     }
 }
 
-/// Knobs of [`irradia_splat::densify::classic`].
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct ClassicKnobs {
-    /// Steps (of the run, not stretched) between rounds.
-    pub every: u64,
-    /// Mean screen gradient, normalised device coordinates, from which a splat is densified.
-    pub gradient_threshold: f32,
-    /// Whether the gradients of a splat's fragments are added absolutely (AbsGS).
-    #[serde(default)]
-    pub absolute: bool,
-    /// Whether clones share the opacity of what they copy.
-    #[serde(default)]
-    pub revised_opacity: bool,
-    /// Size that divides what is cloned from what is split, in units of the scene's extent.
-    pub small: f32,
-    /// Opacity below which a splat is removed.
-    pub min_opacity: f32,
-    /// Half size on screen above which a splat is removed, pixels, once opacities were reset.
-    pub max_extent: f32,
-    /// World size above which a splat is removed, in units of the scene's extent, once opacities were reset.
-    pub max_scale: f32,
-    /// Steps (of the run, not stretched) between resets of the opacities; 0 for never.
-    pub reset_every: u64,
-    /// What opacities are lowered to.
-    pub reset_to: f32,
+documented! {
+    /// Knobs of [`irradia_splat::densify::classic`].
+    #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+    #[serde(deny_unknown_fields)]
+    pub struct ClassicKnobs {
+        /// Steps (of the run, not stretched) between rounds, at least 1.
+        pub every: u64,
+        /// Mean screen gradient, normalised device coordinates, from which a splat is densified.
+        pub gradient_threshold: f32,
+        /// Whether the gradients of a splat's fragments are added absolutely (AbsGS).
+        #[serde(default)]
+        pub absolute: bool,
+        /// Whether clones share the opacity of what they copy.
+        #[serde(default)]
+        pub revised_opacity: bool,
+        /// Size that divides what is cloned from what is split, in units of the scene's extent.
+        pub small: f32,
+        /// Opacity below which a splat is removed.
+        pub min_opacity: f32,
+        /// Half size on screen above which a splat is removed, pixels, once opacities were reset.
+        pub max_extent: f32,
+        /// World size above which a splat is removed, in units of the scene's extent, once opacities were reset.
+        pub max_scale: f32,
+        /// Steps (of the run, not stretched) between resets of the opacities; 0 for never.
+        pub reset_every: u64,
+        /// Opacity that a reset leaves at most.
+        pub reset_to: f32,
+    }
 }
 
 impl ClassicKnobs {
@@ -102,16 +105,18 @@ impl ClassicKnobs {
     }
 }
 
-/// Knobs of [`irradia_splat::densify::mcmc`].
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct McmcKnobs {
-    /// Steps (of the run, not stretched) between rounds.
-    pub every: u64,
-    /// Factor on the number of splats in `every` recipe steps.
-    pub growth: f32,
-    /// Opacity from which down a splat is dead.
-    pub min_opacity: f32,
+documented! {
+    /// Knobs of [`irradia_splat::densify::mcmc`].
+    #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+    #[serde(deny_unknown_fields)]
+    pub struct McmcKnobs {
+        /// Steps (of the run, not stretched) between rounds, at least 1.
+        pub every: u64,
+        /// Factor on the number of splats in `every` recipe steps.
+        pub growth: f32,
+        /// Opacity from which down a splat is dead.
+        pub min_opacity: f32,
+    }
 }
 
 impl McmcKnobs {
@@ -125,28 +130,30 @@ impl McmcKnobs {
     }
 }
 
-/// Knobs of [`irradia_splat::densify::taming`].
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct TamingKnobs {
-    /// Steps (of the run, not stretched) between rounds.
-    pub every: u64,
-    /// Size that divides what is cloned from what is split, in units of the scene's extent.
-    pub small: f32,
-    /// Opacity below which a splat is removed.
-    pub min_opacity: f32,
-    /// How much each part of the score counts: mean screen gradient,
-    pub score_gradient: f32,
-    /// mean error shown,
-    pub score_error: f32,
-    /// pixels covered,
-    pub score_pixels: f32,
-    /// opacity,
-    pub score_opacity: f32,
-    /// half size on screen,
-    pub score_extent: f32,
-    /// and world size.
-    pub score_scale: f32,
+documented! {
+    /// Knobs of [`irradia_splat::densify::taming`].
+    #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+    #[serde(deny_unknown_fields)]
+    pub struct TamingKnobs {
+        /// Steps (of the run, not stretched) between rounds, at least 1.
+        pub every: u64,
+        /// Size that divides what is cloned from what is split, in units of the scene's extent.
+        pub small: f32,
+        /// Opacity below which a splat is removed.
+        pub min_opacity: f32,
+        /// Weight of the mean screen gradient in the score.
+        pub score_gradient: f32,
+        /// Weight of the mean error shown in the score.
+        pub score_error: f32,
+        /// Weight of the pixels covered in the score.
+        pub score_pixels: f32,
+        /// Weight of the opacity in the score.
+        pub score_opacity: f32,
+        /// Weight of the half size on screen in the score.
+        pub score_extent: f32,
+        /// Weight of the world size in the score.
+        pub score_scale: f32,
+    }
 }
 
 impl TamingKnobs {
@@ -168,21 +175,23 @@ impl TamingKnobs {
     }
 }
 
-/// Knobs of [`irradia_splat::densify::fast`], for a run of as many steps as the recipe has. A run of a quarter of them has
-/// less to give to each splat: it may fill half the cap, and what it cuts shows four times the error.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct FastKnobs {
-    /// Steps (of the run, not stretched) between rounds.
-    pub every: u64,
-    /// Opacity below which a splat is removed.
-    pub min_opacity: f32,
-    /// Mean weight a frame, in pixels, below which a splat is removed.
-    pub min_weight: f32,
-    /// Mean error a frame, mean absolute colour difference times pixels, from which a splat is cut in two.
-    pub error_threshold: f32,
-    /// Half size on screen in pixels from which a splat is worth cutting.
-    pub min_extent: f32,
+documented! {
+    /// Knobs of [`irradia_splat::densify::fast`], for a run of as many steps as the recipe has. A run of a quarter of them has
+    /// less to give to each splat: it may fill half the cap, and what it cuts shows four times the error.
+    #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+    #[serde(deny_unknown_fields)]
+    pub struct FastKnobs {
+        /// Steps (of the run, not stretched) between rounds, at least 1.
+        pub every: u64,
+        /// Opacity below which a splat is removed.
+        pub min_opacity: f32,
+        /// Mean weight a frame, in pixels, below which a splat is removed.
+        pub min_weight: f32,
+        /// Mean error a frame, mean absolute colour difference times pixels, from which a splat is cut in two.
+        pub error_threshold: f32,
+        /// Half size on screen in pixels from which a splat is worth cutting.
+        pub min_extent: f32,
+    }
 }
 
 impl FastKnobs {
@@ -198,16 +207,18 @@ impl FastKnobs {
     }
 }
 
-/// When and what a stage merges ([`irradia_splat::densify::merge`]).
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct MergeKnobs {
-    /// Steps (of the run, not stretched) between rounds.
-    pub every: u64,
-    /// How near, in units of the smaller splat's median axis.
-    pub distance: f32,
-    /// How alike, in any channel of the base colour.
-    pub color: f32,
+documented! {
+    /// When and what a stage merges ([`irradia_splat::densify::merge`]).
+    #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+    #[serde(deny_unknown_fields)]
+    pub struct MergeKnobs {
+        /// Steps (of the run, not stretched) between rounds, at least 1.
+        pub every: u64,
+        /// Largest distance of splats that are merged, in units of the smaller one's median axis.
+        pub distance: f32,
+        /// Largest difference of splats that are merged, in any channel of the base colour.
+        pub color: f32,
+    }
 }
 
 impl MergeKnobs {

@@ -1,48 +1,54 @@
 //! The knobs of a radiance field.
 
+use super::keys::documented;
 use irradia_field::net::NetShape;
 use irradia_field::{FieldConfig, Outside, Sampler, Space};
 use serde::{Deserialize, Serialize};
 
-/// A radiance field, for the stages that train one.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct FieldKnobs {
-    /// Where it lives.
-    #[serde(default)]
-    pub space: FieldSpace,
-    /// Samples of a step: the number of rays follows from it.
-    pub samples: usize,
-    /// Decay of Adam's second moment.
-    pub beta2: f32,
-    /// Splats that a later stage of splats begins with at most; 0 without such a stage.
-    #[serde(default)]
-    pub points: usize,
-    /// Degree in direction, 0 to 3, of a background that is learnt with the field, for photographs without alpha; absent: what
-    /// lies behind is fixed or random.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub background_degree: Option<u32>,
-    /// Takes the place of the networks' `density_bias` where photographs have no alpha: there is something in each of their
-    /// pixels, and a field that begins dense enough to hide what lies behind learns at once; absent: as it is.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub opaque_density_bias: Option<f32>,
-    /// The network that gives out colour.
-    pub net: NetShape,
-    /// Where along a ray samples lie.
-    pub sampler: Sampler,
+documented! {
+    /// A radiance field, for the stages that train one.
+    #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+    #[serde(deny_unknown_fields)]
+    pub struct FieldKnobs {
+        /// Where it lives: `auto`, `bounded`, `unbounded` or `ndc`.
+        #[serde(default)]
+        pub space: FieldSpace,
+        /// Samples of a step: the number of rays follows from it.
+        pub samples: usize,
+        /// Decay of Adam's second moment.
+        pub beta2: f32,
+        /// Splats that a later stage of splats begins with at most; 0 without such a stage.
+        #[serde(default)]
+        pub points: usize,
+        /// Degree in direction, 0 to 3, of a background that is learnt with the field, for photographs without alpha; absent: what
+        /// lies behind is fixed or random.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        pub background_degree: Option<u32>,
+        /// Takes the place of the networks' `density_bias` where photographs have no alpha: there is something in each of their
+        /// pixels, and a field that begins dense enough to hide what lies behind learns at once; absent: as it is.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        pub opaque_density_bias: Option<f32>,
+        /// The network that gives out colour: `encoding`, `width`, `depth`, `skip`, `geometry`, `activation`, `density_bias`, `color`;
+        /// see `NetShape` of the crate `irradia-field`.
+        pub net: NetShape,
+        /// Where along a ray samples lie: `kind` is `occupancy`, `hierarchy` or `proposal`; see `Sampler` of the crate `irradia-field`.
+        pub sampler: Sampler,
+    }
 }
 
-/// A small field that adds a view-dependent colour to splats: reflections that harmonics cannot hold.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct ResidualKnobs {
-    /// Decay of Adam's second moment.
-    pub beta2: f32,
-    /// Whether it is asked by the direction that a mirror would show, across the splat's shortest axis, and not by that of
-    /// view (Ref-NeRF, Verbin et al. 2022): what surroundings a place reflects then depends little on the place.
-    pub mirrored: bool,
-    /// Its network, of which the density is not used.
-    pub net: NetShape,
+documented! {
+    /// A small field that adds a view-dependent colour to splats: reflections that harmonics cannot hold.
+    #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+    #[serde(deny_unknown_fields)]
+    pub struct ResidualKnobs {
+        /// Decay of Adam's second moment.
+        pub beta2: f32,
+        /// Whether it is asked by the direction that a mirror would show, across the splat's shortest axis, and not by that of
+        /// view (Ref-NeRF, Verbin et al. 2022): what surroundings a place reflects then depends little on the place.
+        pub mirrored: bool,
+        /// Its network, as `field.net`, of which the density is not used.
+        pub net: NetShape,
+    }
 }
 
 impl ResidualKnobs {

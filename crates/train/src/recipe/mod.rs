@@ -3,14 +3,18 @@
 mod ablation;
 mod density;
 mod field;
+pub mod keys;
 mod param;
+mod table;
 
 pub use ablation::Ingredients;
 pub use density::{ClassicKnobs, Density, FastKnobs, McmcKnobs, MergeKnobs, TamingKnobs};
 pub use field::{FieldKnobs, FieldSpace, ResidualKnobs};
+use keys::documented;
 use param::check_knob;
-pub use param::{Knob, Param, Params, Shape};
+pub use param::{Knob, Params, Shape, Values};
 use serde::{Deserialize, Serialize};
+pub use table::{Group, Param, Row};
 
 /// The recipes that come with the program: name and text.
 pub const BUILT_IN: [(&str, &str); 11] = [
@@ -59,113 +63,123 @@ pub enum RecipeError {
     },
 }
 
-/// One way of training.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Recipe {
-    /// Short name.
-    pub name: String,
-    /// What it is and where it comes from.
-    pub about: String,
-    /// Never more splats than this.
-    pub max_splats: usize,
-    /// Nor than this many for each pixel of a training image, all views' mean; no such limit when absent.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub splats_per_pixel: Option<f32>,
-    /// Held-out views are looked at every so many steps while training.
-    pub eval_every: u64,
-    /// A checkpoint is written every so many steps.
-    pub checkpoint_every: u64,
+documented! {
+    /// One way of training.
+    #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+    #[serde(deny_unknown_fields)]
+    pub struct Recipe {
+        /// Short name.
+        pub name: String,
+        /// What it is and where it comes from.
+        pub about: String,
+        /// Never more splats than this; at least 1.
+        pub max_splats: usize,
+        /// Never more splats than this for each pixel of a training image, all views' mean; no such limit when absent.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        pub splats_per_pixel: Option<f32>,
+        /// Steps between evaluations of held-out views while training; at least 1.
+        pub eval_every: u64,
+        /// Steps between checkpoints; at least 1.
+        pub checkpoint_every: u64,
+        /// How frames are rendered.
+        pub render: RenderKnobs,
+        /// The first splats.
+        pub init: InitKnobs,
+        /// Adam's constants.
+        pub adam: AdamKnobs,
+        /// What of a curriculum is in force.
+        #[serde(default, skip_serializing_if = "Ingredients::are_all")]
+        pub ingredients: Ingredients,
+        /// The radiance field of the stages that train one.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        pub field: Option<FieldKnobs>,
+        /// Each photograph has an exposure and white balance of its own, an affine map of colours.
+        #[serde(default, skip_serializing_if = "is_false")]
+        pub exposure: bool,
+        /// The photographs put their cameras' poses right.
+        #[serde(default, skip_serializing_if = "is_false")]
+        pub refine_poses: bool,
+        /// What adds to the splats' colours.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        pub residual: Option<ResidualKnobs>,
+        /// Knobs over the whole run; a stage may overrule them.
+        pub params: Params,
+        /// What happens, in order.
+        pub stage: Vec<Stage>,
+    }
+}
+
+documented! {
     /// How frames are rendered.
-    pub render: RenderKnobs,
+    #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+    #[serde(deny_unknown_fields)]
+    pub struct RenderKnobs {
+        /// Behind the scene, sRGB; images with alpha are laid over it.
+        pub background: [f32; 3],
+        /// Scale opacities by the area that the 0.3 pixel dilation adds.
+        pub antialias: bool,
+        /// Keep splats from being finer than the training views can show (Mip-Splatting's 3D smoothing filter).
+        #[serde(default)]
+        pub smoothing_filter: bool,
+    }
+}
+
+documented! {
     /// The first splats.
-    pub init: InitKnobs,
+    #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+    #[serde(deny_unknown_fields)]
+    pub struct InitKnobs {
+        /// Opacity, between 0 and 1.
+        pub opacity: f32,
+        /// Opacity of splats at random places, most of them in empty space; `init.opacity` when absent.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        pub random_opacity: Option<f32>,
+        /// Size as a factor on the distance to the nearest neighbours, above 0.
+        pub scale: f32,
+        /// Number of splats where the dataset has no points.
+        pub random_points: usize,
+    }
+}
+
+documented! {
     /// Adam's constants.
-    pub adam: AdamKnobs,
-    /// What of a curriculum is in force.
-    #[serde(default, skip_serializing_if = "Ingredients::are_all")]
-    pub ingredients: Ingredients,
-    /// The radiance field of the stages that train one.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub field: Option<FieldKnobs>,
-    /// Each photograph has an exposure and white balance of its own, an affine map of colours.
-    #[serde(default, skip_serializing_if = "is_false")]
-    pub exposure: bool,
-    /// The photographs put their cameras' poses right.
-    #[serde(default, skip_serializing_if = "is_false")]
-    pub refine_poses: bool,
-    /// What adds to the splats' colours.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub residual: Option<ResidualKnobs>,
-    /// Knobs over the whole run; a stage may overrule them.
-    pub params: Params,
-    /// What happens, in order.
-    pub stage: Vec<Stage>,
+    #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+    #[serde(deny_unknown_fields)]
+    pub struct AdamKnobs {
+        /// Decay of the first moment.
+        pub beta1: f32,
+        /// Decay of the second moment.
+        pub beta2: f32,
+        /// Added to the root of the second moment.
+        pub epsilon: f32,
+    }
 }
 
-/// How frames are rendered.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct RenderKnobs {
-    /// Behind the scene, sRGB; images with alpha are laid over it.
-    pub background: [f32; 3],
-    /// Scale opacities by the area that the 0.3 pixel dilation adds.
-    pub antialias: bool,
-    /// Keep splats from being finer than the training views can show (Mip-Splatting's 3D smoothing filter).
-    #[serde(default)]
-    pub smoothing_filter: bool,
-}
-
-/// The first splats.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct InitKnobs {
-    /// Their opacity.
-    pub opacity: f32,
-    /// Likewise where they are random, most of them in empty space; the same when absent.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub random_opacity: Option<f32>,
-    /// Factor on the distance to the nearest neighbours that makes their size.
-    pub scale: f32,
-    /// How many, where the dataset has no points.
-    pub random_points: usize,
-}
-
-/// Adam's constants.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct AdamKnobs {
-    /// Decay of the first moment.
-    pub beta1: f32,
-    /// Decay of the second moment.
-    pub beta2: f32,
-    /// Added to the root.
-    pub epsilon: f32,
-}
-
-/// A part of the run.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Stage {
-    /// Short name, unique in the recipe.
-    pub name: String,
-    /// Its length in recipe steps: `--steps` and `--budget` stretch or shrink the whole run.
-    pub steps: u64,
-    /// What it trains. Splats that come after a field begin as its surfaces.
-    #[serde(default, skip_serializing_if = "Represents::is_splats")]
-    pub represents: Represents,
-    /// Knobs over this stage.
-    #[serde(default)]
-    pub params: Params,
-    /// How splats are added and removed; none are when absent.
-    #[serde(default)]
-    pub density: Option<Density>,
-    /// How adjacent splats are merged; none are when absent.
-    #[serde(default)]
-    pub merge: Option<MergeKnobs>,
-    /// When the stage may end before its steps are over; never when absent.
-    #[serde(default)]
-    pub exit: Option<Exit>,
+documented! {
+    /// A part of the run.
+    #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+    #[serde(deny_unknown_fields)]
+    pub struct Stage {
+        /// Short name, unique in the recipe.
+        pub name: String,
+        /// Its length in recipe steps, at least 1: `--steps` and `--budget` stretch or shrink the whole run.
+        pub steps: u64,
+        /// What it trains, `splats` or `field`. Splats that come after a field begin as its surfaces.
+        #[serde(default, skip_serializing_if = "Represents::is_splats")]
+        pub represents: Represents,
+        /// Knobs over this stage.
+        #[serde(default)]
+        pub params: Params,
+        /// How splats are added and removed; none are when absent.
+        #[serde(default)]
+        pub density: Option<Density>,
+        /// How adjacent splats are merged; none are when absent.
+        #[serde(default)]
+        pub merge: Option<MergeKnobs>,
+        /// When the stage may end before its steps are over; never when absent.
+        #[serde(default)]
+        pub exit: Option<Exit>,
+    }
 }
 
 /// What a stage trains.
@@ -185,28 +199,30 @@ impl Represents {
     }
 }
 
-/// When a stage has done its work: rules on S, the mean L1 error over the training views (CurriculumGS's S_t), of which a
-/// running estimate is kept and which is measured now and then.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(tag = "when", rename_all = "snake_case", deny_unknown_fields)]
-pub enum Exit {
-    /// S falls below `tau`.
-    Threshold {
-        /// Mean absolute difference of colours in \[0, 1\].
-        tau: f64,
-    },
-    /// S falls below `ratio` of what it was when the stage had seen every view once: a tau that no one has to tune.
-    Relative {
-        /// Share of the stage's first S.
-        ratio: f64,
-    },
-    /// S has not fallen by the share `drop` within `window` recipe steps.
-    Plateau {
-        /// Share of the best S so far.
-        drop: f64,
-        /// Recipe steps.
-        window: u64,
-    },
+documented! {
+    /// When a stage has done its work: rules on S, the mean L1 error over the training views (CurriculumGS's S_t), of which a
+    /// running estimate is kept and which is measured now and then.
+    #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+    #[serde(tag = "when", rename_all = "snake_case", deny_unknown_fields)]
+    pub enum Exit {
+        /// S falls below `tau`.
+        Threshold {
+            /// Mean absolute difference of colours in \[0, 1\].
+            tau: f64,
+        },
+        /// S falls below `ratio` of what it was when the stage had seen every view once: a tau that no one has to tune.
+        Relative {
+            /// Share of the stage's first S.
+            ratio: f64,
+        },
+        /// S has not fallen by the share `drop` within `window` recipe steps.
+        Plateau {
+            /// Share of the best S so far.
+            drop: f64,
+            /// Recipe steps.
+            window: u64,
+        },
+    }
 }
 
 impl Recipe {

@@ -1,154 +1,91 @@
 //! What changes over time in a run, and how.
 
-use serde::{Deserialize, Deserializer, Serialize};
+use super::table::{Group, Param, ROWS, Row};
+use serde::de::Error;
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use std::collections::BTreeMap;
+use std::ops::{Index, IndexMut};
+use std::sync::LazyLock;
 
 /// Knobs by name.
 pub type Params = BTreeMap<Param, Knob>;
 
-/// What can change over time.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Param {
-    /// Size of the training images relative to the data's.
-    ImageScale,
-    /// SH bands in use.
-    ShDegree,
-    /// How many splats there may be, as a share of the recipe's cap.
-    CountShare,
-    /// Share of the visible splats whose place and shape are trained, the largest first; of the others opacity and colour are.
-    TrainedShare,
-    /// Weight of the photometric loss, (1 - w) L1 + w (1 - SSIM).
-    PhotoWeight,
-    /// w in it.
-    SsimWeight,
-    /// Weight of the mean squared error.
-    MseWeight,
-    /// Weight of the mean squared error of images shrunk by `coarse_factor`.
-    CoarseWeight,
-    /// By how much they are shrunk, pixels to one.
-    CoarseFactor,
-    /// Weight of LPIPS, on a patch of the image; needs its weights.
-    PerceptualWeight,
-    /// Weight of the mean |alpha - alpha of the photograph|, where it has one.
-    AlphaWeight,
-    /// Weight of the mean |depth - depth of the points that the view sees|, relative to that depth; for a field of the mean
-    /// squared difference of distance, in the units in which its samples are spread, at pixels where such points lie.
-    DepthWeight,
-    /// Weight of the edge-aware smoothness of depth.
-    SmoothWeight,
-    /// From 0.5 on, photographs with alpha are laid over a new random colour in each step, and so is the scene.
-    RandomBackground,
-    /// Weight of the mean opacity.
-    OpacityReg,
-    /// Weight of the mean squared opacity.
-    OpacitySquareReg,
-    /// Weight of the mean standard deviation, in units of the scene's extent.
-    ScaleReg,
-    /// Weight of the mean squared Frobenius norm of the covariance, in those units to the fourth.
-    CovarianceReg,
-    /// Largest condition number of a covariance; 0 for none.
-    ConditionCap,
-    /// Noise on the means of faint splats, times the means' rate (3DGS-MCMC).
-    Noise,
-    /// Learning rate of the means, in units of the scene's extent.
-    RateMeans,
-    /// Learning rate of the quaternions.
-    RateQuats,
-    /// Learning rate of the ln scales.
-    RateScales,
-    /// Learning rate of the opacity logits.
-    RateOpacities,
-    /// Learning rate of the SH's DC coefficients.
-    RateShDc,
-    /// Learning rate of the other SH coefficients.
-    RateShRest,
-    /// Learning rate of a field's tables.
-    RateTables,
-    /// Learning rate of a field's networks.
-    RateNets,
-    /// Learning rate of a field's appearance codes.
-    RateCodes,
-    /// Weight of the interlevel loss, where a field's samples are proposed (mip-NeRF 360).
-    InterlevelWeight,
-    /// Weight of the distortion loss of a field (mip-NeRF 360).
-    DistortionWeight,
-    /// From 0.5 on, for the rest of the run, the residual field of a recipe that has one adds to the splats' colours.
-    Residual,
-    /// Learning rate of the photographs' exposures, where the recipe has `exposure`.
-    RateExposure,
-    /// Weight of the mean squared difference of a photograph's exposure from none.
-    ExposureReg,
-    /// Learning rate of the poses, radians and units of the scene's extent, where the recipe has `refine_poses`.
-    RatePoses,
-}
+/// Names by [`Param::ALL`].
+static NAMES: LazyLock<[&str; Param::ALL.len()]> = LazyLock::new(|| Param::ALL.map(Param::name));
 
 impl Param {
-    /// All of them, in order.
-    pub const ALL: [Param; 35] = [
-        Param::ImageScale,
-        Param::ShDegree,
-        Param::CountShare,
-        Param::TrainedShare,
-        Param::PhotoWeight,
-        Param::SsimWeight,
-        Param::MseWeight,
-        Param::CoarseWeight,
-        Param::CoarseFactor,
-        Param::PerceptualWeight,
-        Param::AlphaWeight,
-        Param::DepthWeight,
-        Param::SmoothWeight,
-        Param::RandomBackground,
-        Param::OpacityReg,
-        Param::OpacitySquareReg,
-        Param::ScaleReg,
-        Param::CovarianceReg,
-        Param::ConditionCap,
-        Param::Noise,
-        Param::RateMeans,
-        Param::RateQuats,
-        Param::RateScales,
-        Param::RateOpacities,
-        Param::RateShDc,
-        Param::RateShRest,
-        Param::RateTables,
-        Param::RateNets,
-        Param::RateCodes,
-        Param::InterlevelWeight,
-        Param::DistortionWeight,
-        Param::Residual,
-        Param::RateExposure,
-        Param::ExposureReg,
-        Param::RatePoses,
-    ];
+    /// All that the table says about it.
+    pub fn row(self) -> &'static Row {
+        &ROWS[self as usize]
+    }
 
     /// As recipes write it.
-    pub fn name(self) -> String {
-        let name = toml::Value::try_from(self).expect("a name is plain text");
-        name.as_str().unwrap_or_default().to_owned()
+    pub fn name(self) -> &'static str {
+        self.row().name
     }
 
-    /// The value where no recipe says anything.
-    pub fn default_value(self) -> f64 {
-        match self {
-            Param::ImageScale | Param::CountShare | Param::TrainedShare | Param::PhotoWeight | Param::Residual => 1.0,
-            Param::CoarseFactor => 4.0,
-            _ => 0.0,
-        }
+    /// The parameter that recipes call `name`.
+    pub fn named(name: &str) -> Option<Self> {
+        Self::ALL.into_iter().find(|param| param.name() == name)
     }
 
-    /// Values that make sense.
-    fn range(self) -> std::ops::RangeInclusive<f64> {
-        match self {
-            Param::ImageScale => 0.01..=1.0,
-            Param::CountShare => 0.001..=1.0,
-            Param::TrainedShare => 0.001..=1.0,
-            Param::ShDegree => 0.0..=3.0,
-            Param::SsimWeight | Param::RandomBackground | Param::Residual => 0.0..=1.0,
-            Param::CoarseFactor => 1.0..=64.0,
-            _ => 0.0..=f64::MAX,
+    /// Whether it says what a frame is compared by.
+    pub fn is_of_loss(self) -> bool {
+        matches!(self.row().group, Group::Loss | Group::PartOf(_))
+    }
+}
+
+impl Serialize for Param {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.serialize_str(self.name())
+    }
+}
+
+impl<'de> Deserialize<'de> for Param {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        let name = String::deserialize(deserializer)?;
+        Self::named(&name).ok_or_else(|| D::Error::unknown_variant(&name, &*NAMES))
+    }
+}
+
+/// A value for each parameter.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Values([f64; Param::ALL.len()]);
+
+impl Values {
+    /// `value(param)` for each.
+    pub fn of(value: impl FnMut(Param) -> f64) -> Self {
+        Self(Param::ALL.map(value))
+    }
+
+    /// Where no recipe says anything.
+    pub fn default_values() -> Self {
+        Self::of(|param| param.row().default)
+    }
+
+    /// The value as a step uses it: `photo_weight` is what is left for L1 and `ssim_weight` what 1 - SSIM gets of it; all
+    /// others are as they are.
+    pub fn in_effect(&self, param: Param) -> f64 {
+        let ssim = || self[Param::SsimWeight] * self[Param::PhotoWeight];
+        match param {
+            Param::PhotoWeight => self[Param::PhotoWeight] - ssim(),
+            Param::SsimWeight => ssim(),
+            _ => self[param],
         }
+    }
+}
+
+impl IndexMut<Param> for Values {
+    fn index_mut(&mut self, param: Param) -> &mut f64 {
+        &mut self.0[param as usize]
+    }
+}
+
+impl Index<Param> for Values {
+    type Output = f64;
+
+    fn index(&self, param: Param) -> &f64 {
+        &self.0[param as usize]
     }
 }
 
@@ -200,7 +137,6 @@ struct RawKnob {
 
 impl<'de> Deserialize<'de> for Knob {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        use serde::de::Error;
         match toml::Value::deserialize(deserializer)? {
             toml::Value::Integer(v) => Ok(Knob::Const(v as f64)),
             toml::Value::Float(v) => Ok(Knob::Const(v)),
@@ -244,10 +180,10 @@ pub(super) fn check_knob(param: Param, knob: &Knob) -> Result<(), String> {
             steps.iter().map(|(_, v)| *v).collect()
         }
     };
-    let range = param.range();
-    match values.iter().find(|v| !range.contains(*v)) {
-        Some(v) if *range.end() == f64::MAX => Err(format!("{v} is below 0")),
-        Some(v) => Err(format!("{v} is not within {} to {}", range.start(), range.end())),
+    let bounds = &param.row().bounds;
+    match values.iter().find(|v| !bounds.contains(*v)) {
+        Some(v) if *bounds.end() == f64::MAX => Err(format!("{v} is below {}", bounds.start())),
+        Some(v) => Err(format!("{v} is not within {} to {}", bounds.start(), bounds.end())),
         None => Ok(()),
     }
 }

@@ -141,6 +141,8 @@
       ["degree", "Degree of spherical harmonics", { zero: true }],
       ["rate", "Learning rates", { log: true }],
       ["loss", "Weights of losses", { zero: true }],
+      ["noise", "Noise on the means, as a factor on their rate", { zero: true }],
+      ["cap", "Largest condition number of a splat", { log: true }],
     ]) {
       const knobs = schedule.knobs.filter((knob) => knob.name.startsWith(`${kind}.`));
       const named = knobs.map(({ name, values }) => ({ name: name.slice(kind.length + 1), values }));

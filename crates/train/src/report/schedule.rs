@@ -3,8 +3,8 @@
 //! What a run did follows from its recipe and from when it entered its stages: the schedule is gone through again.
 
 use super::StageReport;
-use crate::recipe::{Exit, Recipe};
-use crate::schedule::{Clock, Signal, StepPlan, ahead, plan};
+use crate::recipe::{Exit, Param, Recipe};
+use crate::schedule::{Clock, Signal, plan};
 use serde::{Deserialize, Serialize};
 
 /// Knobs over the steps of a run.
@@ -134,59 +134,25 @@ fn spans(recipe: &Recipe, stages: &[StageReport], clock: &Clock, steps: Option<u
 
 impl Schedule {
     fn push(&mut self, step: f64, recipe: &Recipe, clock: &Clock) {
-        let values = knobs(recipe, clock);
         if self.knobs.is_empty() {
-            self.knobs = values
-                .iter()
-                .map(|(name, _)| KnobCurve {
-                    name: (*name).to_owned(),
-                    values: Vec::new(),
-                })
-                .collect();
+            let curves = drawn().map(|(name, _)| KnobCurve {
+                name: name.to_owned(),
+                values: Vec::new(),
+            });
+            self.knobs = curves.collect();
         }
         self.steps.push(step as f32);
-        for (knob, (_, value)) in self.knobs.iter_mut().zip(values) {
-            knob.values.push(value);
+        let plan = plan(recipe, clock);
+        for (knob, (_, param)) in self.knobs.iter_mut().zip(drawn()) {
+            knob.values.push(plan.value(param));
         }
     }
 }
 
-/// What is drawn.
-fn knobs(recipe: &Recipe, clock: &Clock) -> Vec<(&'static str, f32)> {
-    let StepPlan {
-        image_scale,
-        sh_degree,
-        losses,
-        regularizers,
-        trained_share,
-        rates,
-        ..
-    } = plan(recipe, clock);
-    let count_share = ahead(recipe, clock, 1).first().map_or(1.0, |ahead| ahead.count_share);
-    vec![
-        ("scale.image", image_scale),
-        ("count.allowed", count_share as f32),
-        ("count.trained", trained_share),
-        ("degree.SH", sh_degree as f32),
-        ("rate.means", rates.means),
-        ("rate.quaternions", rates.quats),
-        ("rate.scales", rates.log_scales),
-        ("rate.opacities", rates.opacities),
-        ("rate.SH, base", rates.sh_dc),
-        ("rate.SH, rest", rates.sh_rest),
-        ("loss.L1", losses.photometric.l1),
-        ("loss.SSIM", losses.photometric.ssim),
-        ("loss.squared", losses.photometric.mse),
-        ("loss.coarse", losses.coarse),
-        ("loss.perceptual", losses.perceptual),
-        ("loss.alpha", losses.alpha),
-        ("loss.depth", losses.depth),
-        ("loss.smooth", losses.smooth),
-        ("loss.opacity", regularizers.opacity),
-        ("loss.opacity squared", regularizers.opacity_square),
-        ("loss.size", regularizers.scale),
-        ("loss.covariance", regularizers.covariance),
-    ]
+/// The curves of the table of parameters.
+fn drawn() -> impl Iterator<Item = (&'static str, Param)> {
+    let curve = |param: Param| param.row().curve.map(|name| (name, param));
+    Param::ALL.into_iter().filter_map(curve)
 }
 
 #[cfg(test)]
@@ -296,7 +262,7 @@ mod tests {
         }
         let rates = schedule.knobs.iter().find(|knob| knob.name == "rate.means").unwrap();
         for (step, value) in schedule.steps.iter().zip(&rates.values) {
-            let want = truth[(*step as usize).min(339)].rates.means;
+            let want = truth[(*step as usize).min(339)].value(Param::RateMeans);
             assert!((value - want).abs() < 0.03, "{value}, not {want}, at {step}");
         }
     }

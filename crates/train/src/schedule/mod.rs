@@ -6,8 +6,7 @@ mod watch;
 pub use outline::{Ahead, Moment, ahead, outline};
 pub use watch::Watch;
 
-use crate::recipe::{Density, Exit, Knob, MergeKnobs, Param, Recipe, Shape};
-use irradia_measure::LossWeights;
+use crate::recipe::{Density, Exit, Knob, MergeKnobs, Param, Recipe, Shape, Values};
 use irradia_scene::Rng;
 use irradia_splat::regularize::Regularizers;
 use irradia_splat::{Rates, Statistics};
@@ -32,8 +31,8 @@ pub struct Clock {
     pub stage_time: f64,
     /// `step` when it was entered.
     pub stage_step: u64,
-    /// The values in force when it was entered, by [`Param::ALL`]: a ramp without `from` goes on from them.
-    pub carried: [f64; Param::ALL.len()],
+    /// The values in force when it was entered: a ramp without `from` goes on from them.
+    pub carried: Values,
     /// Whether opacities were reset before.
     pub was_reset: bool,
     /// The training error in this stage.
@@ -58,24 +57,8 @@ pub struct StepPlan {
     pub image_scale: f32,
     /// SH bands in use.
     pub sh_degree: u32,
-    /// Weights of the losses.
-    pub losses: Losses,
-    /// Whether photographs with alpha are laid over a random colour.
-    pub random_background: bool,
-    /// Losses of the splats themselves.
-    pub regularizers: Regularizers,
-    /// Largest condition number of a covariance.
-    pub condition_cap: Option<f32>,
-    /// Noise on the means, in units of their rate.
-    pub noise: f32,
-    /// Share of the visible splats whose place and shape are trained, the largest first.
-    pub trained_share: f32,
-    /// Learning rates; that of the means in units of the scene's extent.
-    pub rates: Rates,
-    /// What a stage of field is trained by.
-    pub field: FieldPlan,
-    /// What sits in the sockets of a step is trained by.
-    pub sockets: SocketPlan,
+    /// Every parameter; [`StepPlan::value`] has them as a step uses them.
+    pub values: Values,
     /// Density statistics to gather.
     pub gathers: Option<Statistics>,
     /// A round of density control, after the step.
@@ -86,61 +69,14 @@ pub struct StepPlan {
     pub reset_opacity: Option<f32>,
     /// The smoothing filter is worked out anew, before the step.
     pub refilter: bool,
+    /// The occupancy grid of a field is updated, after the step.
+    pub update_occupancy: bool,
     /// The error is measured over training views, after the step.
     pub measure: bool,
     /// Held-out views are evaluated, after the step.
     pub evaluate: bool,
     /// A checkpoint is written, after the step.
     pub checkpoint: bool,
-}
-
-/// Rates and weights of a radiance field.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct FieldPlan {
-    /// Learning rate of tables.
-    pub tables: f32,
-    /// Learning rate of networks.
-    pub nets: f32,
-    /// Learning rate of appearance codes.
-    pub codes: f32,
-    /// Weight of the interlevel loss.
-    pub interlevel: f32,
-    /// Weight of the distortion loss.
-    pub distortion: f32,
-    /// The occupancy grid is looked at, after the step.
-    pub look: bool,
-    /// The residual field adds to the splats' colours.
-    pub residual: bool,
-}
-
-/// Rates and weights of what sits in the sockets of a step.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct SocketPlan {
-    /// Learning rate of the exposures.
-    pub exposure_rate: f32,
-    /// Weight of the mean squared difference of exposures from the identity.
-    pub exposure_reg: f32,
-    /// Learning rate of the poses, radians, and units of the scene's extent.
-    pub pose_rate: f32,
-}
-
-/// Weights of what a frame is compared by.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Losses {
-    /// L1, SSIM and squared error.
-    pub photometric: LossWeights,
-    /// Squared error of images shrunk by `coarse_factor`.
-    pub coarse: f32,
-    /// Pixels to one.
-    pub coarse_factor: usize,
-    /// LPIPS.
-    pub perceptual: f32,
-    /// Alpha against the photograph's.
-    pub alpha: f32,
-    /// Depth against that of the points that the view sees.
-    pub depth: f32,
-    /// Edge-aware smoothness of depth.
-    pub smooth: f32,
 }
 
 /// A round of density control.
@@ -156,6 +92,45 @@ pub struct Round {
     pub share: [f64; 2],
 }
 
+impl StepPlan {
+    /// A parameter as the step uses it ([`Values::in_effect`]).
+    pub fn value(&self, param: Param) -> f32 {
+        self.values.in_effect(param) as f32
+    }
+
+    /// Whether a switch is on.
+    pub fn is_on(&self, switch: Param) -> bool {
+        self.values[switch] >= 0.5
+    }
+
+    /// Whether frames are compared by depth, and so rendered with it.
+    pub fn compares_depth(&self) -> bool {
+        self.value(Param::DepthWeight) > 0.0 || self.value(Param::SmoothWeight) > 0.0
+    }
+
+    /// Losses of the splats themselves.
+    pub fn regularizers(&self) -> Regularizers {
+        Regularizers {
+            opacity: self.value(Param::OpacityReg),
+            opacity_square: self.value(Param::OpacitySquareReg),
+            scale: self.value(Param::ScaleReg),
+            covariance: self.value(Param::CovarianceReg),
+        }
+    }
+
+    /// Learning rates; that of the means in units of the scene's extent.
+    pub fn rates(&self) -> Rates {
+        Rates {
+            means: self.value(Param::RateMeans),
+            quats: self.value(Param::RateQuats),
+            log_scales: self.value(Param::RateScales),
+            opacities: self.value(Param::RateOpacities),
+            sh_dc: self.value(Param::RateShDc),
+            sh_rest: self.value(Param::RateShRest),
+        }
+    }
+}
+
 impl Clock {
     /// At the start of `recipe`.
     pub fn new(recipe: &Recipe) -> Self {
@@ -167,7 +142,7 @@ impl Clock {
             stage: 0,
             stage_time: 0.0,
             stage_step: 0,
-            carried: Param::ALL.map(Param::default_value),
+            carried: Values::default_values(),
             was_reset: false,
             watch: Watch::default(),
         };
@@ -206,7 +181,7 @@ impl Clock {
     }
 
     /// Enters the stage that `time` is in; true where it is another. `before` are the values that were in force.
-    fn enter_stages(&mut self, recipe: &Recipe, before: [f64; Param::ALL.len()]) -> bool {
+    fn enter_stages(&mut self, recipe: &Recipe, before: Values) -> bool {
         // Half a thousandth of a step forgives the rounding of a sum of fractions.
         let mut ended = false;
         while self.stage < recipe.stage.len()
@@ -231,25 +206,24 @@ impl Clock {
     }
 }
 
-/// The value of every knob, by [`Param::ALL`].
-fn values(recipe: &Recipe, clock: &Clock) -> [f64; Param::ALL.len()] {
+/// The value of every knob.
+fn values(recipe: &Recipe, clock: &Clock) -> Values {
     let Some(stage) = recipe.stage.get(clock.stage) else {
         return clock.carried;
     };
     let total = recipe.total_steps() as f64;
-    std::array::from_fn(|i| {
-        let param = Param::ALL[i];
+    Values::of(|param| {
         if let Some(knob) = stage.params.get(&param) {
             value(
                 knob,
                 clock.time - clock.stage_time,
                 stage.steps as f64,
-                clock.carried[i],
+                clock.carried[param],
             )
         } else if let Some(knob) = recipe.params.get(&param) {
-            value(knob, clock.progress, total, param.default_value())
+            value(knob, clock.progress, total, param.row().default)
         } else {
-            clock.carried[i]
+            clock.carried[param]
         }
     })
 }
@@ -281,62 +255,16 @@ pub fn is_due(clock: &Clock, every: u64) -> bool {
 
 /// What the step that `clock` stands before does. After the recipe's end it is what the last step did, at rest.
 pub fn plan(recipe: &Recipe, clock: &Clock) -> StepPlan {
-    let v = values(recipe, clock);
-    let of = |param: Param| v[param as usize];
+    let values = values(recipe, clock);
     let stage = &recipe.stage[clock.stage.min(recipe.stage.len() - 1)];
     // Counted as people do: after the step that makes it the n-th.
     let in_stage = clock.step + 1 - clock.stage_step;
     let density = stage.density;
     let measured = matches!(stage.exit, Some(Exit::Threshold { .. } | Exit::Relative { .. }));
-    let ssim = of(Param::SsimWeight) * of(Param::PhotoWeight);
     StepPlan {
-        image_scale: of(Param::ImageScale) as f32,
-        sh_degree: of(Param::ShDegree) as u32,
-        losses: Losses {
-            photometric: LossWeights {
-                l1: (of(Param::PhotoWeight) - ssim) as f32,
-                ssim: ssim as f32,
-                mse: of(Param::MseWeight) as f32,
-            },
-            coarse: of(Param::CoarseWeight) as f32,
-            coarse_factor: of(Param::CoarseFactor) as usize,
-            perceptual: of(Param::PerceptualWeight) as f32,
-            alpha: of(Param::AlphaWeight) as f32,
-            depth: of(Param::DepthWeight) as f32,
-            smooth: of(Param::SmoothWeight) as f32,
-        },
-        random_background: of(Param::RandomBackground) >= 0.5,
-        regularizers: Regularizers {
-            opacity: of(Param::OpacityReg) as f32,
-            opacity_square: of(Param::OpacitySquareReg) as f32,
-            scale: of(Param::ScaleReg) as f32,
-            covariance: of(Param::CovarianceReg) as f32,
-        },
-        condition_cap: (of(Param::ConditionCap) > 0.0).then_some(of(Param::ConditionCap) as f32),
-        noise: of(Param::Noise) as f32,
-        trained_share: of(Param::TrainedShare) as f32,
-        rates: Rates {
-            means: of(Param::RateMeans) as f32,
-            quats: of(Param::RateQuats) as f32,
-            log_scales: of(Param::RateScales) as f32,
-            opacities: of(Param::RateOpacities) as f32,
-            sh_dc: of(Param::RateShDc) as f32,
-            sh_rest: of(Param::RateShRest) as f32,
-        },
-        field: FieldPlan {
-            tables: of(Param::RateTables) as f32,
-            nets: of(Param::RateNets) as f32,
-            codes: of(Param::RateCodes) as f32,
-            interlevel: of(Param::InterlevelWeight) as f32,
-            distortion: of(Param::DistortionWeight) as f32,
-            look: is_due(clock, LOOK_EVERY),
-            residual: of(Param::Residual) >= 0.5,
-        },
-        sockets: SocketPlan {
-            exposure_rate: of(Param::RateExposure) as f32,
-            exposure_reg: of(Param::ExposureReg) as f32,
-            pose_rate: of(Param::RatePoses) as f32,
-        },
+        image_scale: values[Param::ImageScale] as f32,
+        sh_degree: values[Param::ShDegree] as u32,
+        values,
         gathers: density.map(|density| density.statistics()),
         densify: density
             .filter(|density| in_stage.is_multiple_of(density.every()))
@@ -347,7 +275,7 @@ pub fn plan(recipe: &Recipe, clock: &Clock) -> StepPlan {
                 Round {
                     density,
                     prune_large: clock.was_reset,
-                    count_share: of(Param::CountShare),
+                    count_share: values[Param::CountShare],
                     share: [share, before],
                 }
             }),
@@ -356,6 +284,7 @@ pub fn plan(recipe: &Recipe, clock: &Clock) -> StepPlan {
             .and_then(|density| density.reset())
             .and_then(|(every, to)| is_due(clock, every).then_some(to)),
         refilter: recipe.render.smoothing_filter && clock.step.is_multiple_of(REFILTER_EVERY),
+        update_occupancy: is_due(clock, OCCUPANCY_EVERY),
         measure: measured && in_stage.is_multiple_of(MEASURE_EVERY),
         evaluate: is_due(clock, recipe.eval_every),
         checkpoint: is_due(clock, recipe.checkpoint_every),
@@ -365,8 +294,8 @@ pub fn plan(recipe: &Recipe, clock: &Clock) -> StepPlan {
 /// Steps between updates of the 3D smoothing filter (Mip-Splatting's code: 100).
 const REFILTER_EVERY: u64 = 100;
 
-/// Steps between two looks at a field's occupancy grid (Instant-NGP).
-const LOOK_EVERY: u64 = 16;
+/// Steps between updates of a field's occupancy grid (Instant-NGP).
+const OCCUPANCY_EVERY: u64 = 16;
 
 /// The stream of the run's seed that orders the views.
 const STREAM_VIEWS: u64 = 3;
@@ -452,21 +381,24 @@ mod tests {
     fn knobs_follow_their_curves_and_go_on_over_stages() {
         let p = plans(&recipe(), 1.0);
         assert_eq!(p.len(), 20);
-        assert!((p[10].rates.means - 0.1).abs() < 1e-6, "half way in the logarithm");
+        assert!(
+            (p[10].value(Param::RateMeans) - 0.1).abs() < 1e-6,
+            "half way in the logarithm"
+        );
         assert_eq!(
             [p[3].sh_degree, p[4].sh_degree, p[11].sh_degree, p[12].sh_degree],
             [0, 1, 1, 3]
         );
-        assert!((p[5].rates.quats - 0.5).abs() < 1e-6);
+        assert!((p[5].value(Param::RateQuats) - 0.5).abs() < 1e-6);
         // The second stage's ramp has no `from`: it goes on from the last value in force, without a jump.
-        assert!((p[10].rates.quats - p[9].rates.quats).abs() < 1e-6);
-        assert!((p[15].rates.quats - 0.5 * p[9].rates.quats).abs() < 1e-6);
+        assert!((p[10].value(Param::RateQuats) - p[9].value(Param::RateQuats)).abs() < 1e-6);
+        assert!((p[15].value(Param::RateQuats) - 0.5 * p[9].value(Param::RateQuats)).abs() < 1e-6);
         assert_eq!(
-            (p[3].losses.photometric.ssim, p[15].losses.photometric.ssim),
+            (p[3].value(Param::SsimWeight), p[15].value(Param::SsimWeight)),
             (0.2, 0.2),
             "a knob that a stage does not name is carried"
         );
-        assert!((p[15].rates.opacities - 1.5).abs() < 1e-6);
+        assert!((p[15].value(Param::RateOpacities) - 1.5).abs() < 1e-6);
     }
 
     #[test]
@@ -494,9 +426,9 @@ mod tests {
         for steps in [7u64, 13, 40] {
             let p = plans(&recipe, 20.0 / steps as f64);
             assert_eq!(p.len() as u64, steps);
-            assert!((p[0].rates.means - 1.0).abs() < 1e-6);
+            assert!((p[0].value(Param::RateMeans) - 1.0).abs() < 1e-6);
             let expected = 0.01f64.powf((steps - 1) as f64 / steps as f64) as f32;
-            assert!((p.last().unwrap().rates.means / expected - 1.0).abs() < 1e-4);
+            assert!((p.last().unwrap().value(Param::RateMeans) / expected - 1.0).abs() < 1e-4);
             assert_eq!(p.last().unwrap().sh_degree, 3);
         }
     }
@@ -606,14 +538,17 @@ mod tests {
         let (at, p) = ends(&recipe, |s| error(if s < 50 { 0.1 } else { 0.01 }));
         assert_eq!(at, [53, 63]);
         // Over the whole run: it goes on from where it was, and what is left of it is run through in what is left.
-        let slope: Vec<f32> = p.windows(2).map(|w| w[1].rates.means / w[0].rates.means).collect();
+        let slope: Vec<f32> = p
+            .windows(2)
+            .map(|w| w[1].value(Param::RateMeans) / w[0].value(Param::RateMeans))
+            .collect();
         assert!(
             (slope[52] / slope[51] - 1.0).abs() < 0.02,
             "the step over the border is one of the old slope"
         );
-        let last = f64::from(p[62].rates.means) * f64::from(slope[61]);
+        let last = f64::from(p[62].value(Param::RateMeans)) * f64::from(slope[61]);
         assert!((last / 0.01 - 1.0).abs() < 0.01, "{last}");
         // Over the stage: the next one's ramp goes on from the value in force.
-        assert!((p[53].rates.quats - p[52].rates.quats).abs() < 1e-6);
+        assert!((p[53].value(Param::RateQuats) - p[52].value(Param::RateQuats)).abs() < 1e-6);
     }
 }

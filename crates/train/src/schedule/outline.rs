@@ -1,7 +1,7 @@
 //! A recipe's whole plan at a glance, to be printed and drawn.
 
 use super::{Clock, values};
-use crate::recipe::{Param, Recipe};
+use crate::recipe::{Param, Recipe, Values};
 
 /// A stretch of what is still to come.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -33,10 +33,10 @@ pub fn ahead(recipe: &Recipe, clock: &Clock, parts: usize) -> Vec<Ahead> {
         let duration = pace.min(clock.stage_time + stage.steps as f64 - clock.time).max(1e-3);
         stretches.push(Ahead {
             stage: clock.stage,
-            image_scale: values[Param::ImageScale as usize],
-            sh_degree: values[Param::ShDegree as usize],
-            perceptual: values[Param::PerceptualWeight as usize] > 0.0,
-            count_share: values[Param::CountShare as usize],
+            image_scale: values[Param::ImageScale],
+            sh_degree: values[Param::ShDegree],
+            perceptual: values[Param::PerceptualWeight] > 0.0,
+            count_share: values[Param::CountShare],
             share: (clock.time + duration - clock.stage_time) / stage.steps as f64,
             duration,
         });
@@ -52,8 +52,8 @@ pub struct Moment {
     pub time: f64,
     /// Index of the stage.
     pub stage: usize,
-    /// By [`Param::ALL`].
-    pub values: [f64; Param::ALL.len()],
+    /// Their values.
+    pub values: Values,
 }
 
 /// `recipe` at `moments` times, evenly over its steps and at both ends of every stage, as if no stage ended early.

@@ -6,7 +6,6 @@
 
 use super::Occupant;
 use super::per_view::PerViewAdam;
-use crate::schedule::SocketPlan;
 use crate::tensor_file::{NamedTensor, TensorSource, to_bytes};
 use irradia_measure::Affine;
 use rayon::prelude::*;
@@ -99,13 +98,13 @@ impl Exposure {
         total.map(|v| v as f32)
     }
 
-    /// [`Self::vjp`] and a step of Adam on `view`, drawn to the identity by the plan's weight on the mean squared difference.
-    pub fn step(&mut self, view: usize, color: &[f32], v: &mut [f32], plan: &SocketPlan) {
+    /// [`Self::vjp`] and a step of Adam on `view` at `rate`, drawn to the identity by `weight` times the mean squared difference.
+    pub fn step(&mut self, view: usize, color: &[f32], v: &mut [f32], rate: f32, weight: f32) {
         let mut gradient = self.vjp(view, color, v);
         for ((g, value), identity) in gradient.iter_mut().zip(self.maps[view]).zip(IDENTITY) {
-            *g += plan.exposure_reg * 2.0 / N as f32 * (value - identity);
+            *g += weight * 2.0 / N as f32 * (value - identity);
         }
-        let change = self.adam.step(view, gradient, [plan.exposure_rate; N]);
+        let change = self.adam.step(view, gradient, [rate; N]);
         for (value, change) in self.maps[view].iter_mut().zip(change) {
             *value += change;
         }
@@ -217,16 +216,12 @@ mod tests {
         let mut rng = Rng::new(4, 4);
         let color: Vec<f32> = (0..3 * PIXELS).map(|_| rng.range(0.0, 0.6)).collect();
         let mut exposure = Exposure::new(2);
-        let plan = SocketPlan {
-            exposure_rate: 0.02,
-            ..SocketPlan::default()
-        };
         for _ in 0..400 {
             for (view, gain) in [(0, 0.7), (1, 1.5)] {
                 let mut y = Vec::new();
                 exposure.develop(view, &color, &mut y);
                 let mut v: Vec<f32> = y.iter().zip(&color).map(|(y, x)| y - gain * x).collect();
-                exposure.step(view, &color, &mut v, &plan);
+                exposure.step(view, &color, &mut v, 0.02, 0.0);
             }
         }
         for (view, gain) in [(0, 0.7), (1, 1.5)] {

@@ -21,8 +21,8 @@ pub use poses::PoseRefinement;
 pub(crate) use poses::{tangent_gradient, turned};
 pub use residual::{Residual, added_colors};
 
-use crate::recipe::Recipe;
-use crate::schedule::{SocketPlan, StepPlan};
+use crate::recipe::{Param, Recipe};
+use crate::schedule::StepPlan;
 use crate::tensor_file::{NamedTensor, TensorSource};
 use crate::trainer::TrainError;
 use irradia_field::Space;
@@ -154,9 +154,10 @@ impl Sockets {
 
     /// One step of what sits after blending: `v_color` is the gradient of [`Self::frame_color`], and becomes that of the
     /// scene's own colours.
-    pub fn step_after_blending(&mut self, engine: &Engine, view: usize, v_color: &mut [f32], plan: &SocketPlan) {
+    pub fn step_after_blending(&mut self, engine: &Engine, view: usize, v_color: &mut [f32], plan: &StepPlan) {
         if let Some(exposure) = &mut self.exposure {
-            exposure.step(view, engine.frame().color, v_color, plan);
+            let (rate, weight) = (plan.value(Param::RateExposure), plan.value(Param::ExposureReg));
+            exposure.step(view, engine.frame().color, v_color, rate, weight);
         }
     }
 
@@ -175,7 +176,7 @@ impl Sockets {
             residual.step(camera.pose.position, &surfaces, &v_colors, plan);
         }
         if let (Some(poses), Some(gradient)) = (&mut self.poses, engine.camera_gradient()) {
-            poses.step(view, camera, &gradient, extent, &plan.sockets);
+            poses.step(view, camera, &gradient, plan.value(Param::RatePoses), extent);
         }
     }
 }

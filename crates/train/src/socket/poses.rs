@@ -6,7 +6,6 @@
 
 use super::Occupant;
 use super::per_view::PerViewAdam;
-use crate::schedule::SocketPlan;
 use crate::tensor_file::{NamedTensor, TensorSource, to_bytes};
 use glam::{Quat, Vec3};
 use irradia_scene::{Camera, Pose};
@@ -40,13 +39,12 @@ impl PoseRefinement {
         moved(camera, rotation, translation)
     }
 
-    /// One step of Adam on `view`. `camera` is the refined camera that was rendered, `gradient` its gradient; the plan's rate is
-    /// in radians, and in units of `extent` for the translation.
-    pub fn step(&mut self, view: usize, camera: &Camera, gradient: &CameraGradient, extent: f32, plan: &SocketPlan) {
+    /// One step of Adam on `view`. `camera` is the refined camera that was rendered, `gradient` its gradient; `rate` is in
+    /// radians, and in units of `extent` for the translation.
+    pub fn step(&mut self, view: usize, camera: &Camera, gradient: &CameraGradient, rate: f32, extent: f32) {
         let v = tangent_gradient(camera, gradient);
-        let turn = plan.pose_rate;
-        let shift = plan.pose_rate * extent;
-        let step = self.adam.step(view, v, [turn, turn, turn, shift, shift, shift]);
+        let shift = rate * extent;
+        let step = self.adam.step(view, v, [rate, rate, rate, shift, shift, shift]);
         let (rotation, translation) = parts(&self.corrections[view]);
         let turned = exp([step[0], step[1], step[2]]);
         let q = (turned * rotation).normalize();

@@ -2,7 +2,7 @@
 
 use super::Occupant;
 use crate::field_file;
-use crate::recipe::ResidualKnobs;
+use crate::recipe::{Param, ResidualKnobs};
 use crate::schedule::StepPlan;
 use crate::tensor_file::{NamedTensor, TensorSource};
 use crate::trainer::TrainError;
@@ -59,7 +59,7 @@ impl Residual {
 
     /// Whether it adds to what `plan` renders. Once it has begun it stays.
     pub fn acts(&self, plan: &StepPlan) -> bool {
-        plan.field.residual || self.state.step > 0
+        plan.is_on(Param::Residual) || self.state.step > 0
     }
 
     /// The field, once it has learnt something.
@@ -75,8 +75,8 @@ impl Residual {
     /// The vector-Jacobian product of [`Self::colors`] and a step of Adam, for the gradients of the colours.
     pub fn step(&mut self, center: Vec3, surfaces: &[Surface], v_colors: &[[f32; 3]], plan: &StepPlan) {
         let options = StepOptions {
-            table_rate: plan.field.tables,
-            net_rate: plan.field.nets,
+            table_rate: plan.value(Param::RateTables),
+            net_rate: plan.value(Param::RateNets),
             beta2: self.beta2,
             ..StepOptions::default()
         };

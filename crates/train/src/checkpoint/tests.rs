@@ -1,0 +1,176 @@
+use super::*;
+use crate::recipe::{Param, Values};
+use glam::Vec3;
+use irradia_scene::{Camera, Intrinsics, Photo, PointCloud, Pose, View};
+
+/// Two grey photographs and a few points.
+fn dataset() -> Arc<Dataset> {
+    let positions: Vec<Vec3> = (0..12)
+        .map(|i| Vec3::new(i as f32 * 0.1, (i % 3) as f32 * 0.1, 2.0))
+        .collect();
+    let views = [0.0, 1.0].map(|x| View {
+        name: format!("view {x}"),
+        camera: Camera::new(
+            Pose::look_at(Vec3::X * x, 2.0 * Vec3::Z, Vec3::NEG_Y),
+            Intrinsics::from_fov_x(8, 8, 1.0),
+        ),
+        photo: Arc::new(Photo {
+            width: 8,
+            height: 8,
+            channels: 3,
+            data: vec![128; 3 * 8 * 8],
+            mask: None,
+        }),
+        depth_bounds: None,
+        time: None,
+        points_seen: Vec::new(),
+    });
+    Arc::new(Dataset {
+        views: views.into(),
+        train: vec![0, 1],
+        points: Some(PointCloud {
+            colors: vec![[128; 3]; positions.len()],
+            positions,
+        }),
+        ..Dataset::default()
+    })
+}
+
+/// A trainer whose clock carries another value of each parameter, all within their bounds.
+fn trainer() -> Trainer {
+    let recipe = Recipe::parse("classic", Recipe::built_in("classic").unwrap(), &[]).unwrap();
+    let mut trainer = Trainer::new(dataset(), recipe, TrainOptions::default()).unwrap();
+    trainer.clock.carried = Values::of(|param| param.row().default + 0.001 * (1.0 + param as usize as f64));
+    trainer.clock.step = 7;
+    trainer
+}
+
+type Tensors = Vec<(String, Dtype, Vec<usize>, Vec<u8>)>;
+
+/// `bytes` with format `format` and what `change` makes of the tensors.
+fn rewritten(bytes: &[u8], format: &str, change: impl Fn(&mut Tensors)) -> Vec<u8> {
+    let file = SafeTensors::deserialize(bytes).unwrap();
+    let (_, header) = SafeTensors::read_metadata(bytes).unwrap();
+    let mut metadata = header.metadata().clone().unwrap();
+    metadata.insert("format".into(), format.into());
+    let tensors = file.iter();
+    let mut tensors: Tensors = tensors
+        .map(|(name, view)| {
+            (
+                name.to_owned(),
+                view.dtype(),
+                view.shape().to_vec(),
+                view.data().to_vec(),
+            )
+        })
+        .collect();
+    change(&mut tensors);
+    let views = tensors
+        .iter()
+        .map(|(name, dtype, shape, bytes)| (name, TensorView::new(*dtype, shape.clone(), bytes).unwrap()));
+    safetensors::serialize(views, Some(metadata)).unwrap()
+}
+
+fn read(bytes: &[u8]) -> Result<Trainer, String> {
+    from_bytes(bytes, dataset(), TrainOptions::default()).map_err(|error| error.to_string())
+}
+
+/// Leaves out the values by name and appends `count` of `values` to the clock's numbers, as format 4 has them.
+fn unname(tensors: &mut Tensors, values: &Values, count: usize) {
+    tensors.retain(|(name, ..)| !name.starts_with("carried."));
+    let (.., shape, bytes) = tensors.iter_mut().find(|(name, ..)| name == "clock.real").unwrap();
+    let in_order = Param::ALL.iter().take(count);
+    bytes.extend(in_order.flat_map(|param| values[*param].to_le_bytes()));
+    shape[0] += count;
+}
+
+#[test]
+fn a_checkpoint_reads_back_as_what_was_written() {
+    let trainer = trainer();
+    let again = read(&to_bytes(&trainer)).unwrap();
+    assert_eq!(again.clock, trainer.clock);
+    assert_eq!(again.engine.state().splats, trainer.engine.state().splats);
+}
+
+#[test]
+fn what_sits_in_the_sockets_goes_on_as_if_nothing_had_happened() {
+    let overrides = ["exposure=true", "refine_poses=true", "params.rate_poses=0.001"].map(str::to_owned);
+    let recipe = Recipe::parse("shiny", Recipe::built_in("shiny").unwrap(), &overrides).unwrap();
+    let mut trainer = Trainer::new(dataset(), recipe, TrainOptions::default()).unwrap();
+    for _ in 0..3 {
+        trainer.step(&mut Vec::new()).unwrap();
+    }
+    let bytes = to_bytes(&trainer);
+    let mut again = read(&bytes).unwrap();
+    let names: Vec<&str> = again.sockets.occupants().iter().map(|o| o.name()).collect();
+    assert_eq!(names, ["poses", "residual", "exposure"]);
+    for trainer in [&mut trainer, &mut again] {
+        trainer.step(&mut Vec::new()).unwrap();
+        // Clocks of the wall and of the processor differ.
+        (trainer.seconds, trainer.cpu_seconds) = (0.0, 0.0);
+    }
+    assert!(trainer.camera(0) != trainer.dataset.views[0].camera, "poses have moved");
+    assert_eq!(to_bytes(&trainer), to_bytes(&again));
+    let without = rewritten(&bytes, FORMAT, |tensors| {
+        tensors.retain(|(name, ..)| name != "exposure.maps");
+    });
+    let error = read(&without).err().expect("a tensor is missing");
+    assert!(error.contains("exposure.maps is missing"), "{error}");
+}
+
+#[test]
+fn format_4_is_read_as_format_5() {
+    let trainer = trainer();
+    let bytes = to_bytes(&trainer);
+    let old = rewritten(&bytes, "irradia-checkpoint-4", |tensors| {
+        unname(tensors, &trainer.clock.carried, 32);
+    });
+    let again = read(&old).unwrap();
+    // What came after format 4 has its default.
+    let mut clock = trainer.clock.clone();
+    for param in Param::ALL.into_iter().skip(32) {
+        clock.carried[param] = param.row().default;
+    }
+    assert_eq!(again.clock, clock);
+    assert_eq!(again.engine.state().splats, trainer.engine.state().splats);
+    let short = rewritten(&bytes, "irradia-checkpoint-4", |tensors| {
+        unname(tensors, &trainer.clock.carried, 31);
+    });
+    assert!(read(&short).err().is_some_and(|error| error.contains("wrong length")));
+}
+
+#[test]
+fn a_parameter_newer_than_the_checkpoint_has_its_default() {
+    let trainer = trainer();
+    let old = rewritten(&to_bytes(&trainer), FORMAT, |tensors| {
+        tensors.retain(|(name, ..)| name != "carried.coarse_factor");
+    });
+    let clock = read(&old).unwrap().clock;
+    assert_eq!(clock.carried[Param::CoarseFactor], 4.0);
+    assert_eq!(
+        clock.carried[Param::SsimWeight],
+        trainer.clock.carried[Param::SsimWeight]
+    );
+}
+
+#[test]
+fn a_parameter_that_is_not_known_is_refused_by_name() {
+    let bytes = to_bytes(&trainer());
+    let number = |name: &str, values: &[f64]| {
+        let bytes = values.iter().flat_map(|v| v.to_le_bytes()).collect();
+        (name.to_owned(), Dtype::F64, vec![values.len()], bytes)
+    };
+    for (name, values, part) in [
+        ("carried.bilateral_weight", &[0.5][..], "`bilateral_weight`"),
+        ("carried.ssim_weight", &[0.5, 0.5], "carried.ssim_weight"),
+    ] {
+        let newer = rewritten(&bytes, FORMAT, |tensors| {
+            tensors.retain(|(other, ..)| other != name);
+            tensors.push(number(name, values));
+        });
+        let error = read(&newer).err().unwrap();
+        assert!(error.contains(part) && !error.contains('\n'), "{error}");
+    }
+    let other = rewritten(&bytes, "irradia-checkpoint-3", |_| ());
+    assert!(read(&other).err().is_some_and(|error| error.contains(FORMAT)));
+}

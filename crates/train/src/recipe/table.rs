@@ -1,0 +1,500 @@
+//! The table of parameters: everything that a recipe can change over time, a row each.
+//!
+//! A row is all that is said about a parameter. The names that recipes use, bounds and their errors, `irradia recipe keys`,
+//! `docs/recipe-keys.md`, the losses that `ingredients` and `recipe show` list, the curves of a report and what a checkpoint
+//! carries are made from it. Recipes are written in the order of the rows.
+
+use std::ops::RangeInclusive;
+
+/// What a parameter is for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Group {
+    /// How much of the data and how many splats are in use: what `ingredients.data_schedule` holds.
+    Data,
+    /// What splats may be.
+    Splats,
+    /// Weight of a loss.
+    Loss,
+    /// Says more about the loss with the weight named.
+    PartOf(Param),
+    /// Weight of a loss on the splats themselves.
+    Regularizer,
+    /// Learning rate of splats.
+    Rate,
+    /// Rates and weights of a radiance field.
+    Field,
+    /// Rates and weights of what sits in a step's sockets beside the splats.
+    Socket,
+    /// On from 0.5, off below.
+    Switch,
+}
+
+/// One parameter.
+#[derive(Debug)]
+pub struct Row {
+    /// As recipes write it.
+    pub name: &'static str,
+    /// Of its value; empty where it has none.
+    pub unit: &'static str,
+    /// Where no recipe says anything.
+    pub default: f64,
+    /// What it may be.
+    pub bounds: RangeInclusive<f64>,
+    /// What it is for.
+    pub group: Group,
+    /// Its curve in a report, `chart.label`; none for switches, and for parts of a loss that are no weight.
+    pub curve: Option<&'static str>,
+    /// Where it comes from: paper or code.
+    pub source: &'static str,
+    /// What it is; lines of a doc comment, each with a space before it.
+    pub doc: &'static str,
+}
+
+/// 0 and up.
+const NOT_NEGATIVE: RangeInclusive<f64> = 0.0..=f64::MAX;
+
+macro_rules! table {
+    ($($(#[doc = $doc:literal])+ $param:ident { $($row:tt)+ })+) => {
+        /// What can change over time; the rows of the table.
+        #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+        pub enum Param {
+            $($(#[doc = $doc])+ $param,)+
+        }
+
+        impl Param {
+            /// All of them, in the order of the rows.
+            pub const ALL: [Param; [$(Param::$param),+].len()] = [$(Param::$param),+];
+        }
+
+        /// By [`Param::ALL`].
+        pub(super) static ROWS: [Row; Param::ALL.len()] = [
+            $(Row { doc: concat!($($doc),+), $($row)+ },)+
+        ];
+    };
+}
+
+table! {
+    /// Size of the training images relative to the data's.
+    ImageScale {
+        name: "image_scale",
+        unit: "",
+        default: 1.0,
+        bounds: 0.01..=1.0,
+        group: Group::Data,
+        curve: Some("scale.image"),
+        source: "Irradia; CurriculumGS shrinks images for the loss instead (`coarse_weight`)",
+    }
+    /// SH bands in use.
+    ShDegree {
+        name: "sh_degree",
+        unit: "degree",
+        default: 0.0,
+        bounds: 0.0..=3.0,
+        group: Group::Splats,
+        curve: Some("degree.SH"),
+        source: "3DGS (Kerbl et al. 2023), section 5.1: one band more every 1000 steps",
+    }
+    /// How many splats there may be, as a fraction of the recipe's cap.
+    CountShare {
+        name: "count_share",
+        unit: "fraction",
+        default: 1.0,
+        bounds: 0.001..=1.0,
+        group: Group::Data,
+        curve: Some("count.allowed"),
+        source: "Irradia",
+    }
+    /// Fraction of the visible splats whose place and shape are trained, the largest first; of the others opacity and colour are.
+    TrainedShare {
+        name: "trained_share",
+        unit: "fraction",
+        default: 1.0,
+        bounds: 0.001..=1.0,
+        group: Group::Splats,
+        curve: Some("count.trained"),
+        source: "CurriculumGS: groups of parameters",
+    }
+    /// Weight of the photometric loss, (1 - w) L1 + w (1 - SSIM), where w is `ssim_weight`.
+    PhotoWeight {
+        name: "photo_weight",
+        unit: "",
+        default: 1.0,
+        bounds: NOT_NEGATIVE,
+        group: Group::Loss,
+        curve: Some("loss.L1"),
+        source: "3DGS (Kerbl et al. 2023), eq. 7",
+    }
+    /// w in the photometric loss: the part that 1 - SSIM has in it.
+    SsimWeight {
+        name: "ssim_weight",
+        unit: "fraction",
+        default: 0.0,
+        bounds: 0.0..=1.0,
+        group: Group::PartOf(Param::PhotoWeight),
+        curve: Some("loss.SSIM"),
+        source: "3DGS (Kerbl et al. 2023), eq. 7: lambda, 0.2",
+    }
+    /// Weight of the mean squared error.
+    MseWeight {
+        name: "mse_weight",
+        unit: "",
+        default: 0.0,
+        bounds: NOT_NEGATIVE,
+        group: Group::Loss,
+        curve: Some("loss.squared"),
+        source: "Irradia",
+    }
+    /// Weight of the mean squared error of images shrunk by `coarse_factor`.
+    CoarseWeight {
+        name: "coarse_weight",
+        unit: "",
+        default: 0.0,
+        bounds: NOT_NEGATIVE,
+        group: Group::Loss,
+        curve: Some("loss.coarse"),
+        source: "CurriculumGS",
+    }
+    /// By how much the coarse loss shrinks images, pixels to one.
+    CoarseFactor {
+        name: "coarse_factor",
+        unit: "pixels",
+        default: 4.0,
+        bounds: 1.0..=64.0,
+        group: Group::PartOf(Param::CoarseWeight),
+        curve: None,
+        source: "CurriculumGS",
+    }
+    /// Weight of LPIPS, on a patch of the image; left out where its weights are absent.
+    PerceptualWeight {
+        name: "perceptual_weight",
+        unit: "",
+        default: 0.0,
+        bounds: NOT_NEGATIVE,
+        group: Group::Loss,
+        curve: Some("loss.perceptual"),
+        source: "LPIPS (Zhang et al. 2018); as a training loss CurriculumGS",
+    }
+    /// Weight of the mean |alpha - alpha of the photograph|, where it has one.
+    AlphaWeight {
+        name: "alpha_weight",
+        unit: "",
+        default: 0.0,
+        bounds: NOT_NEGATIVE,
+        group: Group::Loss,
+        curve: Some("loss.alpha"),
+        source: "Irradia",
+    }
+    /// Weight of the mean |depth - depth of the points that the view sees|, relative to that depth; for a field of the mean
+    /// squared difference of distance, in the units in which its samples are spread, at pixels where such points lie.
+    DepthWeight {
+        name: "depth_weight",
+        unit: "",
+        default: 0.0,
+        bounds: NOT_NEGATIVE,
+        group: Group::Loss,
+        curve: Some("loss.depth"),
+        source: "CurriculumGS; for fields DS-NeRF (Deng et al. 2022)",
+    }
+    /// Weight of the edge-aware smoothness of disparity.
+    SmoothWeight {
+        name: "smooth_weight",
+        unit: "",
+        default: 0.0,
+        bounds: NOT_NEGATIVE,
+        group: Group::Loss,
+        curve: Some("loss.smooth"),
+        source: "Godard et al. 2017; CurriculumGS",
+    }
+    /// Photographs with alpha are laid over a new random colour in each step, and so is the scene.
+    RandomBackground {
+        name: "random_background",
+        unit: "",
+        default: 0.0,
+        bounds: 0.0..=1.0,
+        group: Group::Switch,
+        curve: None,
+        source: "Instant-NGP and 3DGS, the authors' code: `random_background`",
+    }
+    /// Weight of the mean opacity.
+    OpacityReg {
+        name: "opacity_reg",
+        unit: "",
+        default: 0.0,
+        bounds: NOT_NEGATIVE,
+        group: Group::Regularizer,
+        curve: Some("loss.opacity"),
+        source: "3DGS-MCMC (Kheradmand et al. 2024), eq. 10",
+    }
+    /// Weight of the mean squared opacity.
+    OpacitySquareReg {
+        name: "opacity_square_reg",
+        unit: "",
+        default: 0.0,
+        bounds: NOT_NEGATIVE,
+        group: Group::Regularizer,
+        curve: Some("loss.opacity squared"),
+        source: "CurriculumGS",
+    }
+    /// Weight of the mean standard deviation, in units of the scene's extent.
+    ScaleReg {
+        name: "scale_reg",
+        unit: "",
+        default: 0.0,
+        bounds: NOT_NEGATIVE,
+        group: Group::Regularizer,
+        curve: Some("loss.size"),
+        source: "3DGS-MCMC (Kheradmand et al. 2024), eq. 10",
+    }
+    /// Weight of the mean squared Frobenius norm of the covariance, in units of the scene's extent to the fourth.
+    CovarianceReg {
+        name: "covariance_reg",
+        unit: "",
+        default: 0.0,
+        bounds: NOT_NEGATIVE,
+        group: Group::Regularizer,
+        curve: Some("loss.covariance"),
+        source: "CurriculumGS",
+    }
+    /// Largest condition number of a covariance; 0 for none.
+    ConditionCap {
+        name: "condition_cap",
+        unit: "",
+        default: 0.0,
+        bounds: NOT_NEGATIVE,
+        group: Group::Splats,
+        curve: Some("cap.condition number"),
+        source: "CurriculumGS",
+    }
+    /// Noise on the means of faint splats, as a factor on the means' rate.
+    Noise {
+        name: "noise",
+        unit: "",
+        default: 0.0,
+        bounds: NOT_NEGATIVE,
+        group: Group::Splats,
+        curve: Some("noise.means"),
+        source: "3DGS-MCMC (Kheradmand et al. 2024), eq. 8; `noise_lr` in the authors' code",
+    }
+    /// Learning rate of the means.
+    RateMeans {
+        name: "rate_means",
+        unit: "extent / step",
+        default: 0.0,
+        bounds: NOT_NEGATIVE,
+        group: Group::Rate,
+        curve: Some("rate.means"),
+        source: "3DGS, the authors' code: `position_lr_init` to `position_lr_final`",
+    }
+    /// Learning rate of the quaternions.
+    RateQuats {
+        name: "rate_quats",
+        unit: "1 / step",
+        default: 0.0,
+        bounds: NOT_NEGATIVE,
+        group: Group::Rate,
+        curve: Some("rate.quaternions"),
+        source: "3DGS, the authors' code: `rotation_lr`",
+    }
+    /// Learning rate of the ln scales.
+    RateScales {
+        name: "rate_scales",
+        unit: "1 / step",
+        default: 0.0,
+        bounds: NOT_NEGATIVE,
+        group: Group::Rate,
+        curve: Some("rate.scales"),
+        source: "3DGS, the authors' code: `scaling_lr`",
+    }
+    /// Learning rate of the opacity logits.
+    RateOpacities {
+        name: "rate_opacities",
+        unit: "1 / step",
+        default: 0.0,
+        bounds: NOT_NEGATIVE,
+        group: Group::Rate,
+        curve: Some("rate.opacities"),
+        source: "3DGS, the authors' code: `opacity_lr`",
+    }
+    /// Learning rate of the SH's DC coefficients.
+    RateShDc {
+        name: "rate_sh_dc",
+        unit: "1 / step",
+        default: 0.0,
+        bounds: NOT_NEGATIVE,
+        group: Group::Rate,
+        curve: Some("rate.SH, base"),
+        source: "3DGS, the authors' code: `feature_lr`",
+    }
+    /// Learning rate of the other SH coefficients.
+    RateShRest {
+        name: "rate_sh_rest",
+        unit: "1 / step",
+        default: 0.0,
+        bounds: NOT_NEGATIVE,
+        group: Group::Rate,
+        curve: Some("rate.SH, rest"),
+        source: "3DGS, the authors' code: `feature_lr` / 20",
+    }
+    /// Learning rate of a field's tables.
+    RateTables {
+        name: "rate_tables",
+        unit: "1 / step",
+        default: 0.0,
+        bounds: NOT_NEGATIVE,
+        group: Group::Field,
+        curve: Some("rate.tables"),
+        source: "Instant-NGP (Mueller et al. 2022), section 4",
+    }
+    /// Learning rate of a field's networks.
+    RateNets {
+        name: "rate_nets",
+        unit: "1 / step",
+        default: 0.0,
+        bounds: NOT_NEGATIVE,
+        group: Group::Field,
+        curve: Some("rate.networks"),
+        source: "NeRF (Mildenhall et al. 2020), section 5.3; Instant-NGP, section 4",
+    }
+    /// Learning rate of a field's appearance codes.
+    RateCodes {
+        name: "rate_codes",
+        unit: "1 / step",
+        default: 0.0,
+        bounds: NOT_NEGATIVE,
+        group: Group::Field,
+        curve: Some("rate.appearance codes"),
+        source: "NeRF-W (Martin-Brualla et al. 2021)",
+    }
+    /// Weight of the interlevel loss, where a field's samples are proposed.
+    InterlevelWeight {
+        name: "interlevel_weight",
+        unit: "",
+        default: 0.0,
+        bounds: NOT_NEGATIVE,
+        group: Group::Field,
+        curve: Some("loss.interlevel"),
+        source: "mip-NeRF 360 (Barron et al. 2022), eq. 13",
+    }
+    /// Weight of the distortion loss of a field.
+    DistortionWeight {
+        name: "distortion_weight",
+        unit: "",
+        default: 0.0,
+        bounds: NOT_NEGATIVE,
+        group: Group::Field,
+        curve: Some("loss.distortion"),
+        source: "mip-NeRF 360 (Barron et al. 2022), eq. 15",
+    }
+    /// The residual field of a recipe that has one adds to the splats' colours, from then on for the rest of the run.
+    Residual {
+        name: "residual",
+        unit: "",
+        default: 1.0,
+        bounds: 0.0..=1.0,
+        group: Group::Switch,
+        curve: None,
+        source: "Irradia",
+    }
+    /// Learning rate of the photographs' exposures, where the recipe has `exposure`.
+    RateExposure {
+        name: "rate_exposure",
+        unit: "",
+        default: 0.0,
+        bounds: NOT_NEGATIVE,
+        group: Group::Socket,
+        curve: Some("rate.exposure"),
+        source: "Irradia: 0.03 falling to 0.001 where a recipe with `exposure` says nothing; Hierarchical 3DGS (Kerbl et al. 2024) has 0.01 to 0.001 over 30,000 steps",
+    }
+    /// Weight of the mean squared difference of a photograph's exposure from the identity.
+    ExposureReg {
+        name: "exposure_reg",
+        unit: "",
+        default: 0.0,
+        bounds: NOT_NEGATIVE,
+        group: Group::Socket,
+        curve: Some("loss.exposure"),
+        source: "Irradia: 0.01 falling to 0.001 where a recipe with `exposure` says nothing",
+    }
+    /// Learning rate of the poses, in radians and in extents of the scene, where the recipe has `refine_poses`.
+    RatePoses {
+        name: "rate_poses",
+        unit: "radians, extents of the scene",
+        default: 0.0,
+        bounds: NOT_NEGATIVE,
+        group: Group::Socket,
+        curve: Some("rate.poses"),
+        source: "Irradia: 1e-3 falling to 1e-5 where a recipe with `refine_poses` says nothing; BARF (Lin et al. 2021) has 1e-3 to 1e-5",
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::recipe::{Knob, Recipe, keys::keys};
+    use crate::schedule::{Clock, plan};
+
+    fn classic(overrides: &[String]) -> Recipe {
+        Recipe::parse("classic", Recipe::built_in("classic").unwrap(), overrides).unwrap()
+    }
+
+    #[test]
+    fn every_parameter_has_one_row_that_says_all() {
+        for param in Param::ALL {
+            let row = param.row();
+            let same = |text: fn(&Row) -> Option<&str>| ROWS.iter().filter(|other| text(other) == text(row)).count();
+            assert_eq!(same(|row| Some(row.name)), 1, "{}", row.name);
+            assert!(
+                row.curve.is_none() || same(|row| row.curve) == 1,
+                "{}: two curves of one name",
+                row.name
+            );
+            assert!(row.bounds.contains(&row.default), "{}", row.name);
+            assert!(row.doc.trim().ends_with('.') && !row.source.is_empty(), "{}", row.name);
+            let plain = |c: char| c.is_ascii_lowercase() || c == '_';
+            assert!(row.name.chars().all(plain), "{}", row.name);
+            if let Group::PartOf(loss) = row.group {
+                assert_eq!(loss.row().group, Group::Loss, "{}", row.name);
+            }
+        }
+    }
+
+    #[test]
+    fn every_parameter_can_be_set_within_its_bounds_and_reaches_a_step() {
+        for param in Param::ALL {
+            let (name, bounds) = (param.name(), &param.row().bounds);
+            let value = bounds.end().min(3.0);
+            let recipe = classic(&[format!("params.{name}={value}")]);
+            assert_eq!(recipe.params[&param], Knob::Const(value), "{name}");
+            assert_eq!(plan(&recipe, &Clock::new(&recipe)).values[param], value, "{name}");
+            for outside in [bounds.start() - 1.0, f64::NAN] {
+                let overrides = [format!("params.{name}={outside:?}").replace("NaN", "nan")];
+                let text = Recipe::built_in("classic").unwrap();
+                let message = Recipe::parse("classic", text, &overrides).unwrap_err().to_string();
+                assert!(message.contains(&format!("params.{name}: ")), "{message}");
+            }
+        }
+    }
+
+    #[test]
+    fn every_parameter_is_listed_and_drawn() {
+        let keys = keys();
+        let page = include_str!("../report/page.js");
+        for param in Param::ALL {
+            let (row, path) = (param.row(), format!("params.{}", param.name()));
+            assert_eq!(keys.iter().filter(|key| key.path == path).count(), 1, "{path}");
+            match row.curve {
+                Some(curve) => {
+                    let (chart, label) = curve.split_once('.').expect("chart.label");
+                    assert!(
+                        page.contains(&format!("[\"{chart}\", ")) && !label.is_empty(),
+                        "{curve} has no chart in page.js"
+                    );
+                }
+                None => assert!(
+                    matches!(row.group, Group::Switch | Group::PartOf(_)),
+                    "{path} has no curve"
+                ),
+            }
+        }
+    }
+}

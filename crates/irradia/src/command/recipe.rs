@@ -1,8 +1,8 @@
 //! `irradia recipe`
 
-use super::train::read_recipe;
 use crate::terminal::say;
 use anyhow::Result;
+use irradia_runs::read_recipe;
 use irradia_train::Recipe;
 use irradia_train::recipe::{BUILT_IN, Density, Exit, Param, Represents, Stage};
 use irradia_train::report::columns;

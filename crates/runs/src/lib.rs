@@ -1,7 +1,6 @@
 //! Irradia as a library: photographs in, a scene that can be rendered out. **Begin here**; one import does it:
 //!
 //! ```
-//! # fn main() -> Result<(), RunError> {
 //! # let folder = tempfile::tempdir().unwrap();
 //! # let here = |name: &str| folder.path().join(name);
 //! use irradia_runs::prelude::*;
@@ -17,8 +16,7 @@
 //! // .. and render, this run or any splat PLY.
 //! let scene = Scene::read(&here("run"))?;
 //! write_image(&here("frame.png"), &scene.render(&scene.orbit(60, None)[0]).color)?;
-//! # Ok(())
-//! # }
+//! # Ok::<(), RunError>(())
 //! ```
 //!
 //! | to | begin with |

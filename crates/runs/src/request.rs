@@ -83,7 +83,7 @@ impl Reading {
 /// use irradia_runs::TrainInput;
 ///
 /// let input = TrainInput { steps: Some(2000), ..TrainInput::new("photos", "run") };
-/// assert_eq!(input.check()?.recipe().name, "fast");
+/// assert_eq!(input.clone().check()?.recipe().name, "fast");
 ///
 /// let nonsense = TrainInput { steps: Some(0), ..input };
 /// assert_eq!(nonsense.check().unwrap_err().to_string(), "steps 0: give 1 or more");

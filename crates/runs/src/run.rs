@@ -16,7 +16,7 @@ use std::sync::Arc;
 /// A training with its folder. [`Run::train`] makes the steps, [`Run::finish`] writes the scene and the report.
 ///
 /// ```
-/// # let folder = tempfile::tempdir()?;
+/// # let folder = tempfile::tempdir().unwrap();
 /// # let (photos, run) = (folder.path().join("photos"), folder.path().join("run"));
 /// # let options = SynthOptions { views: 4, width: 24, height: 16, seed: 0 };
 /// # write_synth_dataset(&photos, &options)?;

@@ -18,12 +18,12 @@ use std::sync::Arc;
 /// Splats, with or without a residual field, or a radiance field; how it is rendered, and from where it was seen.
 ///
 /// ```
-/// # use irradia_runs::scene::{GaussianCloud, sh};
+/// # use irradia_runs::scene::GaussianCloud;
 /// # let folder = tempfile::tempdir()?;
 /// # let ply = folder.path().join("scene.ply");
 /// # let cloud = GaussianCloud {
-/// #     means: vec![[0.0; 3]], quats: vec![[1.0, 0.0, 0.0, 0.0]], log_scales: vec![[-1.0; 3]],
-/// #     opacity_logits: vec![4.0], sh: vec![1.0; 3], sh_degree: 0, antialiased: false,
+/// #     means: vec![[-1.0, 0.0, 0.0], [0.0; 3], [1.0, 0.0, 0.0]], quats: vec![[1.0, 0.0, 0.0, 0.0]; 3],
+/// #     log_scales: vec![[-1.0; 3]; 3], opacity_logits: vec![4.0; 3], sh: vec![1.0; 9], sh_degree: 0, antialiased: false,
 /// # };
 /// # irradia_runs::formats::write_splats(&ply, &cloud)?;
 /// use irradia_runs::prelude::*;

@@ -12,8 +12,8 @@ use std::path::Path;
 ///
 /// # Errors
 /// When it does not exist, cannot be read, or is none of these.
-pub fn describe(path: &Path) -> Result<Description, RunError> {
-    let scene = scene_of(path);
+pub fn describe(path: impl AsRef<Path>) -> Result<Description, RunError> {
+    let scene = scene_of(path.as_ref());
     if is_field(&scene) {
         let bytes = std::fs::metadata(&scene).map_or(0, |file| file.len());
         return Ok(describe_field(&read_field(&scene)?, bytes));

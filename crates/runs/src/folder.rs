@@ -130,7 +130,7 @@ impl RunFolder {
     /// Removes the temporary files that a killed process could not remove.
     fn remove_leftovers(&self) -> Result<(), RunError> {
         for folder in FOLDERS.map(|folder| self.file(folder)).iter().chain([&self.0]) {
-            let entries = fs::read_dir(folder).map_err(RunError::io("read", &folder))?;
+            let entries = fs::read_dir(folder).map_err(RunError::io("read", folder))?;
             for path in entries.filter_map(|entry| Some(entry.ok()?.path())) {
                 let name = path.file_name().unwrap_or_default().to_string_lossy();
                 if name.starts_with('.') && name.ends_with(".tmp") {

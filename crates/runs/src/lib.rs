@@ -6,7 +6,7 @@
 //! use irradia_runs::prelude::*;
 //!
 //! // A small dataset to try it on; any folder of posed photographs does.
-//! write_synth_dataset(&here("photos"), &SynthOptions { views: 4, width: 24, height: 16, seed: 0 })?;
+//! write_synth_dataset(here("photos"), &SynthOptions { views: 4, width: 24, height: 16, seed: 0 })?;
 //!
 //! // Train ..
 //! let mut run = Run::begin(TrainInput { steps: Some(5), ..TrainInput::new(here("photos"), here("run")) }.check()?)?;
@@ -14,8 +14,8 @@
 //! println!("held-out PSNR {:.2} dB", run.finish()?.report.psnr);
 //!
 //! // .. and render, this run or any splat PLY.
-//! let scene = Scene::read(&here("run"))?;
-//! write_image(&here("frame.png"), &scene.render(&scene.orbit(60, None)[0]).color)?;
+//! let scene = Scene::read(here("run"))?;
+//! write_image(here("frame.png"), &scene.render(&scene.orbit(60, None)[0]).color)?;
 //! # Ok::<(), RunError>(())
 //! ```
 //!

@@ -152,7 +152,8 @@ impl TrainInput {
     ///
     /// # Errors
     /// When the folder holds no run, or its `run.json` is damaged.
-    pub fn of_run(out: &Path) -> Result<Self, RunError> {
+    pub fn of_run(out: impl AsRef<Path>) -> Result<Self, RunError> {
+        let out = out.as_ref();
         let (folder, record) = RunFolder::open(out)?;
         let mut input = record.input;
         input.out = out.to_owned();

@@ -92,7 +92,8 @@ impl Run {
 ///
 /// # Errors
 /// When the file cannot be written.
-pub fn write_image(path: &Path, image: &Image) -> Result<(), RunError> {
+pub fn write_image(path: impl AsRef<Path>, image: &Image) -> Result<(), RunError> {
+    let path = path.as_ref();
     Ok(write_png(
         path,
         image.width,
@@ -107,7 +108,7 @@ fn write_view(folder: &RunFolder, view: &EvaluatedView) -> Result<ViewReport, Ru
     let stem = file_stem(&view.name);
     let path = |what: &str| format!("eval/{stem}.{what}.png");
     let write = |what: &str, image: &Image| -> Result<String, RunError> {
-        write_image(&folder.file(&path(what)), image)?;
+        write_image(folder.file(&path(what)), image)?;
         Ok(path(what))
     };
     Ok(ViewReport {

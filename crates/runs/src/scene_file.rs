@@ -31,7 +31,7 @@ use std::sync::Arc;
 /// let scene = Scene::read(&ply)?;
 /// let camera = scene.orbit(8, Some((64, 48)))[0];
 /// let frame = scene.render(&camera);
-/// write_image(&folder.path().join("frame.png"), &frame.color)?;
+/// write_image(folder.path().join("frame.png"), &frame.color)?;
 /// # assert!(frame.alpha.iter().any(|alpha| *alpha > 0.5));
 /// # Ok::<(), Box<dyn std::error::Error>>(())
 /// ```
@@ -51,8 +51,8 @@ impl Scene {
     ///
     /// # Errors
     /// When it cannot be read, or is a residual field without its splats.
-    pub fn read(path: &Path) -> Result<Self, RunError> {
-        let path = &scene_of(path);
+    pub fn read(path: impl AsRef<Path>) -> Result<Self, RunError> {
+        let path = &scene_of(path.as_ref());
         let (model, antialiased) = read_model(path)?;
         let knobs = render_knobs_beside(path);
         Ok(Self {

@@ -55,7 +55,8 @@ impl fmt::Display for SynthSummary {
 ///
 /// # Errors
 /// Sizes or counts that make no dataset; a file that cannot be written, by name.
-pub fn write_synth_dataset(out: &Path, options: &SynthOptions) -> Result<SynthSummary, RunError> {
+pub fn write_synth_dataset(out: impl AsRef<Path>, options: &SynthOptions) -> Result<SynthSummary, RunError> {
+    let out = out.as_ref();
     let capture = Capture::new(options)?;
     let mut points = PointCloud::default();
     let mut frames: [Vec<Value>; 3] = Default::default();
@@ -228,7 +229,7 @@ mod tests {
     #[test]
     fn senseless_options_are_refused_in_one_line() {
         for options in [SynthOptions { views: 0, ..SMALL }, SynthOptions { width: 0, ..SMALL }] {
-            let error = write_synth_dataset(Path::new("never-made"), &options).expect_err("refused");
+            let error = write_synth_dataset("never-made", &options).expect_err("refused");
             assert!(error.to_string().contains("give between"), "{error}");
         }
         assert!(!Path::new("never-made").exists());

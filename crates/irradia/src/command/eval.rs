@@ -56,7 +56,7 @@ pub fn run(args: &Args) -> Result<()> {
         rows.push(json!({ "name": view.name, "psnr": m.psnr, "ssim": m.ssim, "lpips": m.lpips }));
         if let Some(folder) = &args.save_images {
             std::fs::create_dir_all(folder).with_context(|| format!("cannot make {}", folder.display()))?;
-            write_image(&folder.join(format!("{}.png", file_stem(&view.name))), &view.render)?;
+            write_image(folder.join(format!("{}.png", file_stem(&view.name))), &view.render)?;
         }
         Ok(())
     };

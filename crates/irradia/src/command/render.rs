@@ -76,7 +76,7 @@ pub fn run(args: &Args) -> Result<()> {
     let mut renderer = Renderer::new();
     let mut depths = Vec::new();
     let write = |name: &str, what: &str, image: &Image| -> Result<()> {
-        Ok(write_image(&args.out.join(format!("{name}{what}.png")), image)?)
+        Ok(write_image(args.out.join(format!("{name}{what}.png")), image)?)
     };
     for (name, camera) in &cameras {
         let frame = scene.model.look(&mut renderer, camera, &scene.options);

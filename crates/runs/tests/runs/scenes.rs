@@ -28,7 +28,7 @@ fn a_scene_takes_background_and_cameras_from_its_run_and_does_without() {
     assert_eq!((camera.intrinsics.width, camera.intrinsics.height), (32, 20));
     assert!(describe(&path).expect("known").title.contains("Gaussians"));
 
-    let error = Scene::read(&folder.path().join("none.ply")).expect_err("absent");
+    let error = Scene::read(folder.path().join("none.ply")).expect_err("absent");
     assert!(error.to_string().contains("none.ply") && !error.is_request(), "{error}");
 }
 
@@ -38,7 +38,7 @@ fn the_mean_of_an_evaluation_is_that_of_its_views() {
     let mut run = begin(folder.path(), "run", 3);
     run.train(&mut []).expect("trains");
     let report = run.finish().expect("finishes").report;
-    let scene = Scene::read(&folder.path().join("run")).expect("a scene");
+    let scene = Scene::read(folder.path().join("run")).expect("a scene");
     let dataset = crate::dataset();
     let mut psnr = Vec::new();
     let mean = evaluate(&scene.model, &dataset, &dataset.test, &scene.options, None, |view| {

@@ -87,7 +87,7 @@ fn a_watched_run_gives_the_same_snapshot_until_a_step_is_made_and_the_same_bytes
     run.finish().expect("finishes");
     let last = snapshots.newest().expect("the last");
     assert_eq!((last.step, last.total_steps), (30, 30));
-    let written = Scene::read(&folder.path().join("run")).expect("a scene");
+    let written = Scene::read(folder.path().join("run")).expect("a scene");
     assert_eq!(last.scene.model.splats(), written.model.splats());
     assert!(scene(folder.path(), "run") == unwatched(folder.path(), 30));
 }

@@ -127,7 +127,9 @@ impl Observer for Progress {
                 }
                 self.say(&format!("{reason} after {step} steps, {seconds:.1} s of training"));
             }
-            Event::Densified { .. } | Event::Saved { .. } | Event::Paused { .. } | Event::Resumed { .. } => {}
+            Event::Paused { step } => self.say(&format!("paused after {step} steps")),
+            Event::Resumed { .. } => self.say("resumed"),
+            Event::Densified { .. } | Event::Saved { .. } => {}
         }
         self.signal()
     }

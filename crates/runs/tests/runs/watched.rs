@@ -147,3 +147,27 @@ fn a_paused_run_can_be_stopped() {
     assert_eq!(pauses.steps, [1, 2, 3]);
     assert!(run.folder().file("checkpoints/step_3.safetensors").is_file());
 }
+
+/// Cannot do its work, and says so once.
+struct Warns(Option<String>);
+
+impl Observer for Warns {
+    fn on_event(&mut self, _event: &Event, _trainer: &Trainer) -> Signal {
+        Signal::Continue
+    }
+
+    fn warning(&mut self) -> Option<String> {
+        self.0.take()
+    }
+}
+
+#[test]
+fn an_observers_warning_reaches_the_others_and_the_report_once() {
+    let folder = folder();
+    let mut run = begin(folder.path(), "run", 3);
+    let (mut warns, mut listens) = (Warns(Some("no sound".into())), At::new(0, Signal::Continue));
+    run.train(&mut [&mut warns, &mut listens]).expect("trains");
+    let warned = |event: &&Event| matches!(event, Event::Warned { message } if message == "no sound");
+    assert_eq!(listens.told.iter().filter(warned).count(), 1);
+    assert_eq!(run.finish().expect("finishes").report.warnings, ["no sound"]);
+}

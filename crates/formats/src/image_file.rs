@@ -78,6 +78,27 @@ pub fn write_png(path: &Path, width: u32, height: u32, channels: u32, data: &[u8
     })
 }
 
+/// Writes a 16-bit grey PNG, whole or not at all.
+///
+/// # Errors
+/// When the file cannot be written, or the sizes do not fit each other.
+pub fn write_png_16(path: &Path, width: u32, height: u32, data: &[u16]) -> Result<(), FormatError> {
+    if width == 0 || height == 0 || data.len() as u64 != u64::from(width) * u64::from(height) {
+        return Err(FormatError::Option(format!(
+            "{}: {} values do not make a {width}x{height} image",
+            path.display(),
+            data.len()
+        )));
+    }
+    // The codec takes 16-bit samples in the machine's byte order.
+    let bytes: Vec<u8> = data.iter().flat_map(|v| v.to_ne_bytes()).collect();
+    write_atomic(path, |out| {
+        PngEncoder::new(out)
+            .write_image(&bytes, width, height, ExtendedColorType::L16)
+            .map_err(io::Error::other)
+    })
+}
+
 /// Size and orientation, without decoding the pixels. The kind is told by content, not by extension.
 pub(crate) fn read_header(path: &Path) -> Result<Header, FormatError> {
     let mut decoder = open(path)?;
@@ -185,6 +206,10 @@ mod tests {
         assert!(write_png(&path, 5, 3, 2, &[0; 30]).is_err());
         assert!(write_png(&path, 5, 3, 3, &[0; 44]).is_err());
         assert!(write_png(&path, 0, 3, 3, &[]).is_err());
+        let deep = [0u16, 1, 256, 65535, 4660, 7];
+        write_png_16(&path, 3, 2, &deep).unwrap();
+        assert_eq!(image::open(&path).unwrap().into_luma16().as_raw()[..], deep);
+        assert!(write_png_16(&path, 3, 3, &deep).is_err());
     }
 
     #[test]

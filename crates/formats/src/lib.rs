@@ -23,6 +23,6 @@ pub use atomic::write_atomic;
 pub use dataset::{DatasetFormat, DatasetOptions, read_dataset};
 pub use describe::{Description, Kind, describe, detect};
 pub use error::{FormatError, Malformed};
-pub use image_file::{Pixels, read_image, write_png};
-pub use points_ply::read_points_ply;
+pub use image_file::{Pixels, read_image, write_png, write_png_16};
+pub use points_ply::{read_points_ply, write_points_ply};
 pub use splats::{SplatFormat, read_splats, write_splats};

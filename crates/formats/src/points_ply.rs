@@ -1,6 +1,6 @@
 use crate::error::read_and_parse;
 use crate::ply::{Column, Ply, Rows};
-use crate::{FormatError, Malformed};
+use crate::{FormatError, Malformed, write_atomic};
 use glam::Vec3;
 use irradia_scene::PointCloud;
 use std::path::Path;
@@ -48,6 +48,24 @@ pub fn parse_points_ply(bytes: &[u8]) -> Result<PointCloud, Malformed> {
         }
     }
     Ok(points)
+}
+
+/// Writes a binary PLY of coloured points, whole or not at all.
+///
+/// # Errors
+/// When the file cannot be written.
+pub fn write_points_ply(path: &Path, points: &PointCloud) -> Result<(), FormatError> {
+    let mut bytes = format!(
+        "ply\nformat binary_little_endian 1.0\nelement vertex {}\nproperty float x\nproperty float y\nproperty float z\n\
+         property uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n",
+        points.len()
+    )
+    .into_bytes();
+    for (position, color) in points.positions.iter().zip(&points.colors) {
+        position.to_array().iter().for_each(|v| bytes.extend(v.to_le_bytes()));
+        bytes.extend(color);
+    }
+    write_atomic(path, |out| out.write_all(&bytes))
 }
 
 /// What takes the file's colours to 0..=255. Float colours are in \[0, 1\] by custom, yet some writers keep 0..255:

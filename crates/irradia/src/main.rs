@@ -1,13 +1,18 @@
 //! `irradia`: photographs in, a scene you can look at from anywhere out.
+//!
+//! This is the program. **To train or render from Rust, begin with [`irradia_runs`]**: one import, and a runnable example
+//! on its first page. The crates below it are `irradia_train` (recipes, schedule, the training step), `irradia_splat` and
+//! `irradia_field` (what is trained), `irradia_measure`, `irradia_formats`, `irradia_synth`, `irradia_compute` and
+//! `irradia_scene` (plain types and conventions).
 #![forbid(unsafe_code)]
 
 mod command;
-mod run_folder;
-mod synth;
+mod interrupt;
 mod terminal;
 
 use clap::{Parser, Subcommand};
-use irradia_formats::FormatError;
+use irradia_runs::RunError;
+use irradia_runs::formats::FormatError;
 use std::process::ExitCode;
 
 #[derive(Parser)]
@@ -41,7 +46,7 @@ enum Command {
 
 /// Marks an error as a mistake in the command line: exit code 2.
 #[derive(Debug)]
-pub struct Usage(pub String);
+struct Usage(pub String);
 
 impl std::fmt::Display for Usage {
     fn fmt(&self, f: &mut std::fmt::Formatter) -> std::fmt::Result {
@@ -78,5 +83,5 @@ fn is_usage(error: &anyhow::Error) -> bool {
         error.downcast_ref(),
         Some(FormatError::Option(_) | FormatError::UnknownSplatFormat { .. })
     );
-    error.is::<Usage>() || of_a_file
+    error.is::<Usage>() || of_a_file || error.downcast_ref().is_some_and(RunError::is_request)
 }

@@ -15,8 +15,6 @@ pub struct EvaluatedView {
     pub name: String,
     /// Its metrics.
     pub metrics: Evaluation,
-    /// PSNR in dB over its right half, after exposure or pose were fitted on the left half; `None` where not asked for.
-    pub half_fit_psnr: Option<f64>,
     /// The photograph over the background.
     pub truth: Image,
     /// What the scene shows there.
@@ -65,12 +63,13 @@ pub fn evaluate_views(
         let truth = truth_image(&photo, view, options.render.background);
         let render = model.render(&mut renderer, &view.camera, &options.render).color;
         let mask = photo.mask.as_deref();
-        let metrics = match options.metrics {
+        let mut metrics = match options.metrics {
             Metrics::All(lpips) => evaluate(&render, &truth, mask, lpips),
             Metrics::Psnr => Evaluation {
                 psnr: psnr_masked(&render.rounded_to_8_bits(), &truth, mask),
                 ssim: f64::NAN,
                 lpips: None,
+                half_fit_psnr: None,
             },
         };
         let held_out = HeldOut {
@@ -81,11 +80,10 @@ pub fn evaluate_views(
             extent,
         };
         let fit = options.half_fit;
-        let half_fit_psnr = fit.any().then(|| half_fit_psnr(model, &mut renderer, &held_out, fit));
+        metrics.half_fit_psnr = fit.any().then(|| half_fit_psnr(model, &mut renderer, &held_out, fit));
         see(EvaluatedView {
             name: view.name.clone(),
             metrics,
-            half_fit_psnr,
             truth,
             render,
             mask: photo.mask,
@@ -105,18 +103,17 @@ fn truth_image(photo: &Photo, view: &View, background: [f32; 3]) -> Image {
     )
 }
 
-/// The mean over views of what was measured after a fit; `None` where nothing was fitted.
-pub fn mean_half_fit(psnr: &[f64]) -> Option<f64> {
-    (!psnr.is_empty()).then(|| psnr.iter().sum::<f64>() / psnr.len() as f64)
-}
-
-/// The mean of the metrics over views; LPIPS where every view has one. NaN when there are none.
+/// The mean of the metrics over views; LPIPS, and what was measured after a fit, where every view has it. NaN when there are none.
 pub fn mean(metrics: &[Evaluation]) -> Evaluation {
     let n = metrics.len() as f64;
-    let lpips: Option<Vec<f64>> = metrics.iter().map(|m| m.lpips).collect();
+    let over_all = |of: fn(&Evaluation) -> Option<f64>| {
+        let values: Option<Vec<f64>> = metrics.iter().map(of).collect();
+        values.filter(|v| !v.is_empty()).map(|v| v.iter().sum::<f64>() / n)
+    };
     Evaluation {
         psnr: metrics.iter().map(|m| m.psnr).sum::<f64>() / n,
         ssim: metrics.iter().map(|m| m.ssim).sum::<f64>() / n,
-        lpips: lpips.filter(|l| !l.is_empty()).map(|l| l.iter().sum::<f64>() / n),
+        lpips: over_all(|m| m.lpips),
+        half_fit_psnr: over_all(|m| m.half_fit_psnr),
     }
 }

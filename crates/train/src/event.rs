@@ -68,6 +68,16 @@ pub enum Event {
         /// Where, relative to the run.
         path: String,
     },
+    /// The run waits, because an observer asked for it.
+    Paused {
+        /// Steps made so far.
+        step: u64,
+    },
+    /// The run goes on after a pause.
+    Resumed {
+        /// Steps made so far.
+        step: u64,
+    },
     /// Something that should be known and does not end the run.
     Warned {
         /// One line.
@@ -124,14 +134,16 @@ impl Event {
     }
 }
 
-/// What an observer wants.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Default)]
+/// What an observer wants. Of several observers' answers all are followed; [`Signal::Stop`] ends a pause too.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Default)]
 pub enum Signal {
     /// Nothing.
     #[default]
     Continue,
     /// A checkpoint, now.
     Save,
+    /// The run to wait until [`Observer::while_paused`] of no observer answers this any more.
+    Pause,
     /// The run to end, with everything saved.
     Stop,
 }
@@ -140,6 +152,16 @@ pub enum Signal {
 pub trait Observer {
     /// Sees `event`; `trainer` is as it stands after it.
     fn on_event(&mut self, event: &Event, trainer: &crate::Trainer) -> Signal;
+
+    /// Asked several times a second while the run is paused, whoever paused it.
+    fn while_paused(&mut self, _trainer: &crate::Trainer) -> Signal {
+        Signal::Continue
+    }
+
+    /// Something that went wrong with watching, once; asked after every event and told as [`Event::Warned`].
+    fn warning(&mut self) -> Option<String> {
+        None
+    }
 
     /// Writes a checkpoint, if that is this observer's business; its place, relative to the run.
     ///

@@ -82,6 +82,17 @@ impl Model<'_> {
         }
     }
 
+    /// The same model, owned; only what is borrowed is copied.
+    pub fn into_owned(self) -> Model<'static> {
+        match self {
+            Model::Splats { splats, residual } => Model::Splats {
+                splats: Cow::Owned(splats.into_owned()),
+                residual,
+            },
+            Model::Field(field) => Model::Field(Cow::Owned(field.into_owned())),
+        }
+    }
+
     /// Gaussians, where that is what it is.
     pub fn splats(&self) -> Option<&Splats> {
         match self {

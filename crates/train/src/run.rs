@@ -6,6 +6,7 @@ use crate::forecast::Forecast;
 use crate::half_fit::HalfFit;
 use crate::schedule::{is_due, plan};
 use crate::trainer::{TrainError, Trainer};
+use std::time::Duration;
 
 /// When a run ends before its recipe does.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -18,6 +19,28 @@ pub struct RunLimits {
 
 /// Steps between looks at the held-out views when `until_psnr` waits for them.
 const UNTIL_PSNR_EVERY: u64 = 50;
+
+/// Time between questions to the observers of a paused run: short for a person, and no load.
+const PAUSE_INTERVAL: Duration = Duration::from_millis(20);
+
+/// What the observers want, taken together.
+#[derive(Clone, Copy, Default)]
+struct Wishes {
+    save: bool,
+    pause: bool,
+    stop: bool,
+}
+
+impl Wishes {
+    fn add(&mut self, signal: Signal) {
+        match signal {
+            Signal::Continue => {}
+            Signal::Save => self.save = true,
+            Signal::Pause => self.pause = true,
+            Signal::Stop => self.stop = true,
+        }
+    }
+}
 
 /// Trains until the recipe is over, a limit is reached or an observer says stop; returns why it ended.
 ///
@@ -45,9 +68,10 @@ pub fn run(
         });
     }
     let mut forecast = Forecast::default();
-    let mut signal = tell(trainer, &mut events, observers);
+    let mut wishes = tell(trainer, &mut events, observers);
+    wait_while_paused(trainer, &mut wishes, &mut events, observers);
     let mut reason = None;
-    while reason.is_none() && signal != Signal::Stop && !trainer.finished() {
+    while reason.is_none() && !wishes.stop && !trainer.finished() {
         let due = plan(&trainer.recipe, &trainer.clock);
         forecast.observe(trainer, &due);
         if let Some(budget) = limits.budget {
@@ -74,23 +98,24 @@ pub fn run(
                 reason = Some("held-out PSNR reached");
             }
         }
-        signal = tell(trainer, &mut events, observers);
-        if due.checkpoint || signal >= Signal::Save {
+        wishes = tell(trainer, &mut events, observers);
+        if due.checkpoint || wishes.save || wishes.stop {
             save(trainer, &mut events, observers);
         }
+        if reason.is_none() && !trainer.finished() {
+            wait_while_paused(trainer, &mut wishes, &mut events, observers);
+        }
     }
-    let stopped = if signal == Signal::Stop {
-        "stopped"
-    } else {
-        "recipe complete"
-    };
+    let stopped = if wishes.stop { "stopped" } else { "recipe complete" };
     let reason = reason.unwrap_or(stopped).to_owned();
     events.push(Event::Finished {
         step: trainer.clock.step,
         seconds: trainer.seconds,
         reason: reason.clone(),
     });
-    tell(trainer, &mut events, observers);
+    while !events.is_empty() {
+        tell(trainer, &mut events, observers);
+    }
     Ok(reason)
 }
 
@@ -107,14 +132,44 @@ fn save(trainer: &Trainer, events: &mut Vec<Event>, observers: &mut [&mut dyn Ob
     }
 }
 
-fn tell(trainer: &Trainer, events: &mut Vec<Event>, observers: &mut [&mut dyn Observer]) -> Signal {
-    let mut strongest = Signal::Continue;
+fn tell(trainer: &Trainer, events: &mut Vec<Event>, observers: &mut [&mut dyn Observer]) -> Wishes {
+    let mut wishes = Wishes::default();
     for event in events.drain(..) {
         for observer in observers.iter_mut() {
-            strongest = strongest.max(observer.on_event(&event, trainer));
+            wishes.add(observer.on_event(&event, trainer));
         }
     }
-    strongest
+    let warnings = observers.iter_mut().filter_map(|observer| observer.warning());
+    events.extend(warnings.map(|message| Event::Warned { message }));
+    wishes
+}
+
+/// Sleeps while an observer wants a pause and none wants to stop.
+fn wait_while_paused(
+    trainer: &Trainer,
+    wishes: &mut Wishes,
+    events: &mut Vec<Event>,
+    observers: &mut [&mut dyn Observer],
+) {
+    if !wishes.pause || wishes.stop {
+        return;
+    }
+    let step = trainer.clock.step;
+    events.push(Event::Paused { step });
+    wishes.stop |= tell(trainer, events, observers).stop;
+    while wishes.pause && !wishes.stop {
+        std::thread::sleep(PAUSE_INTERVAL);
+        *wishes = Wishes::default();
+        for observer in observers.iter_mut() {
+            wishes.add(observer.while_paused(trainer));
+        }
+        if wishes.save || wishes.stop {
+            save(trainer, events, observers);
+            wishes.stop |= tell(trainer, events, observers).stop;
+        }
+    }
+    events.push(Event::Resumed { step });
+    wishes.stop |= tell(trainer, events, observers).stop;
 }
 
 /// Mean PSNR over the held-out views, with the SH bands in use now.

@@ -21,9 +21,18 @@ const TABLE: &[(&str, May)] = &[
     ("field", Import(&["scene", "compute"])),
     ("measure", Import(&["scene", "compute"])),
     ("train", Import(&["scene", "compute", "splat", "field", "measure"])),
+    ("synth", Import(&["scene"])),
+    (
+        "runs",
+        Import(&[
+            "scene", "compute", "formats", "splat", "field", "measure", "train", "synth",
+        ]),
+    ),
     (
         "viewer",
-        Import(&["scene", "compute", "splat", "field", "formats", "train"]),
+        Import(&[
+            "scene", "compute", "splat", "field", "formats", "train", "synth", "runs",
+        ]),
     ),
     ("irradia", ImportAll),
     ("python", ImportAll),

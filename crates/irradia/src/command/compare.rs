@@ -3,24 +3,24 @@
 //! Every training is a process of its own, this same program's `train`: memory is measured by itself, and what goes wrong in
 //! one run stays there.
 
-use super::train::{parse_seconds, read_recipe};
-use super::{DataArgs, file_stem, thread_count};
+use super::train::parse_seconds;
+use super::{DataArgs, thread_count};
 use crate::Usage;
-use crate::run_folder::RunFolder;
+use crate::interrupt::stop_flag;
 use crate::terminal::{note, one_line, say};
 use anyhow::{Context, Result, bail};
 use clap::builder::RangedU64ValueParser;
 use image::codecs::jpeg::JpegEncoder;
-use irradia_formats::write_atomic;
-use irradia_train::compare::{
+use irradia_runs::formats::write_atomic;
+use irradia_runs::train::compare::{
     Comparison, Figures, PictureRow, Render, Run, Scene, overall, picture, to_html, to_markdown, to_text,
 };
-use irradia_train::report::{Report, machine};
+use irradia_runs::train::report::{Report, machine};
+use irradia_runs::{RunFolder, file_stem, logged_errors, read_recipe};
 use serde::{Deserialize, Serialize};
 use std::fs::{self, File};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
@@ -111,14 +111,7 @@ pub fn run(args: &Args) -> Result<()> {
         check_earlier(args, &ways, &names)?;
     }
     fs::create_dir_all(&args.out).with_context(|| format!("cannot make {}; give another --out", args.out.display()))?;
-    let stop = Arc::new(AtomicBool::new(false));
-    let asked = stop.clone();
-    // The second Ctrl-C does not wait. A handler that is already set is no reason not to go on.
-    let _ = ctrlc::set_handler(move || {
-        if asked.swap(true, Ordering::Relaxed) {
-            std::process::exit(130);
-        }
-    });
+    let stop = stop_flag();
 
     let total = args.data.len() * ways.len() * args.seeds as usize;
     let (mut scenes, mut number) = (Vec::new(), 0);
@@ -282,23 +275,11 @@ fn request(args: &Args, data: &Path, way: &Way, seed: u64) -> Request {
 
 /// The report of the finished run in `folder`; with what it was asked for.
 fn finished(folder: &Path) -> Option<(Report, Option<Request>)> {
-    let (run, config) = RunFolder::open(folder).ok()?;
+    let (run, record) = RunFolder::open(folder).ok()?;
     let read = |name: &str| fs::read_to_string(run.file(name)).ok();
     let report = serde_json::from_str(&read("report.json")?).ok()?;
     let request = read(REQUEST).and_then(|text| serde_json::from_str(&text).ok());
-    config.complete.then_some((report, request))
-}
-
-/// Mean squared errors of the training views that the run in `folder` logged; none where it left no log.
-fn logged_errors(folder: &Path) -> Vec<f64> {
-    let text = fs::read_to_string(folder.join("events.jsonl")).unwrap_or_default();
-    let events = text
-        .lines()
-        .filter_map(|line| serde_json::from_str::<serde_json::Value>(line).ok());
-    events
-        .filter(|event| event["event"] == "step")
-        .filter_map(|event| event["mse"].as_f64())
-        .collect()
+    record.complete.then_some((report, request))
 }
 
 /// Refuses, before anything is trained, finished runs that were asked for something else.

@@ -1,10 +1,11 @@
 //! `irradia demo` and `irradia synth`
 
 use super::render::parse_size;
-use super::{DataArgs, thread_count, train, use_threads};
-use crate::synth::{SynthOptions, write_dataset};
+use super::{lpips_path, thread_count, train, use_threads};
 use crate::terminal::{note, say};
 use anyhow::Result;
+use irradia_runs::synth::SynthOptions;
+use irradia_runs::{TrainInput, write_synth_dataset};
 use std::path::PathBuf;
 use std::time::Instant;
 
@@ -53,31 +54,17 @@ pub fn run(args: &Args) -> Result<()> {
         height: args.size.1,
         ..SynthOptions::default()
     };
-    let summary = write_dataset(&data, &options)?;
+    let summary = write_synth_dataset(&data, &options)?;
     note(format_args!(
         "{summary}, in {:.1} s: {}",
         start.elapsed().as_secs_f64(),
         data.display()
     ));
-    train::train(&train::Args {
-        data: Some(data),
-        out: Some(out.clone()),
-        recipe: train::DEFAULT_RECIPE.into(),
-        set: Vec::new(),
+    train::begin(TrainInput {
         steps: Some(args.steps),
-        max_splats: None,
-        seed: 0,
-        threads: args.threads,
-        until_psnr: None,
-        budget: None,
-        resume: None,
+        lpips: lpips_path(None),
         overwrite: true,
-        lpips: None,
-        reading: DataArgs {
-            downscale: 1.0,
-            max_side: None,
-            format: None,
-        },
+        ..TrainInput::new(data, out.clone())
     })?;
     say(format_args!(
         "the scene is {}; go round it with: irradia render {} --orbit 60 --out frames",
@@ -93,6 +80,6 @@ pub fn synth(args: &SynthArgs) -> Result<()> {
         height: args.size.1,
         seed: args.seed,
     };
-    let summary = write_dataset(&args.out, &options)?;
+    let summary = write_synth_dataset(&args.out, &options)?;
     say(format_args!("{}: {summary}", args.out.display()))
 }

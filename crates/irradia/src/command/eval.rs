@@ -1,14 +1,14 @@
 //! `irradia eval`
 
-use super::{DataArgs, Split, file_stem, lpips, thread_count, use_threads};
+use super::{DataArgs, Split, lpips, thread_count, use_threads};
 use crate::Usage;
-use crate::run_folder::{read_scene, render_knobs_beside, scene_of};
 use crate::terminal::say;
-use anyhow::Result;
-use irradia_formats::{write_atomic, write_png};
-use irradia_splat::RenderOptions;
-use irradia_train::eval::{EvalOptions, Metrics, evaluate_views, mean, mean_half_fit};
-use irradia_train::half_fit::HalfFit;
+use anyhow::{Context, Result};
+use irradia_measure::Evaluation;
+use irradia_runs::formats::write_atomic;
+use irradia_runs::train::eval::{EvalOptions, EvaluatedView, Metrics};
+use irradia_runs::train::half_fit::HalfFit;
+use irradia_runs::{Scene, evaluate, file_stem, scene_of, write_image};
 use serde_json::json;
 use std::path::PathBuf;
 
@@ -61,67 +61,39 @@ impl Args {
 
 pub fn run(args: &Args) -> Result<()> {
     use_threads(args.threads)?;
-    let scene = scene_of(&args.scene);
-    let (model, antialiased) = read_scene(&scene)?;
+    let scene = Scene::read(&args.scene)?;
     let dataset = args.reading.read(&args.data)?;
     let indices = args.split.of(&dataset);
     if indices.is_empty() {
         return Err(Usage(format!("{} has no such views: try --split all", args.data.display())).into());
     }
     let lpips = lpips(args.lpips.as_ref())?;
-    let knobs = render_knobs_beside(&scene);
-    let options = RenderOptions {
-        background: knobs.background,
-        antialias: knobs.antialias || antialiased,
-        ..RenderOptions::default()
+    let options = EvalOptions {
+        render: scene.options,
+        metrics: Metrics::All(lpips.as_ref()),
+        half_fit: args.half_fit(),
     };
-    let (mut rows, mut metrics, mut half_fits, mut outcome) = (Vec::new(), Vec::new(), Vec::new(), Ok(()));
-    evaluate_views(
-        &model,
-        &dataset,
-        &indices,
-        &EvalOptions {
-            render: options,
-            metrics: Metrics::All(lpips.as_ref()),
-            half_fit: args.half_fit(),
-        },
-        |view| {
-            let m = view.metrics;
-            let tail = m.lpips.map_or(String::new(), |l| format!("  LPIPS {l:.4}")) + &after_fit(view.half_fit_psnr);
-            let line = format!("{:<40} PSNR {:6.2} dB  SSIM {:.4}{tail}", view.name, m.psnr, m.ssim);
-            if let Err(error) = say(line) {
-                outcome = Err(error);
-            }
-            rows.push(json!({ "name": view.name, "psnr": m.psnr, "ssim": m.ssim, "lpips": m.lpips, "half_fit_psnr": view.half_fit_psnr }));
-            half_fits.extend(view.half_fit_psnr);
-            metrics.push(m);
-            if let Some(folder) = &args.save_images {
-                let path = folder.join(format!("{}.png", file_stem(&view.name)));
-                let image = &view.render;
-                let written = std::fs::create_dir_all(folder)
-                    .map_err(anyhow::Error::from)
-                    .and_then(|()| Ok(write_png(&path, image.width, image.height, 3, &image.to_u8())?));
-                if let Err(error) = written {
-                    outcome = Err(error);
-                }
-            }
-        },
-    )?;
-    outcome?;
-    let mean = mean(&metrics);
-    let half_fit = mean_half_fit(&half_fits);
-    let tail = mean.lpips.map_or(String::new(), |l| format!("  LPIPS {l:.4}")) + &after_fit(half_fit);
-    say(format_args!(
-        "{:<40} PSNR {:6.2} dB  SSIM {:.4}{tail}",
-        format!("mean of {}", metrics.len()),
-        mean.psnr,
-        mean.ssim
-    ))?;
+    let mut rows = Vec::new();
+    let see = |view: &EvaluatedView| -> Result<()> {
+        let m = view.metrics;
+        say(figures(&view.name, &m))?;
+        rows.push(json!({
+            "name": view.name, "psnr": m.psnr, "ssim": m.ssim, "lpips": m.lpips, "half_fit_psnr": m.half_fit_psnr,
+        }));
+        if let Some(folder) = &args.save_images {
+            std::fs::create_dir_all(folder).with_context(|| format!("cannot make {}", folder.display()))?;
+            write_image(folder.join(format!("{}.png", file_stem(&view.name))), &view.render)?;
+        }
+        Ok(())
+    };
+    let mean = evaluate(&scene.model, &dataset, &indices, &options, see)?;
+    say(figures(&format!("mean of {}", rows.len()), &mean))?;
     if let Some(path) = &args.json {
         let figures = json!({
-            "scene": scene, "data": args.data,
-            "splats": model.splats().map(irradia_splat::Splats::len), "parameters": model.field().map(irradia_field::Field::len),
-            "psnr": mean.psnr, "ssim": mean.ssim, "lpips": mean.lpips, "half_fit_psnr": half_fit, "views": rows,
+            "scene": scene_of(&args.scene), "data": args.data,
+            "splats": scene.model.splats().map(|splats| splats.len()),
+            "parameters": scene.model.field().map(|field| field.len()),
+            "psnr": mean.psnr, "ssim": mean.ssim, "lpips": mean.lpips, "half_fit_psnr": mean.half_fit_psnr, "views": rows,
         });
         let bytes = serde_json::to_vec_pretty(&figures)?;
         write_atomic(path, |out| out.write_all(&bytes))?;
@@ -129,6 +101,14 @@ pub fn run(args: &Args) -> Result<()> {
     Ok(())
 }
 
-fn after_fit(psnr: Option<f64>) -> String {
-    psnr.map_or(String::new(), |psnr| format!("  after half fit {psnr:6.2} dB"))
+/// One line of figures.
+fn figures(name: &str, m: &Evaluation) -> String {
+    let mut line = format!("{name:<40} PSNR {:6.2} dB  SSIM {:.4}", m.psnr, m.ssim);
+    if let Some(lpips) = m.lpips {
+        line += &format!("  LPIPS {lpips:.4}");
+    }
+    if let Some(psnr) = m.half_fit_psnr {
+        line += &format!("  after half fit {psnr:6.2} dB");
+    }
+    line
 }

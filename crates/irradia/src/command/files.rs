@@ -1,10 +1,9 @@
 //! `irradia info` and `irradia convert`
 
-use super::describe_field::describe_field;
-use crate::run_folder::{RESIDUAL, is_field, read_field, residual_beside, scene_of};
 use crate::terminal::say;
 use anyhow::Result;
-use irradia_formats::{SplatFormat, describe, read_splats, write_splats};
+use irradia_runs::formats::{SplatFormat, read_splats, write_splats};
+use irradia_runs::{describe, scene_of};
 use std::path::PathBuf;
 
 #[derive(clap::Args)]
@@ -22,17 +21,7 @@ pub struct ConvertArgs {
 }
 
 pub fn info(args: &InfoArgs) -> Result<()> {
-    let scene = scene_of(&args.path);
-    if is_field(&scene) {
-        let bytes = std::fs::metadata(&scene).map_or(0, |file| file.len());
-        return say(describe_field(&read_field(&scene)?, bytes));
-    }
-    let mut description = describe(&scene)?;
-    if let Some(field) = residual_beside(&scene)? {
-        let adds = format!("{RESIDUAL}, {} parameters", field.len());
-        description.facts.push(("reflections", adds));
-    }
-    say(description)
+    say(describe(&args.path)?)
 }
 
 pub fn convert(args: &ConvertArgs) -> Result<()> {

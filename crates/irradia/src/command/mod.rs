@@ -2,10 +2,8 @@
 
 pub mod compare;
 pub mod demo;
-mod describe_field;
 pub mod eval;
 pub mod files;
-mod journal;
 mod progress;
 pub mod recipe;
 mod recipe_keys;
@@ -16,9 +14,9 @@ use crate::Usage;
 use crate::terminal::note;
 use anyhow::{Context, Result};
 use clap::builder::RangedU64ValueParser;
-use irradia_formats::{DatasetFormat, DatasetOptions, read_dataset};
 use irradia_measure::Lpips;
-use irradia_scene::Dataset;
+use irradia_runs::scene::Dataset;
+use irradia_runs::{Reading, RunError};
 use std::path::{Path, PathBuf};
 
 /// Which part of a dataset.
@@ -58,25 +56,37 @@ pub struct DataArgs {
 }
 
 impl DataArgs {
-    /// Reads the dataset; its warnings go to standard error, one line each.
-    pub fn read(&self, path: &Path) -> Result<Dataset> {
-        let format: Option<DatasetFormat> = match &self.format {
-            Some(name) => Some(name.parse().map_err(|e| Usage(format!("--format {name}: {e}")))?),
-            None => None,
-        };
-        if !self.downscale.is_finite() || self.downscale < 1.0 {
-            return Err(Usage(format!("--downscale {}: give 1 or more", self.downscale)).into());
-        }
-        let options = DatasetOptions {
-            format,
+    /// As the library takes it.
+    pub fn reading(&self) -> Reading {
+        Reading {
+            format: self.format.clone(),
             downscale: self.downscale,
             max_side: self.max_side,
-        };
-        let dataset = read_dataset(path, &options)?;
-        for warning in &dataset.warnings {
-            note(format_args!("warning: {warning}"));
         }
+    }
+
+    /// Reads the dataset; its warnings go to standard error.
+    pub fn read(&self, path: &Path) -> Result<Dataset> {
+        let dataset = self.reading().read(path).map_err(by_option)?;
+        warn(&dataset.warnings);
         Ok(dataset)
+    }
+}
+
+/// An error of a request, in the words of the command line.
+pub fn by_option(error: RunError) -> anyhow::Error {
+    match error {
+        RunError::Setting { name, value, message } => {
+            Usage(format!("--{} {value}: {message}", name.replace('_', "-"))).into()
+        }
+        error => error.into(),
+    }
+}
+
+/// Shows warnings on standard error, one line each.
+pub fn warn(warnings: &[String]) {
+    for warning in warnings {
+        note(format_args!("warning: {warning}"));
     }
 }
 
@@ -107,21 +117,4 @@ pub fn use_threads(threads: Option<usize>) -> Result<()> {
         .num_threads(threads.unwrap_or(0))
         .build_global()
         .context("cannot start threads")
-}
-
-/// A view's name as a file name without extension: folders become underscores.
-pub fn file_stem(name: &str) -> String {
-    let stem = name.rsplit_once('.').map_or(
-        name,
-        |(stem, extension)| if extension.contains('/') { name } else { stem },
-    );
-    stem.chars()
-        .map(|c| {
-            if c.is_alphanumeric() || "-_.".contains(c) {
-                c
-            } else {
-                '_'
-            }
-        })
-        .collect()
 }

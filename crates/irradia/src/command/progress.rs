@@ -44,6 +44,14 @@ impl Progress {
         }
     }
 
+    fn signal(&self) -> Signal {
+        if self.stop.load(Ordering::Relaxed) {
+            Signal::Stop
+        } else {
+            Signal::Continue
+        }
+    }
+
     fn say(&self, line: &str) {
         match &self.bar {
             Some(bar) => bar.suspend(|| note(line)),
@@ -119,12 +127,14 @@ impl Observer for Progress {
                 }
                 self.say(&format!("{reason} after {step} steps, {seconds:.1} s of training"));
             }
+            Event::Paused { step } => self.say(&format!("paused after {step} steps")),
+            Event::Resumed { .. } => self.say("resumed"),
             Event::Densified { .. } | Event::Saved { .. } => {}
         }
-        if self.stop.load(Ordering::Relaxed) {
-            Signal::Stop
-        } else {
-            Signal::Continue
-        }
+        self.signal()
+    }
+
+    fn while_paused(&mut self, _trainer: &Trainer) -> Signal {
+        self.signal()
     }
 }

@@ -1,9 +1,9 @@
 //! `irradia recipe`
 
 use super::recipe_keys;
-use super::train::read_recipe;
 use crate::terminal::say;
 use anyhow::Result;
+use irradia_runs::read_recipe;
 use irradia_train::Recipe;
 use irradia_train::recipe::{BUILT_IN, Density, Exit, Group, Param, Represents, Stage};
 use irradia_train::report::columns;

@@ -1,14 +1,12 @@
 //! `irradia render`
 
-use super::{DataArgs, Split, file_stem, thread_count, use_threads};
+use super::{DataArgs, Split, thread_count, use_threads};
 use crate::Usage;
-use crate::run_folder::{cameras_beside, read_scene, render_knobs_beside, scene_of};
 use crate::terminal::say;
 use anyhow::{Context, Result};
-use glam::Vec3;
-use irradia_formats::write_png;
-use irradia_scene::{Camera, Image, Intrinsics, Pose};
-use irradia_splat::{RenderOptions, Renderer, Splats, init::focus_point};
+use irradia_runs::scene::{Camera, Image};
+use irradia_runs::{Scene, file_stem, write_image};
+use irradia_splat::Renderer;
 use std::path::PathBuf;
 
 #[derive(clap::Args)]
@@ -54,8 +52,8 @@ pub fn parse_size(text: &str) -> Result<(u32, u32), String> {
 
 pub fn run(args: &Args) -> Result<()> {
     use_threads(args.threads)?;
-    let scene = scene_of(&args.scene);
-    let (model, antialiased) = read_scene(&scene)?;
+    let mut scene = Scene::read(&args.scene)?;
+    scene.options.depth = args.depth;
     let cameras: Vec<(String, Camera)> = match (&args.data, args.orbit) {
         (Some(data), _) => {
             let dataset = args.reading.read(data)?;
@@ -66,12 +64,8 @@ pub fn run(args: &Args) -> Result<()> {
                 .collect()
         }
         (None, Some(frames)) => {
-            let cameras = orbit(model.splats(), cameras_beside(&scene), frames, args.size);
-            cameras
-                .into_iter()
-                .enumerate()
-                .map(|(i, camera)| (format!("frame_{i:04}"), camera))
-                .collect()
+            let cameras = scene.orbit(frames, args.size).into_iter().enumerate();
+            cameras.map(|(i, camera)| (format!("frame_{i:04}"), camera)).collect()
         }
         (None, None) => unreachable!("clap asks for one of them"),
     };
@@ -79,22 +73,13 @@ pub fn run(args: &Args) -> Result<()> {
         return Err(Usage("nothing to render: no such views".into()).into());
     }
     std::fs::create_dir_all(&args.out).with_context(|| format!("cannot make {}", args.out.display()))?;
-    let knobs = render_knobs_beside(&scene);
-    let options = RenderOptions {
-        background: knobs.background,
-        antialias: knobs.antialias || antialiased,
-        depth: args.depth,
-        ..RenderOptions::default()
-    };
     let mut renderer = Renderer::new();
     let mut depths = Vec::new();
     let write = |name: &str, what: &str, image: &Image| -> Result<()> {
-        let path = args.out.join(format!("{name}{what}.png"));
-        write_png(&path, image.width, image.height, image.channels, &image.to_u8())?;
-        Ok(())
+        Ok(write_image(args.out.join(format!("{name}{what}.png")), image)?)
     };
     for (name, camera) in &cameras {
-        let frame = model.render(&mut renderer, camera, &options);
+        let frame = scene.model.render(&mut renderer, camera, &scene.options);
         let image = frame.color;
         write(name, "", &image)?;
         let alpha = Image::new(image.width, image.height, 1, frame.alpha);
@@ -116,65 +101,4 @@ pub fn run(args: &Args) -> Result<()> {
         write(name, ".depth", &image)?;
     }
     say(format_args!("{} frames in {}", cameras.len(), args.out.display()))
-}
-
-/// A circle around what the training cameras looked at, at their mean distance and height; for a scene without them,
-/// around the middle of the splats.
-fn orbit(splats: Option<&Splats>, cameras: Option<Vec<Camera>>, frames: u32, size: Option<(u32, u32)>) -> Vec<Camera> {
-    let cameras = cameras.filter(|c| !c.is_empty());
-    let (center, up, radius, height, mut intrinsics) = match &cameras {
-        Some(cameras) => {
-            let center = focus_point(cameras);
-            let n = cameras.len() as f32;
-            let up = (cameras.iter().map(|c| c.pose.rotation * Vec3::NEG_Y).sum::<Vec3>() / n).normalize_or(Vec3::Z);
-            let height = cameras.iter().map(|c| (c.pose.position - center).dot(up)).sum::<f32>() / n;
-            let across = |c: &Camera| {
-                let offset = c.pose.position - center;
-                (offset - up * offset.dot(up)).length()
-            };
-            let radius = cameras.iter().map(across).sum::<f32>() / n;
-            (center, up, radius, height, cameras[0].intrinsics)
-        }
-        None => {
-            let middle = |c: usize| {
-                let plane = splats.map_or(&[][..], |splats| &splats.means.plane(c)[..splats.len()]);
-                let mut values: Vec<f32> = plane.iter().copied().filter(|v| v.is_finite()).collect();
-                values.sort_unstable_by(f32::total_cmp);
-                let at = |share: f32| {
-                    values
-                        .get((values.len() as f32 * share) as usize)
-                        .copied()
-                        .unwrap_or(0.0)
-                };
-                (at(0.5), at(0.9) - at(0.1))
-            };
-            let axes = [middle(0), middle(1), middle(2)];
-            let size = axes.iter().map(|a| a.1).fold(1e-3, f32::max);
-            // Most files of this kind come from COLMAP, whose y points down.
-            (
-                Vec3::from_array(axes.map(|a| a.0)),
-                Vec3::NEG_Y,
-                1.5 * size,
-                0.4 * size,
-                Intrinsics::from_fov_x(1280, 720, 1.0),
-            )
-        }
-    };
-    if let Some((width, height)) = size {
-        let fov_x = 2.0 * (0.5 * intrinsics.width as f32 / intrinsics.fx).atan();
-        intrinsics = Intrinsics::from_fov_x(width, height, fov_x);
-    }
-    // The circle starts where the first camera stood.
-    let toward = cameras
-        .as_ref()
-        .map_or(up.any_orthonormal_vector(), |c| c[0].pose.position - center);
-    let x = (toward - up * toward.dot(up)).normalize_or(up.any_orthonormal_vector());
-    let y = up.cross(x);
-    (0..frames)
-        .map(|i| {
-            let angle = std::f32::consts::TAU * i as f32 / frames as f32;
-            let eye = center + radius * (x * angle.cos() + y * angle.sin()) + up * height;
-            Camera::new(Pose::look_at(eye, center, up), intrinsics)
-        })
-        .collect()
 }

@@ -22,6 +22,9 @@ pub struct Evaluation {
     pub ssim: f64,
     /// Learned perceptual distance, 0 for equal images; `None` without weights or for images below [`Lpips::MIN_SIDE`].
     pub lpips: Option<f64>,
+    /// PSNR in dB over the right half of the view, after exposure or pose were fitted on its left half; `None` where that
+    /// was not asked for. [`evaluate`] leaves it so.
+    pub half_fit_psnr: Option<f64>,
 }
 
 /// All metrics of `render` against `truth`, both `[H, W, 3]`, both rounded to 8 bits first, as published numbers are.
@@ -41,6 +44,7 @@ pub fn evaluate(render: &Image, truth: &Image, mask: Option<&[u8]>, lpips: Optio
         psnr: psnr_masked(&render, &truth, mask),
         ssim: ssim_masked(&render, &truth, mask),
         lpips: lpips.and_then(|net| net.distance(&render, &truth).ok()),
+        half_fit_psnr: None,
     }
 }
 

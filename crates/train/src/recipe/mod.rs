@@ -18,20 +18,17 @@ pub use table::{Group, Param, Row};
 
 /// The recipes that come with the program: name and text.
 pub const BUILT_IN: [(&str, &str); 11] = [
-    ("classic", include_str!("../../../../recipes/classic.toml")),
-    ("absgrad", include_str!("../../../../recipes/absgrad.toml")),
-    ("mcmc", include_str!("../../../../recipes/mcmc.toml")),
-    ("taming", include_str!("../../../../recipes/taming.toml")),
-    ("fast", include_str!("../../../../recipes/fast.toml")),
-    ("curriculum", include_str!("../../../../recipes/curriculum.toml")),
-    (
-        "curriculum-paper",
-        include_str!("../../../../recipes/curriculum-paper.toml"),
-    ),
-    ("hashgrid", include_str!("../../../../recipes/hashgrid.toml")),
-    ("nerf", include_str!("../../../../recipes/nerf.toml")),
-    ("shiny", include_str!("../../../../recipes/shiny.toml")),
-    ("hybrid", include_str!("../../../../recipes/hybrid.toml")),
+    ("classic", include_str!("../../recipes/classic.toml")),
+    ("absgrad", include_str!("../../recipes/absgrad.toml")),
+    ("mcmc", include_str!("../../recipes/mcmc.toml")),
+    ("taming", include_str!("../../recipes/taming.toml")),
+    ("fast", include_str!("../../recipes/fast.toml")),
+    ("curriculum", include_str!("../../recipes/curriculum.toml")),
+    ("curriculum-paper", include_str!("../../recipes/curriculum-paper.toml")),
+    ("hashgrid", include_str!("../../recipes/hashgrid.toml")),
+    ("nerf", include_str!("../../recipes/nerf.toml")),
+    ("shiny", include_str!("../../recipes/shiny.toml")),
+    ("hybrid", include_str!("../../recipes/hybrid.toml")),
 ];
 
 /// Why a recipe was refused: one line that names the key.

@@ -1,5 +1,5 @@
-use super::shape::{Ray, Shape};
-use super::texture::Texture;
+use crate::shape::{Ray, Shape};
+use crate::texture::Texture;
 use glam::{Quat, Vec3};
 use std::f32::consts::FRAC_PI_2;
 
@@ -88,8 +88,6 @@ pub struct SynthScene {
     pub surroundings: Vec<Object>,
     /// Everything else.
     pub clusters: Vec<Cluster>,
-    /// Seed of the samples within pixels.
-    pub seed: u64,
 }
 
 /// A point of a surface that a ray meets first.
@@ -167,7 +165,7 @@ fn passes(ray: &Ray, (center, radius): (Vec3, f32), far: f32) -> bool {
 
 /// The demo scene: a round table on a terrace among hills, and on it a satin ball whose colour depends on where one
 /// stands, an armillary sphere and a lattice mast of thin parts, blocks and balls.
-pub fn scene() -> SynthScene {
+pub fn demo_scene() -> SynthScene {
     let object = |shape, material| Object { shape, material };
     SynthScene {
         surroundings: vec![
@@ -196,7 +194,6 @@ pub fn scene() -> SynthScene {
             Cluster::new([glazed_ball((1.42, 0.12, 0.20, Vec3::new(0.16, 0.24, 0.55)))]),
             Cluster::new([glazed_ball((-0.20, 0.42, 0.14, Vec3::new(0.72, 0.22, 0.20)))]),
         ],
-        seed: 0,
     }
 }
 
@@ -347,7 +344,7 @@ mod tests {
 
     #[test]
     fn straight_down_are_the_table_the_ball_and_the_ground() {
-        let scene = scene();
+        let scene = demo_scene();
         for (x, y, depth) in [(0.0, 0.0, 5.0), (-0.42, -0.38, 5.0 - 0.92), (3.0, 0.0, 6.45)] {
             let hit = scene.hit(&down_at(x, y), 1e-4).expect("met");
             assert!((hit.t - depth).abs() < 1e-4, "({x}, {y}): {} for {depth}", hit.t);
@@ -357,7 +354,7 @@ mod tests {
 
     #[test]
     fn every_ray_meets_something_and_the_bound_changes_nothing() {
-        let scene = scene();
+        let scene = demo_scene();
         let mut unbounded = scene.clone();
         for cluster in &mut unbounded.clusters {
             cluster.bound.1 = 1e3;

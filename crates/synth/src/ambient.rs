@@ -3,9 +3,9 @@
 //!
 //! Symbols: `n` the surface's normal, `w` the unit direction to a solid at distance `d`.
 
-use super::scene::{Hit, SynthScene};
-use super::shape::Shape;
-use super::texture::smooth;
+use crate::scene::{Hit, SynthScene};
+use crate::shape::Shape;
+use crate::texture::smooth;
 use glam::Vec3;
 
 /// Light of the upper half of the sky on a surface that faces up, linear RGB.
@@ -86,7 +86,7 @@ mod tests {
         for _ in 0..count {
             let (r2, angle) = (rng.uniform(), rng.range(0.0, std::f32::consts::TAU));
             let flat = glam::Vec2::from_angle(angle) * r2.sqrt();
-            let ray = super::super::shape::Ray {
+            let ray = crate::shape::Ray {
                 origin: point,
                 direction: flat.extend((1.0 - r2).sqrt()),
             };

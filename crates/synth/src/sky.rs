@@ -1,6 +1,6 @@
 //! The light that comes from far away: a low sun, a clear sky with thin clouds, three ranges of hills.
 
-use super::texture::{fbm, noise, smooth};
+use crate::texture::{fbm, noise, smooth};
 use glam::{Vec2, Vec3};
 
 /// Towards the sun, unit: an afternoon, 36 degrees up.

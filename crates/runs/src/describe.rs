@@ -1,11 +1,33 @@
-//! What a `field.safetensors` holds, for people.
+//! What a file or folder is, for people.
 
+use crate::RunError;
+use crate::folder::RESIDUAL;
+use crate::scene_file::{is_field, read_field, residual_beside, scene_of};
 use irradia_field::encoding::PositionEncoding;
 use irradia_field::{Field, Outside, Sampler};
 use irradia_formats::Description;
+use std::path::Path;
+
+/// A summary of the scene, run, dataset or point cloud at `path`.
+///
+/// # Errors
+/// When it does not exist, cannot be read, or is none of these.
+pub fn describe(path: impl AsRef<Path>) -> Result<Description, RunError> {
+    let scene = scene_of(path.as_ref());
+    if is_field(&scene) {
+        let bytes = std::fs::metadata(&scene).map_or(0, |file| file.len());
+        return Ok(describe_field(&read_field(&scene)?, bytes));
+    }
+    let mut description = irradia_formats::describe(&scene)?;
+    if let Some(field) = residual_beside(&scene)? {
+        let adds = format!("{RESIDUAL}, {} parameters", field.len());
+        description.facts.push(("reflections", adds));
+    }
+    Ok(description)
+}
 
 /// A summary of `field`, whose file has `bytes`.
-pub fn describe_field(field: &Field, bytes: u64) -> Description {
+fn describe_field(field: &Field, bytes: u64) -> Description {
     let config = &field.config;
     let net = &config.net;
     let encoding = match &net.encoding {

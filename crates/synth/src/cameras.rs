@@ -25,6 +25,9 @@ pub enum Part {
 }
 
 impl Part {
+    /// In the order of tracing.
+    pub const ALL: [Part; 3] = [Part::Train, Part::Val, Part::Test];
+
     /// As the files are named.
     pub fn name(self) -> &'static str {
         match self {
@@ -93,9 +96,9 @@ mod tests {
 
     #[test]
     fn nothing_is_close_to_a_lens() {
-        let scene = super::super::scene::scene();
+        let scene = crate::demo_scene();
         for camera in cameras(Part::Train, 40, 8, 8, 3) {
-            let frame = scene.trace(&camera, 1);
+            let frame = scene.trace(&camera, 1, 0);
             assert!(frame.depth.data.iter().all(|depth| *depth > 0.5));
         }
     }

@@ -55,7 +55,7 @@ impl Texture {
                 color * (0.75 + 0.5 * grain)
             }
             Texture::Meadow => meadow(local.truncate()),
-            Texture::Sky => super::sky::radiance(local.normalize()),
+            Texture::Sky => crate::sky::radiance(local.normalize()),
         }
     }
 }

@@ -1,11 +1,11 @@
 //! From a camera to a picture: a ray a sample, a ray to the sun, and one in the mirror's direction where the surface
 //! shines. The light of the sky is worked out without rays (`ambient`): sampled, it would be the noise of the picture.
 
-use super::ambient;
-use super::scene::{Hit, SynthScene};
-use super::shape::Ray;
-use super::sky;
-use super::texture::Texture;
+use crate::ambient;
+use crate::scene::{Hit, SynthScene};
+use crate::shape::Ray;
+use crate::sky;
+use crate::texture::Texture;
 use glam::{Vec2, Vec3};
 use irradia_scene::{Camera, Image, Rng};
 use rayon::prelude::*;
@@ -34,11 +34,19 @@ pub struct SynthFrame {
     pub normals: Image,
 }
 
+impl SynthFrame {
+    /// The picture as 8 bits, `[H, W, 4]`, opaque.
+    pub fn rgba(&self) -> Vec<u8> {
+        let rgb = self.color.to_u8();
+        rgb.chunks_exact(3).flat_map(|p| [p[0], p[1], p[2], 255]).collect()
+    }
+}
+
 impl SynthScene {
-    /// Traces the scene with up to `samples` samples a pixel (rounded up to a square number).
+    /// Traces the scene with up to `samples` samples a pixel (rounded up to a square number), placed by `seed`.
     ///
-    /// The same scene, camera and number give the same bits on any number of threads.
-    pub fn trace(&self, camera: &Camera, samples: u32) -> SynthFrame {
+    /// The same scene, camera, number and seed give the same bits on any number of threads.
+    pub fn trace(&self, camera: &Camera, samples: u32, seed: u64) -> SynthFrame {
         let (width, height) = (camera.intrinsics.width, camera.intrinsics.height);
         let side = (1..).find(|n| n * n >= samples).expect("some square is large enough");
         let mut frame = SynthFrame {
@@ -57,7 +65,7 @@ impl SynthScene {
             .enumerate()
             .for_each(|(y, ((color, depth), normals))| {
                 for x in 0..row {
-                    let mut rng = Rng::new(self.seed, (y * row + x) as u64);
+                    let mut rng = Rng::new(seed, (y * row + x) as u64);
                     let corner = Vec2::new(x as f32, y as f32);
                     color[3 * x..3 * x + 3].copy_from_slice(&self.pixel(camera, corner, side, &mut rng).to_array());
                     let ray = pixel_ray(camera, corner + 0.5);
@@ -231,8 +239,8 @@ fn develop(linear: Vec3) -> Vec3 {
 
 #[cfg(test)]
 mod tests {
-    use super::super::scene::scene;
     use super::*;
+    use crate::demo_scene;
     use irradia_scene::{Intrinsics, Pose};
 
     fn camera(size: u32) -> Camera {
@@ -248,15 +256,15 @@ mod tests {
             Pose::look_at(Vec3::new(0.1, 0.0, 4.0), Vec3::new(0.1, 0.0, 0.0), Vec3::Y),
             Intrinsics::from_fov_x(33, 33, 0.05),
         );
-        let frame = scene().trace(&camera, 1);
+        let frame = demo_scene().trace(&camera, 1, 0);
         assert!(frame.depth.data.iter().all(|depth| (depth - 4.0).abs() < 1e-4));
         assert!((Vec3::from_slice(frame.normals.pixel(16, 16)) - Vec3::Z).length() < 1e-5);
     }
 
     #[test]
     fn depth_unprojects_to_the_point_that_was_hit_and_normals_face_the_camera() {
-        let (scene, camera) = (scene(), camera(48));
-        let frame = scene.trace(&camera, 1);
+        let (scene, camera) = (demo_scene(), camera(48));
+        let frame = scene.trace(&camera, 1, 0);
         for y in 0..48 {
             for x in 0..48 {
                 let pixel = Vec2::new(x as f32 + 0.5, y as f32 + 0.5);
@@ -276,29 +284,28 @@ mod tests {
         let center = Vec3::new(-0.42, -0.38, 0.46);
         let eye = Vec3::new(-2.5, -3.0, 1.6);
         let camera = Camera::new(Pose::look_at(eye, center, Vec3::Z), Intrinsics::from_fov_x(31, 31, 0.1));
-        let frame = scene().trace(&camera, 1);
+        let frame = demo_scene().trace(&camera, 1, 0);
         let expected = (eye - center).length() - 0.46;
         assert!((frame.depth.pixel(15, 15)[0] - expected).abs() < 1e-4);
     }
 
     #[test]
     fn equal_seeds_give_equal_bits_on_any_number_of_threads_and_unequal_ones_do_not() {
-        let mut scene = scene();
+        let scene = demo_scene();
         let one = rayon::ThreadPoolBuilder::new().num_threads(1).build().expect("pool");
-        let first = one.install(|| scene.trace(&camera(24), 4));
-        assert_eq!(first, scene.trace(&camera(24), 4));
+        let first = one.install(|| scene.trace(&camera(24), 4, 0));
+        assert_eq!(first, scene.trace(&camera(24), 4, 0));
         assert!(first.color.data.iter().all(|v| (0.0..=1.0).contains(v)));
-        scene.seed = 1;
-        let second = scene.trace(&camera(24), 4);
+        let second = scene.trace(&camera(24), 4, 1);
         assert!(first.color != second.color && first.depth == second.depth);
     }
 
     #[test]
     fn the_ball_changes_its_colour_with_the_viewpoint_and_the_ground_does_not() {
-        let scene = scene();
+        let scene = demo_scene();
         let seen = |target: Vec3, offset: Vec3| {
             let pose = Pose::look_at(target + offset, target, Vec3::Z);
-            let frame = scene.trace(&Camera::new(pose, Intrinsics::from_fov_x(1, 1, 0.01)), 1024);
+            let frame = scene.trace(&Camera::new(pose, Intrinsics::from_fov_x(1, 1, 0.01)), 1024, 0);
             Vec3::from_slice(frame.color.pixel(0, 0))
         };
         let difference = |target: Vec3| {

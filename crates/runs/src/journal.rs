@@ -1,13 +1,12 @@
 //! What a run writes while it goes: `events.jsonl`, checkpoints, and the curves for its report.
 
-use crate::run_folder::RunFolder;
-use crate::terminal::note;
-use anyhow::{Context, Result};
+use crate::{RunError, RunFolder};
 use irradia_train::event::{Event, Observer, Signal};
 use irradia_train::report::{CurvePoint, StageReport};
 use irradia_train::{Trainer, checkpoint};
 use std::fs::{self, File, OpenOptions};
 use std::io::Write;
+use std::path::Path;
 
 /// Points that a curve has, about: more would not be seen.
 const CURVE_POINTS: u64 = 1000;
@@ -22,26 +21,34 @@ pub struct Journal {
     pub stages: Vec<StageReport>,
     /// Lines that should reach the report.
     pub warnings: Vec<String>,
+    /// When the present stage began, seconds of training.
+    stage_start: f64,
     non_finite: usize,
     failed: bool,
+    /// What [`Observer::warning`] is to tell.
+    warning: Option<String>,
+}
+
+/// `events.jsonl`, to be written behind what it holds.
+fn appended(path: &Path) -> Result<File, RunError> {
+    let file = OpenOptions::new().create(true).append(true).open(path);
+    file.map_err(RunError::io("write", path))
 }
 
 impl Journal {
     /// Begins, or goes on behind step `from`: what an interrupted run had written beyond is dropped.
-    pub fn open(folder: &RunFolder, from: u64) -> Result<Self> {
+    pub fn open(folder: &RunFolder, from: u64) -> Result<Self, RunError> {
         let path = folder.file("events.jsonl");
         let mut journal = Self {
             folder: folder.clone(),
-            events: OpenOptions::new()
-                .create(true)
-                .append(true)
-                .open(&path)
-                .with_context(|| format!("cannot write {}", path.display()))?,
+            events: appended(&path)?,
             curve: Vec::new(),
             stages: Vec::new(),
             warnings: Vec::new(),
+            stage_start: 0.0,
             non_finite: 0,
             failed: false,
+            warning: None,
         };
         let text = fs::read_to_string(&path).unwrap_or_default();
         let mut kept = String::new();
@@ -59,10 +66,7 @@ impl Journal {
         }
         if kept.len() < text.len() {
             folder.write("events.jsonl", kept.as_bytes())?;
-            journal.events = OpenOptions::new()
-                .append(true)
-                .open(&path)
-                .with_context(|| format!("cannot write {}", path.display()))?;
+            journal.events = appended(&path)?;
         }
         Ok(journal)
     }
@@ -110,15 +114,15 @@ impl Journal {
             name,
             first_step: step + 1,
             last_step: step + 1,
-            seconds,
+            seconds: 0.0,
         });
+        self.stage_start = seconds;
     }
 
-    /// A stage's `seconds` holds its start until it ends.
     fn end_stage(&mut self, step: u64, seconds: f64) {
         if let Some(last) = self.stages.last_mut() {
             last.last_step = step;
-            last.seconds = seconds - last.seconds;
+            last.seconds = seconds - self.stage_start;
         }
     }
 
@@ -129,23 +133,18 @@ impl Journal {
         {
             // A full disk must not end the training; one word about it is enough.
             self.failed = true;
-            let message = format!(
-                "cannot write {}: {error}; training goes on",
-                self.folder.file("events.jsonl").display()
-            );
-            note(format_args!("warning: {message}"));
-            self.warnings.push(message);
+            let path = self.folder.file("events.jsonl");
+            self.warning = Some(format!("cannot write {}: {error}; training goes on", path.display()));
         }
     }
 
-    /// The last words about what was counted.
-    pub fn finish(&mut self) {
-        if self.non_finite > 0 {
-            self.warnings.push(format!(
-                "{} times a splat rested for a step because its gradient was not finite",
-                self.non_finite
-            ));
-        }
+    /// All warnings, with what was counted.
+    pub fn all_warnings(&self) -> Vec<String> {
+        let counted = (self.non_finite > 0).then(|| {
+            let times = self.non_finite;
+            format!("{times} times a splat rested for a step because its gradient was not finite")
+        });
+        self.warnings.iter().cloned().chain(counted).collect()
     }
 }
 
@@ -176,7 +175,11 @@ impl Observer for Journal {
             Event::StageEntered { stage, step, seconds } => self.stage(stage.clone(), *step, *seconds),
             Event::Finished { step, seconds, .. } => self.end_stage(*step, *seconds),
             Event::Warned { message } => self.warnings.push(message.clone()),
-            Event::Started { .. } | Event::Densified { .. } | Event::Saved { .. } => {}
+            Event::Started { .. }
+            | Event::Densified { .. }
+            | Event::Saved { .. }
+            | Event::Paused { .. }
+            | Event::Resumed { .. } => {}
         }
         self.write(event);
         Signal::Continue
@@ -187,6 +190,22 @@ impl Observer for Journal {
         self.folder
             .write_checkpoint(trainer.clock.step, &bytes)
             .map(Some)
-            .map_err(|e| format!("no checkpoint: {e:#}"))
+            .map_err(|e| format!("no checkpoint: {e}"))
     }
+
+    fn warning(&mut self) -> Option<String> {
+        self.warning.take()
+    }
+}
+
+/// Mean squared errors of the training views that the run in `folder` logged, step by step; none where it left no log.
+pub fn logged_errors(folder: &Path) -> Vec<f64> {
+    let text = fs::read_to_string(folder.join("events.jsonl")).unwrap_or_default();
+    let events = text
+        .lines()
+        .filter_map(|line| serde_json::from_str::<serde_json::Value>(line).ok());
+    events
+        .filter(|event| event["event"] == "step")
+        .filter_map(|event| event["mse"].as_f64())
+        .collect()
 }

@@ -1,0 +1,79 @@
+//! Irradia as a library: photographs in, a scene that can be rendered out. **Begin here**; one import does it:
+//!
+//! ```
+//! # let folder = tempfile::tempdir().unwrap();
+//! # let here = |name: &str| folder.path().join(name);
+//! use irradia_runs::prelude::*;
+//!
+//! // A small dataset to try it on; any folder of posed photographs does.
+//! write_synth_dataset(here("photos"), &SynthOptions { views: 4, width: 24, height: 16, seed: 0 })?;
+//!
+//! // Train ..
+//! let mut run = Run::begin(TrainInput { steps: Some(5), ..TrainInput::new(here("photos"), here("run")) }.check()?)?;
+//! run.train(&mut [])?;
+//! println!("held-out PSNR {:.2} dB", run.finish()?.report.psnr);
+//!
+//! // .. and render, this run or any splat PLY.
+//! let scene = Scene::read(here("run"))?;
+//! write_image(here("frame.png"), &scene.render(&scene.orbit(60, None)[0]).color)?;
+//! # Ok::<(), RunError>(())
+//! ```
+//!
+//! | to | begin with |
+//! |---|---|
+//! | train on a folder | [`TrainInput`], which becomes a validated [`TrainRequest`]; [`Run::begin`] |
+//! | train on a dataset in memory | [`Run::begin_on`] |
+//! | go on with an interrupted run | [`TrainInput::of_run`], [`Run::resume`] |
+//! | show progress, pause, save or stop | an [`Observer`](train::event::Observer) given to [`Run::train`] |
+//! | see a training from another thread | [`Run::snapshots`] |
+//! | read and render a scene | [`Scene`] |
+//! | measure a scene against photographs | [`evaluate`] |
+//! | say what a file or folder is | [`describe`] |
+//!
+//! Nothing here prints: warnings are returned, or told to observers. Random numbers come from the request's seed alone, and
+//! the number of threads (rayon's global pool) does not change a byte of a scene.
+//!
+//! The crates below are re-exported by their short names. [`train`] has the recipes, the schedule and the training step,
+//! [`scene`] the plain types and their conventions.
+#![forbid(unsafe_code)]
+
+mod describe;
+mod error;
+mod evaluate;
+mod folder;
+mod journal;
+mod orbit;
+mod request;
+mod results;
+mod run;
+mod scene_file;
+mod snapshot;
+mod synth_files;
+
+pub use describe::describe;
+pub use error::RunError;
+pub use evaluate::{evaluate, file_stem};
+pub use folder::{FIELD, RESIDUAL, RunFolder, RunRecord, SCENE};
+pub use irradia_formats as formats;
+pub use irradia_scene as scene;
+pub use irradia_synth as synth;
+pub use irradia_train as train;
+pub use journal::logged_errors;
+pub use request::{DEFAULT_RECIPE, Reading, TrainInput, TrainRequest, read_recipe};
+pub use results::write_image;
+pub use run::{Finished, Run};
+pub use scene_file::{Scene, scene_of};
+pub use snapshot::{Snapshot, Snapshots};
+pub use synth_files::{SynthSummary, write_synth_dataset};
+
+/// All that a program which trains or renders names.
+pub mod prelude {
+    pub use crate::scene::{Camera, Dataset, Image, Intrinsics, Pose};
+    pub use crate::synth::SynthOptions;
+    pub use crate::train::event::{Event, Observer, Signal};
+    pub use crate::train::{Recipe, Trainer};
+    pub use crate::{
+        Finished, Reading, Run, RunError, RunFolder, Scene, Snapshot, Snapshots, TrainInput, TrainRequest, describe,
+        evaluate, write_image, write_synth_dataset,
+    };
+}

@@ -1,0 +1,271 @@
+//! What a training is asked for: raw input, and the validated request.
+
+use crate::{RunError, RunFolder};
+use irradia_formats::{DatasetFormat, DatasetOptions, read_dataset};
+use irradia_scene::Dataset;
+use irradia_train::recipe::Param;
+use irradia_train::schedule::{Moment, outline};
+use irradia_train::{Recipe, RunLimits};
+use serde::{Deserialize, Serialize};
+use std::fmt::Display;
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+/// The recipe of a request that names none: the best for its time on all scenes of RESULTS.md.
+pub const DEFAULT_RECIPE: &str = "fast";
+
+/// How a dataset is read, unchecked.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Reading {
+    /// `colmap`, `nerfstudio`, `blender` or `llff`; recognised from the folder when `None`.
+    #[serde(default)]
+    pub format: Option<String>,
+    /// The images' sides are divided by this; 1 or more.
+    pub downscale: f32,
+    /// The longer side of an image has at most this many pixels; at least 1, and not together with `downscale`.
+    #[serde(default)]
+    pub max_side: Option<u32>,
+}
+
+impl Default for Reading {
+    /// Any format, full size.
+    fn default() -> Self {
+        Self {
+            format: None,
+            downscale: 1.0,
+            max_side: None,
+        }
+    }
+}
+
+impl Reading {
+    /// The validated options.
+    ///
+    /// # Errors
+    /// [`RunError::Setting`] for a value out of range.
+    pub fn check(&self) -> Result<DatasetOptions, RunError> {
+        let format: Option<DatasetFormat> = match &self.format {
+            Some(name) => Some(
+                name.parse()
+                    .map_err(|e| RunError::setting("format", name, format!("{e}")))?,
+            ),
+            None => None,
+        };
+        if !self.downscale.is_finite() || self.downscale < 1.0 {
+            return Err(RunError::setting("downscale", self.downscale, "give 1 or more"));
+        }
+        if self.max_side == Some(0) {
+            return Err(RunError::setting("max_side", 0, "give 1 or more"));
+        }
+        if let Some(side) = self.max_side.filter(|_| self.downscale != 1.0) {
+            return Err(RunError::setting("max_side", side, "give it or downscale, not both"));
+        }
+        Ok(DatasetOptions {
+            format,
+            downscale: self.downscale,
+            max_side: self.max_side,
+        })
+    }
+
+    /// Reads the dataset at `path`; its `warnings` are for the caller to show.
+    ///
+    /// # Errors
+    /// When a value is out of range, or `path` holds no dataset.
+    pub fn read(&self, path: &Path) -> Result<Dataset, RunError> {
+        Ok(read_dataset(path, &self.check()?)?)
+    }
+}
+
+/// What a training is asked for, unchecked; `run.json` keeps it. A new option is a field here, with its bounds in
+/// [`TrainInput::check`].
+///
+/// ```
+/// use irradia_runs::TrainInput;
+///
+/// let input = TrainInput { steps: Some(2000), ..TrainInput::new("photos", "run") };
+/// assert_eq!(input.clone().check()?.recipe().name, "fast");
+///
+/// let nonsense = TrainInput { steps: Some(0), ..input };
+/// assert_eq!(nonsense.check().unwrap_err().to_string(), "steps 0: give 1 or more");
+/// # Ok::<(), irradia_runs::RunError>(())
+/// ```
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct TrainInput {
+    /// The dataset's folder.
+    pub data: PathBuf,
+    /// The run's folder.
+    #[serde(skip)]
+    pub out: PathBuf,
+    /// A built-in recipe, or a `.toml` file.
+    #[serde(default = "default_recipe")]
+    pub recipe: String,
+    /// Changes to the recipe, each `key=value`.
+    #[serde(default)]
+    pub set: Vec<String>,
+    /// Most splats; the recipe's own limit when `None`.
+    #[serde(default)]
+    pub max_splats: Option<usize>,
+    /// Steps into which the recipe is fitted; its own number when `None`.
+    pub steps: Option<u64>,
+    /// Seconds of training into which the recipe is fitted; not together with `steps`.
+    pub budget: Option<f64>,
+    /// Held-out PSNR at which to stop, dB.
+    pub until_psnr: Option<f64>,
+    /// Random seed.
+    pub seed: u64,
+    /// Weights of LPIPS. Without them a recipe's perceptual loss is skipped and reports have no LPIPS.
+    #[serde(default)]
+    pub lpips: Option<PathBuf>,
+    /// How the dataset is read.
+    #[serde(flatten)]
+    pub reading: Reading,
+    /// Whether a run that `out` holds is replaced.
+    #[serde(skip)]
+    pub overwrite: bool,
+}
+
+fn default_recipe() -> String {
+    DEFAULT_RECIPE.into()
+}
+
+impl TrainInput {
+    /// Trains on the dataset in `data` by the default recipe and writes the run to `out`.
+    pub fn new(data: impl Into<PathBuf>, out: impl Into<PathBuf>) -> Self {
+        Self {
+            data: data.into(),
+            out: out.into(),
+            recipe: default_recipe(),
+            set: Vec::new(),
+            max_splats: None,
+            steps: None,
+            budget: None,
+            until_psnr: None,
+            seed: 0,
+            lpips: None,
+            reading: Reading::default(),
+            overwrite: false,
+        }
+    }
+
+    /// What the run in the folder `out` was asked for, to resume it: its recipe is the resolved one that it holds. The
+    /// dataset, limits and weights may be changed before [`TrainInput::check`].
+    ///
+    /// # Errors
+    /// When the folder holds no run, or its `run.json` is damaged.
+    pub fn of_run(out: impl AsRef<Path>) -> Result<Self, RunError> {
+        let out = out.as_ref();
+        let (folder, record) = RunFolder::open(out)?;
+        let mut input = record.input;
+        input.out = out.to_owned();
+        input.recipe = folder.file("recipe.toml").display().to_string();
+        input.set.clear();
+        input.max_splats = None;
+        if input.budget.is_some() {
+            // A run may be given a budget when it is resumed; it then replaces the steps.
+            input.steps = None;
+        }
+        Ok(input)
+    }
+
+    /// The validated request: every setting in its range, the recipe read and resolved. The dataset and the run's folder
+    /// are not touched.
+    ///
+    /// # Errors
+    /// [`RunError::Setting`] or [`RunError::Recipe`], for the first setting that is out of range.
+    pub fn check(mut self) -> Result<TrainRequest, RunError> {
+        let started = Instant::now();
+        at_least_one("steps", self.steps)?;
+        at_least_one("max_splats", self.max_splats)?;
+        if let Some(seconds) = self.budget.filter(|seconds| !(*seconds > 0.0 && seconds.is_finite())) {
+            return Err(RunError::setting("budget", seconds, "give seconds, more than 0"));
+        }
+        if let (Some(steps), Some(_)) = (self.steps, self.budget) {
+            return Err(RunError::setting("steps", steps, "give steps or a budget, not both"));
+        }
+        if let Some(psnr) = self.until_psnr.filter(|psnr| !psnr.is_finite()) {
+            return Err(RunError::setting("until_psnr", psnr, "give a number of dB"));
+        }
+        let reading = self.reading.check()?;
+        let mut overrides = self.set.clone();
+        overrides.extend(self.max_splats.map(|n| format!("max_splats={n}")));
+        let recipe = read_recipe(&self.recipe, &overrides)?;
+        self.data = std::path::absolute(&self.data).unwrap_or(self.data);
+        Ok(TrainRequest {
+            input: self,
+            recipe,
+            reading,
+            started,
+        })
+    }
+}
+
+fn at_least_one<N: PartialOrd + From<u8> + Display>(name: &'static str, value: Option<N>) -> Result<(), RunError> {
+    match value {
+        Some(value) if value < N::from(1) => Err(RunError::setting(name, value, "give 1 or more")),
+        _ => Ok(()),
+    }
+}
+
+/// The built-in recipe or `.toml` file `name`, changed by `overrides`, each `key=value`.
+///
+/// # Errors
+/// [`RunError::Recipe`]; a file that cannot be read is [`RunError::Refused`].
+pub fn read_recipe(name: &str, overrides: &[String]) -> Result<Recipe, RunError> {
+    let text = if name.ends_with(".toml") {
+        std::fs::read_to_string(name).map_err(|e| RunError::Refused(format!("cannot read recipe {name}: {e}")))?
+    } else {
+        Recipe::built_in(name)?.to_owned()
+    };
+    Ok(Recipe::parse(name, &text, overrides)?)
+}
+
+/// A validated request, made by [`TrainInput::check`]; one request is one run.
+#[derive(Debug)]
+pub struct TrainRequest {
+    pub(crate) input: TrainInput,
+    pub(crate) recipe: Recipe,
+    reading: DatasetOptions,
+    /// A report's `total_seconds` counts from here.
+    pub(crate) started: Instant,
+}
+
+impl TrainRequest {
+    /// What was asked for; its dataset's path is absolute.
+    pub fn input(&self) -> &TrainInput {
+        &self.input
+    }
+
+    /// The recipe, resolved.
+    pub fn recipe(&self) -> &Recipe {
+        &self.recipe
+    }
+
+    /// Reads the dataset; its `warnings` are for the caller to show.
+    ///
+    /// # Errors
+    /// When the folder holds no dataset that can be trained on.
+    pub fn read_dataset(&self) -> Result<Dataset, RunError> {
+        Ok(read_dataset(&self.input.data, &self.reading)?)
+    }
+
+    /// What of the request cannot be followed, one line each.
+    pub fn warnings(&self) -> Vec<String> {
+        let weighs = |moment: &Moment| moment.values[Param::PerceptualWeight] > 0.0;
+        let missing = self.input.lpips.is_none() && outline(&self.recipe, 1000).iter().any(weighs);
+        let line = || {
+            format!(
+                "recipe {} is trained without its perceptual loss, for no weights of LPIPS were found: give \
+                 lpips_squeeze.safetensors with --lpips FILE or name it in IRRADIA_LPIPS",
+                self.recipe.name
+            )
+        };
+        missing.then(line).into_iter().collect()
+    }
+
+    pub(crate) fn limits(&self) -> RunLimits {
+        RunLimits {
+            until_psnr: self.input.until_psnr,
+            budget: self.input.budget,
+        }
+    }
+}

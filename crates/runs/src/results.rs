@@ -1,0 +1,139 @@
+//! What a run leaves when it is finished: its scene, the held-out views, and the report.
+
+use crate::folder::{FIELD, SCENE, to_json};
+use crate::{Run, RunError, RunFolder, evaluate, file_stem};
+use irradia_compute::Level;
+use irradia_formats::{write_png, write_splats};
+use irradia_scene::{Image, sh};
+use irradia_train::eval::{EvalOptions, EvaluatedView, Metrics};
+use irradia_train::field_file;
+use irradia_train::model::Model;
+use irradia_train::report::{Report, ViewReport, machine, peak_rss_bytes, schedule, to_html};
+use std::path::Path;
+
+impl Run {
+    /// Writes the splats with what was trained beside them, or the field.
+    pub(crate) fn write_scene(&self) -> Result<(), RunError> {
+        let folder = &self.folder;
+        match self.trainer.scene() {
+            Model::Splats { splats, .. } => {
+                let mut cloud = splats.to_cloud();
+                cloud.antialiased = self.trainer.recipe.render.antialias;
+                write_splats(&folder.file(SCENE), &cloud)?;
+                for (name, bytes) in self.trainer.sockets.files() {
+                    folder.write(&name, &bytes)?;
+                }
+                folder.write_cameras(&self.trainer)?;
+            }
+            Model::Field(field) => folder.write(FIELD, &field_file::to_bytes(&field))?,
+        }
+        Ok(())
+    }
+
+    /// Measures the held-out views, writes their pictures, and sums up the run.
+    pub(crate) fn report(&self) -> Result<Report, RunError> {
+        let (trainer, input, journal) = (&self.trainer, &self.request.input, &self.journal);
+        let mut views = Vec::new();
+        let mean = evaluate(
+            &trainer.scene(),
+            &trainer.dataset,
+            &trainer.dataset.test,
+            &EvalOptions {
+                render: trainer.render_options(sh::MAX_DEGREE),
+                metrics: Metrics::All(trainer.options.lpips.as_deref()),
+                half_fit: trainer.half_fit(),
+            },
+            |view| {
+                views.push(write_view(&self.folder, view)?);
+                Ok::<(), RunError>(())
+            },
+        )?;
+        Ok(Report {
+            version: env!("CARGO_PKG_VERSION").to_owned(),
+            device: format!(
+                "CPU, {} threads, {}",
+                rayon::current_num_threads(),
+                Level::detect().name()
+            ),
+            dataset: input.data.display().to_string(),
+            recipe: trainer.recipe.name.clone(),
+            recipe_hash: trainer.recipe.hash(),
+            recipe_toml: trainer.recipe.to_toml(),
+            seed: trainer.options.seed,
+            steps: trainer.clock.step,
+            seconds: trainer.seconds,
+            cpu_seconds: trainer.cpu_seconds,
+            total_seconds: self.request.started.elapsed().as_secs_f64(),
+            splats: trainer.engine.len() as u64,
+            parameters: trainer.parameters().map(|n| n as u64),
+            peak_rss_bytes: peak_rss_bytes(),
+            psnr: mean.psnr,
+            ssim: mean.ssim,
+            lpips: mean.lpips,
+            half_fit_psnr: mean.half_fit_psnr,
+            views,
+            schedule: schedule(
+                &trainer.recipe,
+                &journal.stages,
+                &trainer.clock,
+                input.steps,
+                input.budget.is_some(),
+            ),
+            stages: journal.stages.clone(),
+            curve: journal.curve.clone(),
+            machine: machine(),
+            warnings: journal.all_warnings(),
+        })
+    }
+
+    /// Writes `report.json` and `report.html`.
+    pub(crate) fn write_report(&self, report: &Report) -> Result<(), RunError> {
+        self.folder.write("report.json", &to_json(report))?;
+        self.folder.write("report.html", to_html(report).as_bytes())
+    }
+}
+
+/// Writes `image`, sRGB in \[0, 1\] with 1, 3 or 4 channels, as an 8-bit PNG, whole or not at all.
+///
+/// # Errors
+/// When the file cannot be written.
+pub fn write_image(path: impl AsRef<Path>, image: &Image) -> Result<(), RunError> {
+    let path = path.as_ref();
+    Ok(write_png(
+        path,
+        image.width,
+        image.height,
+        image.channels,
+        &image.to_u8(),
+    )?)
+}
+
+/// Writes truth, render and error of a held-out view under `eval/`.
+fn write_view(folder: &RunFolder, view: &EvaluatedView) -> Result<ViewReport, RunError> {
+    let stem = file_stem(&view.name);
+    let path = |what: &str| format!("eval/{stem}.{what}.png");
+    let write = |what: &str, image: &Image| -> Result<String, RunError> {
+        write_image(folder.file(&path(what)), image)?;
+        Ok(path(what))
+    };
+    Ok(ViewReport {
+        name: view.name.clone(),
+        psnr: view.metrics.psnr,
+        ssim: view.metrics.ssim,
+        lpips: view.metrics.lpips,
+        half_fit_psnr: view.metrics.half_fit_psnr,
+        truth: write("truth", &view.truth)?,
+        render: write("render", &view.render)?,
+        error: write("error", &error_image(view))?,
+    })
+}
+
+/// Absolute difference, four times enlarged so that a difference of a quarter is white; black where a mask says that the
+/// pixel does not count.
+fn error_image(view: &EvaluatedView) -> Image {
+    let (truth, render) = (&view.truth, &view.render);
+    let counts = |pixel: usize| view.mask.as_ref().is_none_or(|mask| mask[pixel] != 0);
+    let error = |(i, (t, r)): (usize, (&f32, &f32))| if counts(i / 3) { 4.0 * (t - r).abs() } else { 0.0 };
+    let data = truth.data.iter().zip(&render.data).enumerate().map(error).collect();
+    Image::new(truth.width, truth.height, 3, data)
+}

@@ -1,0 +1,210 @@
+//! A training with its folder: begin or resume, train, finish.
+
+use crate::folder::RunRecord;
+use crate::journal::Journal;
+use crate::snapshot::{SnapshotServer, Snapshots};
+use crate::{RunError, RunFolder, TrainRequest};
+use irradia_measure::Lpips;
+use irradia_scene::Dataset;
+use irradia_train::event::Observer;
+use irradia_train::report::Report;
+use irradia_train::{TrainOptions, Trainer, checkpoint};
+use std::fs;
+use std::path::Path;
+use std::sync::Arc;
+
+/// A training with its folder. [`Run::train`] makes the steps, [`Run::finish`] writes the scene and the report.
+///
+/// ```
+/// # let folder = tempfile::tempdir().unwrap();
+/// # let (photos, run) = (folder.path().join("photos"), folder.path().join("run"));
+/// # let options = SynthOptions { views: 4, width: 24, height: 16, seed: 0 };
+/// # write_synth_dataset(&photos, &options)?;
+/// use irradia_runs::prelude::*;
+///
+/// let request = TrainInput { steps: Some(5), ..TrainInput::new(photos, run) }.check()?;
+/// let mut run = Run::begin(request)?;
+/// run.train(&mut [])?;
+/// let report = run.finish()?.report;
+/// assert!(report.psnr > 5.0 && report.steps == 5);
+/// # Ok::<(), RunError>(())
+/// ```
+///
+/// What watches or steers a training is an [`Observer`]; another thread sees its newest state through
+/// [`Run::snapshots`].
+pub struct Run {
+    pub(crate) folder: RunFolder,
+    pub(crate) request: TrainRequest,
+    pub(crate) trainer: Trainer,
+    pub(crate) journal: Journal,
+    snapshots: SnapshotServer,
+}
+
+/// How a run ended.
+#[derive(Clone, Debug)]
+pub struct Finished {
+    /// Where everything lies.
+    pub folder: RunFolder,
+    /// What `report.json` holds.
+    pub report: Report,
+    /// Whether the recipe was followed to its end; otherwise the run can be resumed.
+    pub complete: bool,
+}
+
+impl Run {
+    /// Begins a run in a folder of its own.
+    ///
+    /// # Errors
+    /// When the folder holds a run that the request does not replace, or the dataset cannot be trained on. Nothing is
+    /// written then.
+    pub fn begin(request: TrainRequest) -> Result<Self, RunError> {
+        RunFolder::check_free(&request.input.out, request.input.overwrite)?;
+        let dataset = request.read_dataset()?;
+        Self::begin_on(request, dataset)
+    }
+
+    /// Begins a run on a dataset that is in memory. It can be resumed by [`Run::resume_on`] with the same dataset.
+    ///
+    /// # Errors
+    /// Those of [`Run::begin`].
+    pub fn begin_on(request: TrainRequest, dataset: Dataset) -> Result<Self, RunError> {
+        let out = &request.input.out;
+        RunFolder::check_free(out, request.input.overwrite)?;
+        let options = train_options(&request)?;
+        let trainer = Trainer::new(Arc::new(dataset), request.recipe.clone(), options)?;
+        let folder = RunFolder::create(out)?;
+        folder.write_record(&RunRecord {
+            input: request.input.clone(),
+            complete: false,
+        })?;
+        folder.write("recipe.toml", trainer.recipe.to_toml().as_bytes())?;
+        folder.write_cameras(&trainer)?;
+        Self::new(folder, request, trainer)
+    }
+
+    /// Goes on with the run in the request's folder from its newest checkpoint. The request comes from
+    /// [`TrainInput::of_run`](crate::TrainInput::of_run).
+    ///
+    /// # Errors
+    /// When the folder holds no run, its checkpoint is damaged, or its dataset cannot be read.
+    pub fn resume(request: TrainRequest) -> Result<Self, RunError> {
+        let dataset = request.read_dataset()?;
+        Self::resume_on(request, dataset)
+    }
+
+    /// Likewise, on a dataset that was read already.
+    ///
+    /// # Errors
+    /// Those of [`Run::resume`].
+    pub fn resume_on(request: TrainRequest, dataset: Dataset) -> Result<Self, RunError> {
+        let (folder, _) = RunFolder::open(&request.input.out)?;
+        let options = train_options(&request)?;
+        let dataset = Arc::new(dataset);
+        let trainer = match folder.newest_checkpoint()? {
+            Some(path) => read_checkpoint(&path, dataset, options)?,
+            // Interrupted before its first checkpoint.
+            None => Trainer::new(dataset, request.recipe.clone(), options)?,
+        };
+        Self::new(folder, request, trainer)
+    }
+
+    fn new(folder: RunFolder, request: TrainRequest, trainer: Trainer) -> Result<Self, RunError> {
+        let mut journal = Journal::open(&folder, trainer.clock.step)?;
+        journal.warnings.extend(trainer.dataset.warnings.iter().cloned());
+        journal.warnings.extend(request.warnings());
+        Ok(Self {
+            folder,
+            request,
+            trainer,
+            journal,
+            snapshots: SnapshotServer::new(),
+        })
+    }
+
+    /// What is trained, as it stands.
+    pub fn trainer(&self) -> &Trainer {
+        &self.trainer
+    }
+
+    /// The folder.
+    pub fn folder(&self) -> &RunFolder {
+        &self.folder
+    }
+
+    /// Lets other threads see the newest state while [`Run::train`] runs.
+    pub fn snapshots(&self) -> Snapshots {
+        self.snapshots.handle()
+    }
+
+    /// Trains until the recipe is over, a limit of the request is reached, or an observer answers
+    /// [`Signal::Stop`](irradia_train::event::Signal::Stop); returns why it ended. A run that was stopped may be trained on.
+    ///
+    /// # Errors
+    /// When a photograph cannot be read; the steps made are saved all the same.
+    pub fn train(&mut self, observers: &mut [&mut dyn Observer]) -> Result<String, RunError> {
+        let limits = self.request.limits();
+        let mut all: Vec<&mut dyn Observer> = Vec::with_capacity(observers.len() + 2);
+        for observer in observers.iter_mut() {
+            all.push(&mut **observer);
+        }
+        all.push(&mut self.journal);
+        self.snapshots.open();
+        all.push(&mut self.snapshots);
+        let ended = irradia_train::run(&mut self.trainer, &limits, &mut all);
+        self.snapshots.close(&self.trainer);
+        ended.map_err(|error| {
+            // The first error is the one worth telling.
+            let _ = self.save_unfinished();
+            error.into()
+        })
+    }
+
+    /// Writes the scene, measures it on the held-out views, and writes the report. A run that has not come to its
+    /// recipe's end is saved, to be resumed.
+    ///
+    /// # Errors
+    /// When a file cannot be written or a held-out photograph cannot be read.
+    pub fn finish(mut self) -> Result<Finished, RunError> {
+        let saved = self.save_unfinished();
+        self.write_scene()?;
+        saved?;
+        let report = self.report()?;
+        self.write_report(&report)?;
+        let complete = self.trainer.finished();
+        self.folder.write_record(&RunRecord {
+            input: self.request.input,
+            complete,
+        })?;
+        Ok(Finished {
+            folder: self.folder,
+            report,
+            complete,
+        })
+    }
+
+    fn save_unfinished(&mut self) -> Result<(), RunError> {
+        if !self.trainer.finished() && self.trainer.clock.step > 0 {
+            self.journal.save(&self.trainer).map_err(RunError::NotSaved)?;
+        }
+        Ok(())
+    }
+}
+
+/// The request's part that the trainer needs, with LPIPS's network read.
+fn train_options(request: &TrainRequest) -> Result<TrainOptions, RunError> {
+    let input = &request.input;
+    Ok(TrainOptions {
+        seed: input.seed,
+        steps: input.steps,
+        lpips: input.lpips.as_ref().map(Lpips::load).transpose()?.map(Arc::new),
+        ..TrainOptions::default()
+    })
+}
+
+fn read_checkpoint(path: &Path, dataset: Arc<Dataset>, options: TrainOptions) -> Result<Trainer, RunError> {
+    let bytes = fs::read(path).map_err(RunError::io("read", path))?;
+    checkpoint::from_bytes(&bytes, dataset, options).map_err(|source| RunError::File {
+        path: path.to_owned(),
+        source,
+    })
+}

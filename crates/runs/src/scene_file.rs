@@ -1,0 +1,136 @@
+//! A scene that can be rendered: read from a file or a run, or taken from a training.
+
+use crate::RunError;
+use crate::folder::{FIELD, RESIDUAL, SCENE, cameras_beside};
+use crate::orbit::orbit;
+use irradia_field::{Field, Sampler};
+use irradia_formats::read_splats;
+use irradia_scene::Camera;
+use irradia_splat::{RenderOptions, Renderer, Splats};
+use irradia_train::model::{Frame, Model};
+use irradia_train::recipe::RenderKnobs;
+use irradia_train::{Recipe, field_file};
+use std::borrow::Cow;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+/// Splats, with or without a residual field, or a radiance field; how it is rendered, and from where it was seen.
+///
+/// ```
+/// # use irradia_runs::scene::GaussianCloud;
+/// # let folder = tempfile::tempdir()?;
+/// # let ply = folder.path().join("scene.ply");
+/// # let cloud = GaussianCloud {
+/// #     means: vec![[-1.0, 0.0, 0.0], [0.0; 3], [1.0, 0.0, 0.0]], quats: vec![[1.0, 0.0, 0.0, 0.0]; 3],
+/// #     log_scales: vec![[-1.0; 3]; 3], opacity_logits: vec![4.0; 3], sh: vec![1.0; 9], sh_degree: 0, antialiased: false,
+/// # };
+/// # irradia_runs::formats::write_splats(&ply, &cloud)?;
+/// use irradia_runs::prelude::*;
+///
+/// let scene = Scene::read(&ply)?;
+/// let camera = scene.orbit(8, Some((64, 48)))[0];
+/// let frame = scene.render(&camera);
+/// write_image(folder.path().join("frame.png"), &frame.color)?;
+/// # assert!(frame.alpha.iter().any(|alpha| *alpha > 0.5));
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
+#[derive(Clone, Debug)]
+pub struct Scene {
+    /// What is rendered.
+    pub model: Model<'static>,
+    /// Background, antialiasing and SH degree.
+    pub options: RenderOptions,
+    /// The training views' cameras, where they are known.
+    pub cameras: Option<Arc<[Camera]>>,
+}
+
+impl Scene {
+    /// Reads a splat file, a field, or the scene of a run's folder. Background and antialiasing are those of the run that
+    /// the file lies in; a residual field beside a run's splats is part of the scene.
+    ///
+    /// # Errors
+    /// When it cannot be read, or is a residual field without its splats.
+    pub fn read(path: impl AsRef<Path>) -> Result<Self, RunError> {
+        let path = &scene_of(path.as_ref());
+        let (model, antialiased) = read_model(path)?;
+        let knobs = render_knobs_beside(path);
+        Ok(Self {
+            model,
+            options: RenderOptions {
+                background: knobs.background,
+                antialias: knobs.antialias || antialiased,
+                ..RenderOptions::default()
+            },
+            cameras: cameras_beside(path).map(Into::into),
+        })
+    }
+
+    /// What `camera` sees. For many frames, [`Model::render`] with one [`Renderer`] reuses memory.
+    pub fn render(&self, camera: &Camera) -> Frame {
+        self.model.render(&mut Renderer::new(), camera, &self.options)
+    }
+
+    /// `frames` cameras on a circle around what the training cameras looked at, at their mean distance and height; for a
+    /// scene without them, around the middle of the splats. `size` is width and height in pixels; that of the training
+    /// images, or 1280 x 720, when `None`.
+    pub fn orbit(&self, frames: u32, size: Option<(u32, u32)>) -> Vec<Camera> {
+        orbit(self.model.splats(), self.cameras.as_deref(), frames, size)
+    }
+}
+
+/// The file of the scene where `path` is a run's folder, `path` itself elsewhere.
+pub fn scene_of(path: &Path) -> PathBuf {
+    let files = [SCENE, FIELD].map(|name| path.join(name));
+    files.into_iter().find(|file| file.is_file()).unwrap_or(path.to_owned())
+}
+
+/// The field in a file.
+pub(crate) fn read_field(path: &Path) -> Result<Field, RunError> {
+    let bytes = fs::read(path).map_err(RunError::io("read", path))?;
+    field_file::from_bytes(&bytes).map_err(|source| RunError::File {
+        path: path.to_owned(),
+        source,
+    })
+}
+
+/// Whether `path` is named as the file of a field is.
+pub(crate) fn is_field(path: &Path) -> bool {
+    path.extension().is_some_and(|extension| extension == "safetensors")
+}
+
+/// The model in a file: a field where its name ends so, splats elsewhere; and whether it wants its opacities scaled.
+fn read_model(path: &Path) -> Result<(Model<'static>, bool), RunError> {
+    if is_field(path) {
+        let field = read_field(path)?;
+        if matches!(field.config.sampler, Sampler::Given { .. }) {
+            return Err(RunError::Residual(path.to_owned()));
+        }
+        return Ok((Model::Field(Cow::Owned(field)), false));
+    }
+    let cloud = read_splats(path)?;
+    let splats = Cow::Owned(Splats::from_cloud(&cloud));
+    let residual = residual_beside(path)?.map(Box::new);
+    Ok((Model::Splats { splats, residual }, cloud.antialiased))
+}
+
+/// What adds to the colours of a run's `scene`, if anything does.
+pub(crate) fn residual_beside(scene: &Path) -> Result<Option<Field>, RunError> {
+    let beside = scene.with_file_name(RESIDUAL);
+    let is_there = scene.file_name().is_some_and(|name| name == SCENE) && beside.is_file();
+    is_there.then(|| read_field(&beside)).transpose()
+}
+
+/// Background and antialiasing of the run that `scene` lies in; the defaults elsewhere.
+fn render_knobs_beside(scene: &Path) -> RenderKnobs {
+    let fallback = RenderKnobs {
+        background: [0.0; 3],
+        antialias: false,
+        smoothing_filter: false,
+    };
+    let Some(folder) = scene.parent() else { return fallback };
+    fs::read_to_string(folder.join("recipe.toml"))
+        .ok()
+        .and_then(|text| Recipe::parse("beside the scene", &text, &[]).ok())
+        .map_or(fallback, |recipe| recipe.render)
+}

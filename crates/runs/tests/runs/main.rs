@@ -1,0 +1,52 @@
+//! The library as a program uses it: requests, runs, those who watch them, and scenes.
+
+mod requests;
+mod scenes;
+mod snapshots;
+mod watched;
+
+use irradia_runs::prelude::*;
+use std::path::Path;
+use tempfile::TempDir;
+
+/// A dataset that trains in a blink.
+const SMALL: SynthOptions = SynthOptions {
+    views: 4,
+    width: 24,
+    height: 16,
+    seed: 1,
+};
+
+fn folder() -> TempDir {
+    tempfile::tempdir().expect("a folder")
+}
+
+fn dataset() -> Dataset {
+    irradia_runs::synth::dataset(&SMALL).expect("options")
+}
+
+/// A request for `steps` steps in `folder/name`.
+fn input(folder: &Path, name: &str, steps: u64) -> TrainInput {
+    TrainInput {
+        steps: Some(steps),
+        ..TrainInput::new("memory", folder.join(name))
+    }
+}
+
+/// A run of `steps` steps in `folder/name`.
+fn begin(folder: &Path, name: &str, steps: u64) -> Run {
+    let request = input(folder, name, steps).check().expect("a request");
+    Run::begin_on(request, dataset()).expect("a run")
+}
+
+/// The bytes of the scene of a run of `steps` steps that nobody watches.
+fn unwatched(folder: &Path, steps: u64) -> Vec<u8> {
+    let mut run = begin(folder, "unwatched", steps);
+    run.train(&mut []).expect("trains");
+    assert!(run.finish().expect("finishes").complete);
+    scene(folder, "unwatched")
+}
+
+fn scene(folder: &Path, name: &str) -> Vec<u8> {
+    std::fs::read(folder.join(name).join("scene.ply")).expect("a scene")
+}

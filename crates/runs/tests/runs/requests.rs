@@ -1,0 +1,267 @@
+//! Requests: what is refused, and what a run's folder keeps of them.
+
+use crate::{begin, dataset, folder, input, scene};
+use irradia_runs::prelude::*;
+use irradia_runs::{RunRecord, read_recipe};
+use std::fs;
+use std::path::Path;
+
+#[test]
+fn each_setting_out_of_range_is_refused_by_its_line() {
+    let good = || TrainInput::new("photos", "run");
+    let reading = |reading: Reading| TrainInput { reading, ..good() };
+    let cases = [
+        (
+            TrainInput {
+                steps: Some(0),
+                ..good()
+            },
+            "steps 0: give 1 or more",
+        ),
+        (
+            TrainInput {
+                max_splats: Some(0),
+                ..good()
+            },
+            "max_splats 0: give 1 or more",
+        ),
+        (
+            TrainInput {
+                budget: Some(0.0),
+                ..good()
+            },
+            "budget 0: give seconds, more than 0",
+        ),
+        (
+            TrainInput {
+                budget: Some(f64::NAN),
+                ..good()
+            },
+            "budget NaN: give seconds, more than 0",
+        ),
+        (
+            TrainInput {
+                steps: Some(9),
+                budget: Some(9.0),
+                ..good()
+            },
+            "steps 9: give steps or a budget, not both",
+        ),
+        (
+            TrainInput {
+                until_psnr: Some(f64::INFINITY),
+                ..good()
+            },
+            "until_psnr inf: give a number of dB",
+        ),
+        (
+            reading(Reading {
+                downscale: 0.5,
+                ..Reading::default()
+            }),
+            "downscale 0.5: give 1 or more",
+        ),
+        (
+            reading(Reading {
+                downscale: f32::NAN,
+                ..Reading::default()
+            }),
+            "downscale NaN: give 1 or more",
+        ),
+        (
+            reading(Reading {
+                max_side: Some(0),
+                ..Reading::default()
+            }),
+            "max_side 0: give 1 or more",
+        ),
+        (
+            reading(Reading {
+                max_side: Some(64),
+                downscale: 2.0,
+                ..Reading::default()
+            }),
+            "max_side 64: give it or downscale, not both",
+        ),
+    ];
+    for (input, line) in cases {
+        let error = input.check().expect_err(line);
+        assert_eq!(error.to_string(), line);
+        assert!(error.is_request());
+    }
+    let named = |name: &str| TrainInput {
+        recipe: name.into(),
+        ..good()
+    };
+    let set = |change: &str| TrainInput {
+        set: vec![change.into()],
+        ..good()
+    };
+    let format = reading(Reading {
+        format: Some("exr".into()),
+        ..Reading::default()
+    });
+    for (input, words) in [
+        (format, ["format exr", "colmap"]),
+        (named("clasic"), ["`clasic`", "classic"]),
+        (named("absent.toml"), ["cannot read recipe", "absent.toml"]),
+        (set("max_splat=3"), ["`max_splat`", "`max_splats`"]),
+        (set("params.ssim_weight=2"), ["params.ssim_weight", "0 to 1"]),
+    ] {
+        let error = input.check().expect_err(words[0]);
+        let line = error.to_string();
+        assert!(words.iter().all(|word| line.contains(word)), "{line}");
+        assert!(error.is_request() && line.lines().count() == 1, "{line}");
+    }
+}
+
+#[test]
+fn overrides_and_the_cap_change_the_recipe() {
+    let input = TrainInput {
+        set: vec!["eval_every=7".into()],
+        max_splats: Some(123),
+        ..TrainInput::new("photos", "run")
+    };
+    let request = input.check().expect("a request");
+    assert_eq!((request.recipe().eval_every, request.recipe().max_splats), (7, 123));
+    assert!(request.input().data.is_absolute());
+}
+
+#[test]
+fn a_folder_that_holds_a_run_is_not_replaced_unless_asked() {
+    let folder = folder();
+    begin(folder.path(), "run", 2);
+    let again = || input(folder.path(), "run", 3);
+    let refused = |input: TrainInput, word: &str| {
+        let error = Run::begin_on(input.check().expect("a request"), dataset()).err();
+        let error = error.expect("refused");
+        assert!(error.to_string().contains(word) && error.is_request(), "{error}");
+    };
+    refused(again(), "already holds a run");
+    refused(input(folder.path(), "run/run.json", 3), "is a file");
+    let overwrite = TrainInput {
+        overwrite: true,
+        ..again()
+    };
+    Run::begin_on(overwrite.check().expect("a request"), dataset()).expect("replaced");
+    let (_, record) = RunFolder::open(&folder.path().join("run")).expect("a run");
+    assert_eq!((record.input.steps, record.complete), (Some(3), false));
+}
+
+#[test]
+fn what_was_asked_for_is_read_back() {
+    let folder = folder();
+    let asked = TrainInput {
+        recipe: "classic".into(),
+        set: vec!["eval_every=7".into()],
+        until_psnr: Some(31.5),
+        seed: u64::MAX,
+        reading: Reading {
+            format: Some("blender".into()),
+            downscale: 1.5,
+            max_side: None,
+        },
+        ..input(folder.path(), "run", 4)
+    };
+    Run::begin_on(asked.clone().check().expect("a request"), dataset()).expect("a run");
+    let run = folder.path().join("run");
+    let (_, record) = RunFolder::open(&run).expect("a run");
+    let kept = TrainInput {
+        data: std::path::absolute("memory").expect("a path"),
+        out: "".into(),
+        ..asked.clone()
+    };
+    assert_eq!(record.input, kept);
+    // To resume, the recipe is the one that the folder holds.
+    let resumed = TrainInput::of_run(&run).expect("a run");
+    assert_eq!(
+        (resumed.seed, resumed.until_psnr, resumed.set.len()),
+        (u64::MAX, Some(31.5), 0)
+    );
+    let request = resumed.check().expect("a request");
+    let recipe = read_recipe("classic", &asked.set).expect("a recipe");
+    assert_eq!(request.recipe().hash(), recipe.hash());
+}
+
+/// As 0.1.0's first builds wrote it: no recipe, and `lpips` in later ones only.
+#[test]
+fn an_old_run_json_is_read() {
+    let text = r#"{
+        "data": "/photos", "format": null, "downscale": 2.0, "max_side": null, "until_psnr": null,
+        "budget": 90.0, "seed": 3, "steps": 500, "complete": false
+    }"#;
+    let record: RunRecord = serde_json::from_str(text).expect("an old record");
+    assert_eq!(record.input.data, Path::new("/photos"));
+    assert_eq!((record.input.seed, record.input.reading.downscale), (3, 2.0));
+    assert_eq!((record.input.lpips, record.complete), (None, false));
+
+    let folder = folder();
+    let run = folder.path().join("run");
+    begin(folder.path(), "run", 3);
+    fs::write(run.join("run.json"), text).expect("written");
+    let input = TrainInput::of_run(&run).expect("an old run");
+    // A budget that was given when the run was resumed replaces its steps.
+    assert_eq!((input.budget, input.steps), (Some(90.0), None));
+    input.check().expect("a request");
+}
+
+#[test]
+fn folders_that_hold_no_run_are_told_by_one_line() {
+    let folder = folder();
+    let error = TrainInput::of_run(folder.path()).expect_err("no run");
+    let line = error.to_string();
+    assert!(line.contains("holds no run") && line.contains("run.json"), "{line}");
+    assert!(!error.is_request());
+    fs::write(folder.path().join("run.json"), "{").expect("written");
+    let line = TrainInput::of_run(folder.path()).expect_err("damaged").to_string();
+    assert!(line.contains("run.json is damaged"), "{line}");
+}
+
+#[test]
+fn weights_that_cannot_be_read_leave_no_run() {
+    let folder = folder();
+    let input = TrainInput {
+        lpips: Some("nowhere.safetensors".into()),
+        ..input(folder.path(), "run", 2)
+    };
+    let error = Run::begin_on(input.check().expect("a request"), dataset()).err();
+    let line = error.expect("refused").to_string();
+    assert!(line.contains("nowhere.safetensors"), "{line}");
+    assert!(!folder.path().join("run").exists());
+}
+
+#[test]
+fn a_recipe_that_misses_its_weights_is_a_warning() {
+    let named = |recipe: &str| {
+        let input = TrainInput {
+            recipe: recipe.into(),
+            ..TrainInput::new("photos", "run")
+        };
+        input.check().expect("a request").warnings()
+    };
+    assert!(named("classic").is_empty());
+    assert!(matches!(&named("curriculum")[..], [one] if one.contains("LPIPS")));
+}
+
+#[test]
+fn a_run_is_made_on_files_and_on_a_dataset_in_memory() {
+    let folder = folder();
+    let data = folder.path().join("data");
+    write_synth_dataset(&data, &crate::SMALL).expect("written");
+    let make = |name: &str, begin: &dyn Fn(TrainRequest) -> Result<Run, RunError>| {
+        let request = TrainInput {
+            data: data.clone(),
+            ..input(folder.path(), name, 6)
+        };
+        let mut run = begin(request.check().expect("a request")).expect("a run");
+        run.train(&mut []).expect("trains");
+        run.finish().expect("finishes");
+        scene(folder.path(), name).len()
+    };
+    let sizes = ["files", "memory"].map(|name| match name {
+        "files" => make(name, &Run::begin),
+        _ => make(name, &|request| Run::begin_on(request, dataset())),
+    });
+    // Poses go through a file's matrices and back: near to each other, not the same bits.
+    assert_eq!(sizes[0], sizes[1]);
+}

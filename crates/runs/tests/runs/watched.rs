@@ -1,0 +1,173 @@
+//! Observers: stop, save and pause.
+
+use crate::{begin, dataset, folder, scene, unwatched};
+use irradia_runs::prelude::*;
+use std::fs;
+use std::time::{Duration, Instant};
+
+/// Answers `answer` after step `at`, and keeps what it was told.
+struct At {
+    step: u64,
+    answer: Signal,
+    told: Vec<Event>,
+}
+
+impl At {
+    fn new(step: u64, answer: Signal) -> Self {
+        Self {
+            step,
+            answer,
+            told: Vec::new(),
+        }
+    }
+}
+
+impl Observer for At {
+    fn on_event(&mut self, event: &Event, _trainer: &Trainer) -> Signal {
+        self.told.push(event.clone());
+        match event {
+            Event::Step(report) if report.step == self.step => self.answer,
+            _ => Signal::Continue,
+        }
+    }
+}
+
+/// Pauses after a step for a while, saving meanwhile, and then goes on or stops.
+struct Pauses {
+    after: u64,
+    questions: u32,
+    then: Signal,
+    steps: Vec<u64>,
+}
+
+impl Observer for Pauses {
+    fn on_event(&mut self, event: &Event, _trainer: &Trainer) -> Signal {
+        match event {
+            Event::Step(report) => {
+                self.steps.push(report.step);
+                if report.step == self.after {
+                    return Signal::Pause;
+                }
+            }
+            Event::Paused { step } | Event::Resumed { step } => assert_eq!(*step, self.after),
+            _ => {}
+        }
+        Signal::Continue
+    }
+
+    fn while_paused(&mut self, trainer: &Trainer) -> Signal {
+        assert_eq!(trainer.clock.step, self.after, "no step is made meanwhile");
+        self.questions += 1;
+        if self.questions < 4 { Signal::Pause } else { self.then }
+    }
+}
+
+#[test]
+fn a_stopped_run_is_saved_and_resumes_to_the_bytes_of_an_unbroken_one() {
+    let folder = folder();
+    let mut run = begin(folder.path(), "run", 12);
+    let reason = run.train(&mut [&mut At::new(5, Signal::Stop)]).expect("trains");
+    assert_eq!((reason.as_str(), run.trainer().clock.step), ("stopped", 5));
+    let finished = run.finish().expect("finishes");
+    assert!(!finished.complete && finished.report.steps == 5);
+    let path = finished.folder.path().to_owned();
+    assert!(path.join("checkpoints/step_5.safetensors").is_file());
+
+    let request = TrainInput::of_run(&path).expect("a run").check().expect("a request");
+    let mut run = Run::resume_on(request, dataset()).expect("resumed");
+    run.train(&mut []).expect("trains");
+    let finished = run.finish().expect("finishes");
+    assert!(finished.complete);
+    assert!(RunFolder::open(&path).expect("a run").1.complete);
+    assert!(scene(folder.path(), "run") == unwatched(folder.path(), 12));
+}
+
+#[test]
+fn a_stopped_run_may_be_trained_on_at_once() {
+    let folder = folder();
+    let mut run = begin(folder.path(), "run", 12);
+    run.train(&mut [&mut At::new(5, Signal::Stop)]).expect("trains");
+    run.train(&mut []).expect("trains");
+    let report = run.finish().expect("finishes").report;
+    assert!(scene(folder.path(), "run") == unwatched(folder.path(), 12));
+    let seconds: f64 = report.stages.iter().map(|stage| stage.seconds).sum();
+    assert!((seconds - report.seconds).abs() < 1e-9, "each second is counted once");
+}
+
+#[test]
+fn save_writes_a_checkpoint_and_says_so() {
+    let folder = folder();
+    let mut run = begin(folder.path(), "run", 6);
+    let mut asks = At::new(3, Signal::Save);
+    run.train(&mut [&mut asks]).expect("trains");
+    let saved = |event: &Event| matches!(event, Event::Saved { step: 3, path } if path.ends_with("step_3.safetensors"));
+    assert!(asks.told.iter().any(saved), "{:?}", asks.told);
+    assert!(run.folder().file("checkpoints/step_3.safetensors").is_file());
+}
+
+#[test]
+fn a_paused_run_waits_and_goes_on_to_the_same_bytes() {
+    let folder = folder();
+    let mut run = begin(folder.path(), "run", 8);
+    let mut pauses = Pauses {
+        after: 3,
+        questions: 0,
+        then: Signal::Continue,
+        steps: Vec::new(),
+    };
+    let started = Instant::now();
+    // One that saves in the same step is heard too.
+    run.train(&mut [&mut At::new(3, Signal::Save), &mut pauses])
+        .expect("trains");
+    assert!(
+        started.elapsed() > Duration::from_millis(40),
+        "it waits between questions"
+    );
+    assert_eq!((pauses.questions, pauses.steps.len()), (4, 8));
+    assert!(run.folder().file("checkpoints/step_3.safetensors").is_file());
+    let log = fs::read_to_string(run.folder().file("events.jsonl")).expect("events");
+    for event in ["paused", "resumed"] {
+        assert_eq!(log.matches(&format!("\"event\":\"{event}\"")).count(), 1, "{event}");
+    }
+    run.finish().expect("finishes");
+    assert!(scene(folder.path(), "run") == unwatched(folder.path(), 8));
+}
+
+#[test]
+fn a_paused_run_can_be_stopped() {
+    let folder = folder();
+    let mut run = begin(folder.path(), "run", 8);
+    let mut pauses = Pauses {
+        after: 3,
+        questions: 0,
+        then: Signal::Stop,
+        steps: Vec::new(),
+    };
+    assert_eq!(run.train(&mut [&mut pauses]).expect("trains"), "stopped");
+    assert_eq!(pauses.steps, [1, 2, 3]);
+    assert!(run.folder().file("checkpoints/step_3.safetensors").is_file());
+}
+
+/// Cannot do its work, and says so once.
+struct Warns(Option<String>);
+
+impl Observer for Warns {
+    fn on_event(&mut self, _event: &Event, _trainer: &Trainer) -> Signal {
+        Signal::Continue
+    }
+
+    fn warning(&mut self) -> Option<String> {
+        self.0.take()
+    }
+}
+
+#[test]
+fn an_observers_warning_reaches_the_others_and_the_report_once() {
+    let folder = folder();
+    let mut run = begin(folder.path(), "run", 3);
+    let (mut warns, mut listens) = (Warns(Some("no sound".into())), At::new(0, Signal::Continue));
+    run.train(&mut [&mut warns, &mut listens]).expect("trains");
+    let warned = |event: &&Event| matches!(event, Event::Warned { message } if message == "no sound");
+    assert_eq!(listens.told.iter().filter(warned).count(), 1);
+    assert_eq!(run.finish().expect("finishes").report.warnings, ["no sound"]);
+}

@@ -1,0 +1,266 @@
+//! The views of the demo scene: cameras, frames, and points as structure from motion would leave them.
+
+use crate::cameras::{Part, cameras};
+use crate::scene::{SynthScene, demo_scene};
+use crate::trace::SynthFrame;
+use glam::{Vec2, Vec3};
+use irradia_scene::{Camera, Dataset, Photo, PointCloud, Rng, View};
+use std::sync::Arc;
+
+/// Most samples a pixel.
+const SAMPLES: u32 = 16;
+/// Points, over all training views.
+const POINTS: u32 = 6000;
+/// Standard deviation of a point's error, as a fraction of its distance: what structure from motion reaches on good photos.
+const POINT_ERROR: f32 = 0.001;
+
+/// What to make.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct SynthOptions {
+    /// Training views, 3 to 1000; one more in eight is held out, one more in twenty is for validation.
+    pub views: u32,
+    /// Pixels, 8 to 4096.
+    pub width: u32,
+    /// Pixels, 8 to 4096.
+    pub height: u32,
+    /// Seed of cameras, samples and points: equal seeds make equal views.
+    pub seed: u64,
+}
+
+impl Default for SynthOptions {
+    /// 40 views of 256 x 256, seed 0.
+    fn default() -> Self {
+        Self {
+            views: 40,
+            width: 256,
+            height: 256,
+            seed: 0,
+        }
+    }
+}
+
+/// Options that make no dataset: one line.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum SynthError {
+    /// Too few or too many views.
+    #[error("{0} views: give between 3 and 1000")]
+    Views(u32),
+    /// Too small or too large.
+    #[error("size {0}x{1}: give between 8 and 4096 pixels a side")]
+    Size(u32, u32),
+}
+
+/// One view to be traced.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Shot {
+    /// What it is for.
+    pub part: Part,
+    /// Among the views of its part.
+    pub number: u32,
+    /// From where.
+    pub camera: Camera,
+    /// Seed of the samples. It differs from view to view, or the samples' noise would look like texture on the lens.
+    seed: u64,
+}
+
+impl Shot {
+    /// Name without extension, such as `train/r_007`.
+    pub fn name(&self) -> String {
+        format!("{}/r_{:03}", self.part.name(), self.number)
+    }
+}
+
+/// The demo scene with the cameras that look at it.
+#[derive(Clone, Debug)]
+pub struct Capture {
+    scene: SynthScene,
+    options: SynthOptions,
+    shots: Vec<Shot>,
+}
+
+impl Capture {
+    /// Places the cameras; nothing is traced yet.
+    ///
+    /// # Errors
+    /// When a count or a size of `options` is out of its range.
+    pub fn new(options: &SynthOptions) -> Result<Self, SynthError> {
+        let SynthOptions {
+            views,
+            width,
+            height,
+            seed,
+        } = *options;
+        if !(3..=1000).contains(&views) {
+            return Err(SynthError::Views(views));
+        }
+        if ![width, height].iter().all(|side| (8..=4096).contains(side)) {
+            return Err(SynthError::Size(width, height));
+        }
+        let mut shots: Vec<Shot> = Vec::new();
+        for part in Part::ALL {
+            let cameras = cameras(part, Self::count(views, part), width, height, seed);
+            for (number, camera) in (0..).zip(cameras) {
+                let seed = seed.wrapping_mul(1_000_003).wrapping_add(shots.len() as u64);
+                shots.push(Shot {
+                    part,
+                    number,
+                    camera,
+                    seed,
+                });
+            }
+        }
+        Ok(Self {
+            scene: demo_scene(),
+            options: *options,
+            shots,
+        })
+    }
+
+    fn count(views: u32, part: Part) -> u32 {
+        match part {
+            Part::Train => views,
+            Part::Val => (views / 20).max(1),
+            Part::Test => (views / 8).max(2),
+        }
+    }
+
+    /// As given.
+    pub fn options(&self) -> &SynthOptions {
+        &self.options
+    }
+
+    /// All views, part by part: training, validation, held out.
+    pub fn shots(&self) -> &[Shot] {
+        &self.shots
+    }
+
+    /// The picture of one view, with its depth and normals.
+    pub fn trace(&self, shot: &Shot) -> SynthFrame {
+        self.scene.trace(&shot.camera, SAMPLES, shot.seed)
+    }
+
+    /// Points that structure from motion would find in the `frame` of a training view; none in other views.
+    pub fn points(&self, shot: &Shot, frame: &SynthFrame) -> PointCloud {
+        let mut points = PointCloud::default();
+        if shot.part == Part::Train {
+            let count = (POINTS / self.options.views).max(1);
+            let mut rng = Rng::new(self.options.seed, 1000 + u64::from(shot.number));
+            (0..count).for_each(|_| add_point(&mut points, &shot.camera, frame, &mut rng));
+        }
+        points
+    }
+}
+
+/// The training and held-out views in memory, traced now; the same dataset as its files are read as.
+///
+/// # Errors
+/// When a count or a size of `options` is out of its range.
+pub fn dataset(options: &SynthOptions) -> Result<Dataset, SynthError> {
+    let capture = Capture::new(options)?;
+    let mut dataset = Dataset {
+        kind: "ray traced".into(),
+        ..Dataset::default()
+    };
+    let mut points = PointCloud::default();
+    for shot in capture.shots().iter().filter(|shot| shot.part != Part::Val) {
+        let frame = capture.trace(shot);
+        let found = capture.points(shot, &frame);
+        points.positions.extend(found.positions);
+        points.colors.extend(found.colors);
+        let photo = Photo {
+            width: frame.color.width,
+            height: frame.color.height,
+            channels: 4,
+            data: frame.rgba(),
+            mask: None,
+        };
+        dataset.views.push(View {
+            name: format!("{}.png", shot.name()),
+            camera: shot.camera,
+            photo: Arc::new(photo),
+            depth_bounds: None,
+            time: None,
+            points_seen: Vec::new(),
+        });
+    }
+    dataset.views.sort_by(|a, b| a.name.cmp(&b.name));
+    let held_out = format!("{}/", Part::Test.name());
+    (dataset.test, dataset.train) =
+        (0..dataset.views.len()).partition(|i| dataset.views[*i].name.starts_with(&held_out));
+    dataset.points = Some(points);
+    Ok(dataset)
+}
+
+/// The surface under a random pixel, a little off.
+fn add_point(points: &mut PointCloud, camera: &Camera, frame: &SynthFrame, rng: &mut Rng) {
+    let (x, y) = (rng.below(frame.color.width), rng.below(frame.color.height));
+    let direction = camera.ray_direction(Vec2::new(x as f32 + 0.5, y as f32 + 0.5));
+    let depth = frame.depth.pixel(x, y)[0];
+    let distance = depth / direction.dot(camera.pose.rotation * Vec3::Z);
+    let error = Vec3::new(rng.normal(), rng.normal(), rng.normal()) * (POINT_ERROR * distance);
+    points
+        .positions
+        .push(camera.pose.position + direction * distance + error);
+    let color = frame.color.pixel(x, y);
+    points.colors.push([0, 1, 2].map(|c| (color[c] * 255.0).round() as u8));
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const SMALL: SynthOptions = SynthOptions {
+        views: 4,
+        width: 32,
+        height: 32,
+        seed: 5,
+    };
+
+    #[test]
+    fn points_lie_on_what_a_ray_to_them_meets() {
+        let capture = Capture::new(&SMALL).expect("options");
+        let shot = capture.shots()[0];
+        let frame = capture.trace(&shot);
+        let points = capture.points(&shot, &frame);
+        assert_eq!(points.len(), 1500);
+        for point in points.positions.iter().take(50) {
+            let (pixel, depth) = shot.camera.project(*point).expect("in front");
+            let seen = frame.depth.pixel((pixel.x as u32).min(31), (pixel.y as u32).min(31))[0];
+            // Five standard deviations, and room for those that slid over an edge to the neighbour pixel.
+            assert!((seen - depth).abs() < 5.0 * POINT_ERROR * depth + 0.5, "{seen} {depth}");
+        }
+    }
+
+    #[test]
+    fn a_dataset_holds_each_part_once_and_equal_seeds_are_equal() {
+        let [a, b] = [dataset(&SMALL).expect("options"), dataset(&SMALL).expect("options")];
+        assert_eq!((a.views.len(), a.train.len(), a.test.len()), (6, 4, 2));
+        assert!(a.train.iter().all(|i| a.views[*i].name.starts_with("train/")));
+        assert_eq!(a.points, b.points);
+        assert_eq!(a.points.as_ref().map(PointCloud::len), Some(6000));
+        for (a, b) in a.views.iter().zip(&b.views) {
+            assert!(a.photo.load().expect("in memory") == b.photo.load().expect("in memory"));
+        }
+    }
+
+    #[test]
+    fn options_out_of_range_are_refused_in_one_line() {
+        let cases = [
+            (SynthOptions { views: 2, ..SMALL }, "2 views: give between 3 and 1000"),
+            (
+                SynthOptions { width: 0, ..SMALL },
+                "size 0x32: give between 8 and 4096 pixels a side",
+            ),
+            (
+                SynthOptions { height: 5000, ..SMALL },
+                "size 32x5000: give between 8 and 4096 pixels a side",
+            ),
+        ];
+        for (options, line) in cases {
+            assert_eq!(
+                Capture::new(&options).err().map(|e| e.to_string()).as_deref(),
+                Some(line)
+            );
+        }
+    }
+}

@@ -1,0 +1,37 @@
+//! A ray-traced scene with known cameras, depth, normals and points: a lit table-top with fine and coarse detail, a satin
+//! ball whose colour depends on the viewpoint, thin parts, and a background far away. It is the built-in data of
+//! `irradia demo`, and data for tests that need the truth.
+//!
+//! World: z up, the middle of the table's top at the origin. [`Capture`] places the cameras and traces them one by one;
+//! [`dataset`] does it all in memory. Writing the views as files is left to `irradia-runs`.
+//!
+//! ```
+//! use irradia_synth::{Capture, SynthOptions, dataset};
+//!
+//! let options = SynthOptions { views: 4, width: 24, height: 16, seed: 0 };
+//! let dataset = dataset(&options)?;
+//! assert_eq!((dataset.train.len(), dataset.test.len()), (4, 2));
+//!
+//! // With the truth about depth, view by view:
+//! let capture = Capture::new(&options)?;
+//! let frame = capture.trace(&capture.shots()[0]);
+//! assert!(frame.depth.data.iter().all(|depth| *depth > 0.5));
+//! # Ok::<(), irradia_synth::SynthError>(())
+//! ```
+#![forbid(unsafe_code)]
+
+mod ambient;
+mod cameras;
+mod capture;
+mod scene;
+mod shape;
+mod sky;
+mod texture;
+mod trace;
+
+pub use cameras::{FOV_X, Part};
+pub use capture::{Capture, Shot, SynthError, SynthOptions, dataset};
+pub use scene::{Cluster, Hit, Material, Object, SynthScene, demo_scene};
+pub use shape::{Ray, Shape};
+pub use texture::Texture;
+pub use trace::SynthFrame;

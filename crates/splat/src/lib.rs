@@ -4,6 +4,7 @@
 pub mod densify;
 pub mod filter;
 pub mod init;
+mod nearest;
 pub mod regularize;
 pub mod render;
 mod splats;

@@ -111,9 +111,9 @@ impl<F: Lanes> WeightLanes<F> {
 #[inline(always)]
 fn regularizer<F: Lanes>(w: &WeightLanes<F>, log_scale: [F; 3], logit: F) -> (F, [F; 3], F) {
     let one = logit.splat(1.0);
-    let s = each!(c in 3 => crate::render::exp(log_scale[c]));
+    let s = each!(c in 3 => log_scale[c].exp());
     let squares = each!(c in 3 => s[c] * s[c]);
-    let o = one / (one + crate::render::exp(-logit));
+    let o = one / (one + (-logit).exp());
     let frobenius = squares[0] * squares[0] + squares[1] * squares[1] + squares[2] * squares[2];
     let value = w.opacity * o + w.opacity_square * o * o + w.scale * (s[0] + s[1] + s[2]) + w.covariance * frobenius;
     let four = one.splat(4.0);

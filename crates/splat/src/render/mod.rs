@@ -15,7 +15,6 @@ mod view;
 mod gradients;
 
 pub use blend::{ALPHA_MAX, TRANSMITTANCE_MIN};
-pub(crate) use project::exp;
 pub use project::{ALPHA_MIN, DILATION};
 pub use view::ViewParams;
 

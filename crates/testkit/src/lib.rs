@@ -5,6 +5,7 @@ mod compare;
 pub mod differences;
 mod golden;
 pub mod shared;
+pub mod torch;
 
 pub use compare::{Difference, max_abs_difference, relative_difference};
 pub use golden::Golden;

@@ -1,11 +1,13 @@
 //! `irradia eval`
 
-use super::{DataArgs, Split, file_stem, lpips, thread_count, use_threads};
+use super::lpips::{HOW, lpips};
+use super::{DataArgs, Split, file_stem, thread_count, use_threads};
 use crate::Usage;
 use crate::run_folder::{read_scene, render_knobs_beside, scene_of};
-use crate::terminal::say;
+use crate::terminal::{note, say};
 use anyhow::Result;
 use irradia_formats::{write_atomic, write_png};
+use irradia_measure::LpipsNet;
 use irradia_splat::RenderOptions;
 use irradia_train::eval::{Metrics, evaluate_views, mean};
 use serde_json::json;
@@ -27,9 +29,12 @@ pub struct Args {
     /// Write the rendered views here
     #[arg(long, value_name = "DIR")]
     pub save_images: Option<PathBuf>,
-    /// LPIPS weights (lpips_squeeze.safetensors)
-    #[arg(long, value_name = "FILE")]
+    /// LPIPS weights: a file, or a folder of them; see irradia lpips
+    #[arg(long, value_name = "PATH")]
     pub lpips: Option<PathBuf>,
+    /// Network of LPIPS: squeeze, alex or vgg; distances of different networks are not comparable
+    #[arg(long, value_name = "NET")]
+    pub lpips_net: Option<LpipsNet>,
     /// Threads; all cores when absent
     #[arg(long, value_parser = thread_count())]
     pub threads: Option<usize>,
@@ -46,7 +51,17 @@ pub fn run(args: &Args) -> Result<()> {
     if indices.is_empty() {
         return Err(Usage(format!("{} has no such views: try --split all", args.data.display())).into());
     }
-    let lpips = lpips(args.lpips.as_ref())?;
+    let lpips = lpips(args.lpips.as_ref(), args.lpips_net)?;
+    if lpips.is_none() {
+        note(format_args!(
+            "LPIPS is not measured, since no weights were found: {HOW}"
+        ));
+    }
+    let net = lpips.as_ref().map(|lpips| lpips.net());
+    let in_words = |value: Option<f64>| {
+        let pair = value.zip(net);
+        pair.map_or(String::new(), |(value, net)| format!("  LPIPS ({net}) {value:.4}"))
+    };
     let knobs = render_knobs_beside(&scene);
     let options = RenderOptions {
         background: knobs.background,
@@ -62,7 +77,7 @@ pub fn run(args: &Args) -> Result<()> {
         Metrics::All(lpips.as_ref()),
         |view| {
             let m = view.metrics;
-            let tail = m.lpips.map_or(String::new(), |l| format!("  LPIPS {l:.4}"));
+            let tail = in_words(m.lpips);
             let line = format!("{:<40} PSNR {:6.2} dB  SSIM {:.4}{tail}", view.name, m.psnr, m.ssim);
             if let Err(error) = say(line) {
                 outcome = Err(error);
@@ -83,7 +98,7 @@ pub fn run(args: &Args) -> Result<()> {
     )?;
     outcome?;
     let mean = mean(&metrics);
-    let tail = mean.lpips.map_or(String::new(), |l| format!("  LPIPS {l:.4}"));
+    let tail = in_words(mean.lpips);
     say(format_args!(
         "{:<40} PSNR {:6.2} dB  SSIM {:.4}{tail}",
         format!("mean of {}", metrics.len()),
@@ -94,7 +109,8 @@ pub fn run(args: &Args) -> Result<()> {
         let figures = json!({
             "scene": scene, "data": args.data,
             "splats": model.splats().map(irradia_splat::Splats::len), "parameters": model.field().map(irradia_field::Field::len),
-            "psnr": mean.psnr, "ssim": mean.ssim, "lpips": mean.lpips, "views": rows,
+            "psnr": mean.psnr, "ssim": mean.ssim, "lpips": mean.lpips, "lpips_net": net.map(LpipsNet::name),
+            "views": rows,
         });
         let bytes = serde_json::to_vec_pretty(&figures)?;
         write_atomic(path, |out| out.write_all(&bytes))?;

@@ -6,6 +6,7 @@ mod describe_field;
 pub mod eval;
 pub mod files;
 mod journal;
+pub mod lpips;
 mod progress;
 pub mod recipe;
 pub mod render;
@@ -16,9 +17,8 @@ use crate::terminal::note;
 use anyhow::{Context, Result};
 use clap::builder::RangedU64ValueParser;
 use irradia_formats::{DatasetFormat, DatasetOptions, read_dataset};
-use irradia_measure::Lpips;
 use irradia_scene::Dataset;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 /// Which part of a dataset.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
@@ -77,22 +77,6 @@ impl DataArgs {
         }
         Ok(dataset)
     }
-}
-
-/// LPIPS's network: the file given, or `$IRRADIA_LPIPS`, or where the shared data lies; `None` when there is none.
-pub fn lpips(given: Option<&PathBuf>) -> Result<Option<Lpips>> {
-    let path = lpips_path(given);
-    path.map(|path| Lpips::load(&path).context("LPIPS weights")).transpose()
-}
-
-/// The file that [`lpips`] reads, absolute.
-pub fn lpips_path(given: Option<&PathBuf>) -> Option<PathBuf> {
-    let shared = || Some(PathBuf::from("../shared/data/lpips/lpips_squeeze.safetensors")).filter(|path| path.exists());
-    let path = given.cloned();
-    let path = path
-        .or_else(|| std::env::var_os("IRRADIA_LPIPS").map(PathBuf::from))
-        .or_else(shared)?;
-    Some(std::path::absolute(&path).unwrap_or(path))
 }
 
 /// What `--threads` takes.

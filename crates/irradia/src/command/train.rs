@@ -1,8 +1,9 @@
 //! `irradia train`
 
 use super::journal::Journal;
+use super::lpips::{HOW, lpips, lpips_path};
 use super::progress::{Progress, size_in_words};
-use super::{DataArgs, file_stem, lpips, lpips_path, thread_count, use_threads};
+use super::{DataArgs, file_stem, thread_count, use_threads};
 use crate::Usage;
 use crate::run_folder::{FIELD, RESIDUAL, RunConfig, RunFolder, SCENE};
 use crate::terminal::{note, one_line, say};
@@ -10,7 +11,7 @@ use anyhow::{Context, Result, anyhow};
 use clap::builder::RangedU64ValueParser;
 use irradia_compute::Level;
 use irradia_formats::{write_png, write_splats};
-use irradia_measure::{Evaluation, Lpips};
+use irradia_measure::{Evaluation, Lpips, LpipsNet};
 use irradia_scene::{Image, sh};
 use irradia_train::eval::{EvaluatedView, Metrics, evaluate_views, mean};
 use irradia_train::event::Observer;
@@ -65,8 +66,8 @@ pub struct Args {
     /// Replace the run that --out holds
     #[arg(long)]
     pub overwrite: bool,
-    /// LPIPS weights (lpips_squeeze.safetensors)
-    #[arg(long, value_name = "FILE")]
+    /// LPIPS weights: a file, or a folder of them; see irradia lpips
+    #[arg(long, value_name = "PATH")]
     pub lpips: Option<PathBuf>,
     #[command(flatten)]
     pub reading: DataArgs,
@@ -94,7 +95,7 @@ pub fn run(args: &Args) -> Result<()> {
 /// Trains on the threads that there are.
 pub fn train(args: &Args) -> Result<()> {
     let started = Instant::now();
-    let weights = |given: Option<&PathBuf>| anyhow::Ok(lpips(given)?.map(Arc::new));
+    let weights = |given: Option<&PathBuf>| anyhow::Ok(lpips(given, None)?.map(Arc::new));
     let (folder, config, trainer) = match &args.resume {
         Some(run) => {
             let (folder, mut config) = RunFolder::open(run)?;
@@ -257,6 +258,7 @@ fn finish(folder: RunFolder, mut config: RunConfig, mut trainer: Trainer, starte
     saved.map_err(anyhow::Error::msg)?;
 
     let lpips = trainer.options.lpips.clone();
+    let lpips_net = lpips.as_ref().map(|lpips| lpips.net());
     let mut views = Vec::new();
     let mut metrics: Vec<Evaluation> = Vec::new();
     let options = trainer.render_options(sh::MAX_DEGREE);
@@ -300,6 +302,7 @@ fn finish(folder: RunFolder, mut config: RunConfig, mut trainer: Trainer, starte
         psnr: mean.psnr,
         ssim: mean.ssim,
         lpips: mean.lpips,
+        lpips_net: lpips_net.map(|net| net.name().to_owned()),
         views,
         schedule: schedule(
             &trainer.recipe,
@@ -321,7 +324,7 @@ fn finish(folder: RunFolder, mut config: RunConfig, mut trainer: Trainer, starte
         "held-out PSNR {:.2} dB, SSIM {:.4}{}; {}, {:.1} s of training",
         report.psnr,
         report.ssim,
-        report.lpips.map_or(String::new(), |l| format!(", LPIPS {l:.4}")),
+        in_words(report.lpips, lpips_net),
         size_in_words(report.splats, report.parameters),
         report.seconds
     ))?;
@@ -334,14 +337,19 @@ fn finish(folder: RunFolder, mut config: RunConfig, mut trainer: Trainer, starte
     say(format_args!("look at {}", folder.file("report.html").display()))
 }
 
+/// `, LPIPS (alex) 0.1234`, where it was measured.
+fn in_words(lpips: Option<f64>, net: Option<LpipsNet>) -> String {
+    let pair = lpips.zip(net);
+    pair.map_or(String::new(), |(lpips, net)| format!(", LPIPS ({net}) {lpips:.4}"))
+}
+
 /// What is left out of the recipe because LPIPS has no weights.
 fn missing_weights(trainer: &Trainer) -> Option<String> {
     let weighs = |moment: &Moment| moment.values[Param::PerceptualWeight as usize] > 0.0;
     let missing = trainer.options.lpips.is_none() && outline(&trainer.recipe, 1000).iter().any(weighs);
     missing.then(|| {
         format!(
-            "recipe {} is trained without its perceptual loss, for no weights of LPIPS were found: give \
-             lpips_squeeze.safetensors with --lpips FILE or name it in IRRADIA_LPIPS",
+            "recipe {} is trained without its perceptual loss, since no weights of LPIPS were found: {HOW}",
             trainer.recipe.name
         )
     })

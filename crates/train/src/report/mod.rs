@@ -56,6 +56,9 @@ pub struct Report {
     pub ssim: f64,
     /// Mean over the held-out views; `None` without the network's weights.
     pub lpips: Option<f64>,
+    /// The network whose features it compares: `squeeze`, `alex` or `vgg`.
+    #[serde(default)]
+    pub lpips_net: Option<String>,
     /// The held-out views.
     pub views: Vec<ViewReport>,
     /// The stages of the recipe, in order.

@@ -7,7 +7,7 @@ use crate::Rows;
 use crate::config::Sampler;
 use crate::field::Field;
 use crate::mlp::PANEL;
-use crate::net::{Block, Net, NetParameters, exp, get3, place, set3};
+use crate::net::{Block, Net, NetParameters, get3, place, set3};
 use crate::render::quadrature::weights;
 use crate::sample::importance::importance;
 use crate::sample::march::March;
@@ -310,7 +310,7 @@ impl Kernel for Densities<'_> {
         self.through.resize(self.lengths.len(), 0.0);
         for s in (0..self.lengths.len()).step_by(S::LANES) {
             let thickness = simd.load(&self.block.density[s..]) * simd.load(&self.lengths[s..]);
-            exp(-thickness).store(&mut self.through[s..]);
+            (-thickness).exp().store(&mut self.through[s..]);
         }
     }
 }

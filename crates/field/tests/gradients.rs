@@ -11,26 +11,14 @@ use irradia_field::render::quadrature::{weights, weights_vjp};
 use irradia_field::sample::proposal::{distortion, interlevel};
 use irradia_field::{Rows, background_color, background_vjp};
 use irradia_scene::Rng;
+use irradia_testkit::differences::Differences;
 
 /// Steps of the differences; their error is of its square, 1e-10, beside rounding of 1e-16 / 1e-5.
 const H: f64 = 1e-5;
 
-/// Compares `gradient` with central differences of `f` at `x`, in the components `which`.
+/// Holds `gradient` against central differences of `f` at `x`, in the components `which`.
 fn check(what: &str, x: &[f64], gradient: &[f64], which: impl Iterator<Item = usize>, f: impl Fn(&[f64]) -> f64) {
-    let scale = gradient.iter().fold(1e-3f64, |m, v| m.max(v.abs()));
-    for i in which {
-        let at = |h: f64| {
-            let mut moved = x.to_vec();
-            moved[i] += h;
-            f(&moved)
-        };
-        let difference = (at(H) - at(-H)) / (2.0 * H);
-        assert!(
-            (difference - gradient[i]).abs() < 1e-6 * scale,
-            "{what} {i}: gradient {} and differences {difference}",
-            gradient[i]
-        );
-    }
+    Differences::of_largest(H, 1e-6).hold(what, x, gradient, which, f);
 }
 
 fn random(rng: &mut Rng, n: usize, low: f32, high: f32) -> Vec<f64> {

@@ -34,6 +34,10 @@ impl<'a> Bytes<'a> {
         Ok(self.array::<1>()?[0])
     }
 
+    pub fn u16(&mut self) -> Result<u16, Malformed> {
+        Ok(u16::from_le_bytes(self.array()?))
+    }
+
     pub fn u32(&mut self) -> Result<u32, Malformed> {
         Ok(u32::from_le_bytes(self.array()?))
     }
@@ -57,6 +61,18 @@ impl<'a> Bytes<'a> {
     /// Bytes up to a zero, which is taken too; invalid UTF-8 is replaced.
     pub fn text(&mut self) -> Result<String, Malformed> {
         let length = self.rest.iter().position(|byte| *byte == 0).unwrap_or(self.rest.len());
+        let text = String::from_utf8_lossy(self.take(length)?).into_owned();
+        self.u8()?;
+        Ok(text)
+    }
+
+    /// Bytes up to a line feed, which is taken too; invalid UTF-8 is replaced.
+    pub fn line(&mut self) -> Result<String, Malformed> {
+        let length = self
+            .rest
+            .iter()
+            .position(|byte| *byte == b'\n')
+            .unwrap_or(self.rest.len());
         let text = String::from_utf8_lossy(self.take(length)?).into_owned();
         self.u8()?;
         Ok(text)

@@ -1,4 +1,4 @@
-//! Files in, files out: datasets of posed photographs, splat scenes, point clouds and pictures.
+//! Files in, files out: datasets of posed photographs, splat scenes, point clouds, pictures, and other programs' tensors.
 //!
 //! Foreign conventions stop in this crate: whatever a file means by a pose, a pixel or a colour, what comes out follows
 //! the conventions of [`irradia_scene`]. The parsers in [`parse`] take bytes and are fuzzed; no input makes them panic,
@@ -17,6 +17,7 @@ mod photo;
 mod ply;
 mod points_ply;
 mod splats;
+mod tensors;
 mod undistort;
 
 pub use atomic::write_atomic;
@@ -26,3 +27,4 @@ pub use error::{FormatError, Malformed};
 pub use image_file::{Pixels, read_image, write_png, write_png_16};
 pub use points_ply::{read_points_ply, write_points_ply};
 pub use splats::{SplatFormat, read_splats, write_splats};
+pub use tensors::{Tensor, read_tensors};

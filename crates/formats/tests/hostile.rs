@@ -3,8 +3,14 @@
 
 use irradia_formats::parse;
 use irradia_scene::Rng;
+use irradia_testkit::torch::{self, NamedTensor};
 
 const ROUNDS: u32 = 3000;
+
+const TENSORS: [NamedTensor; 2] = [
+    ("a.weight", &[2, 2], &[1.0, 2.0, 3.0, 4.0]),
+    ("a.bias", &[2], &[0.5; 2]),
+];
 
 /// A parser and a file that it accepts.
 struct Case {
@@ -138,6 +144,12 @@ fn cases() -> Vec<Case> {
         }),
         case("points, big", points_ply("binary_big_endian"), |b| {
             parse::points_ply(b).is_ok()
+        }),
+        case("state dict, archive", torch::archive(&TENSORS), |b| {
+            parse::tensors(b).is_ok()
+        }),
+        case("state dict, stream", torch::stream(&TENSORS), |b| {
+            parse::tensors(b).is_ok()
         }),
         case("splats", splat_ply(), |b| parse::splat_ply(b).is_ok()),
     ]

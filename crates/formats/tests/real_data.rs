@@ -6,21 +6,9 @@ use irradia_scene::{Dataset, Lens, View};
 use std::collections::HashSet;
 use std::path::{Path, PathBuf};
 
-/// The folder of shared data, or a loud line and `None`; with `IRRADIA_REQUIRE_SHARED` its absence fails the test.
+/// A part of the shared data.
 fn shared(name: &str) -> Option<PathBuf> {
-    let path = Path::new(env!("CARGO_MANIFEST_DIR"))
-        .join("../../../shared/data")
-        .join(name);
-    if path.exists() {
-        return Some(path);
-    }
-    assert!(
-        std::env::var_os("IRRADIA_REQUIRE_SHARED").is_none(),
-        "{} is absent and IRRADIA_REQUIRE_SHARED is set",
-        path.display()
-    );
-    eprintln!("SKIPPED (no ../shared): {name}");
-    None
+    irradia_testkit::shared(&format!("data/{name}"))
 }
 
 fn read(path: &Path) -> Dataset {

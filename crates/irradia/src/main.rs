@@ -34,6 +34,8 @@ enum Command {
     Recipe(command::recipe::Args),
     /// Measure a scene against photographs: PSNR, SSIM, LPIPS
     Eval(command::eval::Args),
+    /// Say where weights of LPIPS are found, or import them from PyTorch's files
+    Lpips(command::lpips::Args),
     /// Render a scene into PNG frames
     Render(command::render::Args),
     /// Say what a scene, a run or a dataset holds
@@ -63,6 +65,7 @@ fn main() -> ExitCode {
         Command::Compare(args) => command::compare::run(&args),
         Command::Recipe(args) => command::recipe::run(&args),
         Command::Eval(args) => command::eval::run(&args),
+        Command::Lpips(args) => command::lpips::run(&args),
         Command::Render(args) => command::render::run(&args),
         Command::Info(args) => command::files::info(&args),
         Command::Convert(args) => command::files::convert(&args),

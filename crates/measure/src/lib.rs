@@ -15,4 +15,7 @@ pub use loss::depth::{DepthKind, DepthLoss, DepthSample};
 pub use loss::perceptual::{Crop, perceptual};
 pub use loss::smooth::{SmoothLoss, Smoothed};
 pub use loss::{LossValues, LossWeights, PhotometricLoss, Target, Truth};
-pub use metric::{Affine, Evaluation, Lpips, LpipsError, evaluate, psnr, psnr_masked, ssim, ssim_masked};
+pub use metric::{
+    Affine, Evaluation, ImportedTensor, Lpips, LpipsError, LpipsNet, evaluate, psnr, psnr_masked, ssim, ssim_masked,
+    to_weights_file,
+};

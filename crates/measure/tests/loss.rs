@@ -1,11 +1,12 @@
 //! The loss through its public face: golden gradients, 8-bit truths, padded planes.
 
-mod shared;
+mod tensors;
 
 use irradia_measure::{LossWeights, PhotometricLoss, Target, Truth};
 use irradia_scene::{Image, Rng};
+use irradia_testkit::shared;
 use safetensors::SafeTensors;
-use shared::{shared, tensor_f64, tensor_image};
+use tensors::{tensor_f64, tensor_image};
 
 /// `[3, stride]` of an `[H, W, 3]` image, with not-a-number in the padding, which must not be read.
 fn planar(image: &Image, stride: usize) -> Vec<f32> {

@@ -1,13 +1,14 @@
 //! Metrics against golden values (an independent implementation) and LPIPS against its published check values.
 
-mod shared;
+mod tensors;
 
-use irradia_measure::{Lpips, LpipsError, evaluate, psnr, ssim};
+use irradia_measure::{Lpips, LpipsError, LpipsNet, evaluate, psnr, ssim};
 use irradia_scene::Image;
+use irradia_testkit::shared;
 use safetensors::SafeTensors;
 use safetensors::tensor::TensorView;
-use shared::{read_image, shared, tensor_image};
 use std::fs;
+use tensors::{read_image, tensor_image};
 
 const WEIGHTS: &str = "data/lpips/lpips_squeeze.safetensors";
 
@@ -38,28 +39,33 @@ fn psnr_and_ssim_have_the_golden_values() {
 
 #[test]
 fn lpips_has_the_published_check_values() {
-    let Some(weights) = shared(WEIGHTS) else { return };
-    let net = Lpips::load(weights).unwrap();
-    let [reference, p0, p1] = ["ref", "p0", "p1"].map(|name| {
-        let path = shared(&format!("data/lpips/ex_{name}.png")).unwrap();
-        read_image(path)
-    });
-    // Published to four digits.
-    for (other, want) in [(&p0, 0.7110), (&p1, 0.1479)] {
-        let got = net.distance(&reference, other).unwrap();
-        println!("LPIPS {got:.6}, published {want}");
-        assert!((got - want).abs() < 6e-5, "{got} and not {want}");
+    for (which, far, near) in [(LpipsNet::Squeeze, 0.7110, 0.1479), (LpipsNet::Alex, 0.7219, 0.1376)] {
+        let Some(weights) = shared(&format!("data/lpips/{}", which.file_name())) else {
+            return;
+        };
+        let net = Lpips::load(weights).unwrap();
+        assert_eq!(net.net(), which);
+        let [reference, p0, p1] = ["ref", "p0", "p1"].map(|name| {
+            let path = shared(&format!("data/lpips/ex_{name}.png")).unwrap();
+            read_image(path)
+        });
+        // Known to four digits.
+        for (other, want) in [(&p0, far), (&p1, near)] {
+            let got = net.distance(&reference, other).unwrap();
+            println!("LPIPS {which} {got:.6}, published {want}");
+            assert!((got - want).abs() < 6e-5, "{which}: {got} and not {want}");
+        }
+        assert_eq!(net.distance(&p0, &p0).unwrap(), 0.0);
+        let back = net.distance(&p0, &reference).unwrap();
+        assert!((back - far).abs() < 6e-5, "a distance is symmetric: {back}");
     }
-    assert_eq!(net.distance(&p0, &p0).unwrap(), 0.0);
-    let back = net.distance(&p0, &reference).unwrap();
-    assert!((back - 0.7110).abs() < 6e-5, "a distance is symmetric: {back}");
 }
 
 #[test]
 fn lpips_takes_images_down_to_its_smallest_and_refuses_smaller_ones() {
     let Some(weights) = shared(WEIGHTS) else { return };
     let net = Lpips::load(weights).unwrap();
-    let side = Lpips::MIN_SIDE;
+    let side = net.net().min_side();
     for (w, h) in [(side, side), (side, 64), (18, 19), (31, 33)] {
         let mut render = Image::zeros(w, h, 3);
         render.data[0] = 1.0;
@@ -124,17 +130,21 @@ fn weights_that_are_broken_are_refused_in_one_line() {
     refused(b"not a file of tensors at all", "no whole safetensors file");
     refused(&u64::MAX.to_le_bytes(), "no whole safetensors file");
     let bias = [0u8; 256];
-    let whole = |name: &str, shape: Vec<usize>, data: &[u8]| {
-        let view = TensorView::new(safetensors::Dtype::F32, shape, data).unwrap();
-        safetensors::serialize([(name, view)], None).unwrap()
+    let whole = |tensors: &[(&str, Vec<usize>, &[u8])]| {
+        let view = |shape: &Vec<usize>, data| TensorView::new(safetensors::Dtype::F32, shape.clone(), data).unwrap();
+        let views = tensors.iter().map(|(name, shape, data)| (*name, view(shape, data)));
+        safetensors::serialize(views, None).unwrap()
     };
-    refused(&whole("something", vec![64], &bias), "features.0.weight is missing");
+    refused(&whole(&[("something", vec![64], &bias)]), "no features of SqueezeNet");
+    let mark = ("features.3.squeeze.weight", vec![64], &bias[..]);
+    refused(&whole(&[mark.clone()]), "features.0.weight is missing");
     refused(
-        &whole("features.0.weight", vec![64], &bias),
+        &whole(&[mark.clone(), ("features.0.weight", vec![64], &bias)]),
         "[64] and not F32 [64, 3, 3, 3]",
     );
     let nan = f32::NAN.to_le_bytes().repeat(64 * 27);
-    refused(&whole("features.0.weight", vec![64, 3, 3, 3], &nan), "not finite");
+    let poison = ("features.0.weight", vec![64, 3, 3, 3], &nan[..]);
+    refused(&whole(&[mark, poison]), "not finite");
     let missing = Lpips::load(folder.path().join("absent"))
         .err()
         .expect("absent")

@@ -11,6 +11,10 @@ use std::fmt::Display;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
+/// How to get the weights of LPIPS, in the words of the command line.
+pub const HOW_TO_GET_LPIPS: &str = "import the weights once with irradia lpips --import FEATURES HEADS, or name a file or a \
+                                    folder with --lpips or IRRADIA_LPIPS";
+
 /// The recipe of a request that names none: the best for its time on all scenes of RESULTS.md.
 pub const DEFAULT_RECIPE: &str = "fast";
 
@@ -254,8 +258,7 @@ impl TrainRequest {
         let missing = self.input.lpips.is_none() && outline(&self.recipe, 1000).iter().any(weighs);
         let line = || {
             format!(
-                "recipe {} is trained without its perceptual loss, for no weights of LPIPS were found: give \
-                 lpips_squeeze.safetensors with --lpips FILE or name it in IRRADIA_LPIPS",
+                "recipe {} is trained without its perceptual loss, since no weights of LPIPS were found: {HOW_TO_GET_LPIPS}",
                 self.recipe.name
             )
         };

@@ -70,6 +70,11 @@ impl Run {
             psnr: mean.psnr,
             ssim: mean.ssim,
             lpips: mean.lpips,
+            lpips_net: trainer
+                .options
+                .lpips
+                .as_ref()
+                .map(|lpips| lpips.net().name().to_owned()),
             half_fit_psnr: mean.half_fit_psnr,
             views,
             schedule: schedule(

@@ -126,6 +126,11 @@ impl Run {
         &self.trainer
     }
 
+    /// What was asked for.
+    pub fn request(&self) -> &TrainRequest {
+        &self.request
+    }
+
     /// The folder.
     pub fn folder(&self) -> &RunFolder {
         &self.folder

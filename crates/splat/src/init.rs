@@ -1,12 +1,10 @@
 //! Where the first splats stand: on points that structure from motion found, or at random in what the cameras see.
 
+use crate::nearest::Nearest;
 use crate::{Splats, logit};
 use glam::{Vec2, Vec3};
 use irradia_scene::{Camera, GaussianCloud, PointCloud, Rng, sh};
-use kiddo::SquaredEuclidean;
-use kiddo::immutable::float::kdtree::ImmutableKdTree;
 use rayon::prelude::*;
-use std::num::NonZero;
 
 /// Knobs of the first cloud.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -56,15 +54,15 @@ fn neighbour_distances(positions: &[[f32; 3]]) -> Vec<f32> {
     if positions.len() < 2 || size == 0.0 {
         return vec![if size > 0.0 { 0.01 * size } else { 0.01 }; positions.len()];
     }
-    let tree: ImmutableKdTree<f32, u32, 3, 32> = ImmutableKdTree::new_from_slice(positions);
-    let wanted = NonZero::new(4).expect("not zero"); // The first is the point itself.
+    let tree = Nearest::new(positions);
+    let others = (positions.len() - 1).min(3);
     positions
         .par_iter()
         .map(|p| {
-            let near = tree.nearest_n::<SquaredEuclidean>(p, wanted);
-            let others = &near[1..];
-            let mean = others.iter().map(|n| n.distance).sum::<f32>() / others.len() as f32;
-            mean.sqrt().max(1e-7 * size)
+            let near: [_; 4] = tree.of(*p);
+            // The first is the point itself.
+            let sum: f32 = near[1..=others].iter().map(|(distance, _)| distance).sum();
+            (sum / others as f32).sqrt().max(1e-7 * size)
         })
         .collect()
 }

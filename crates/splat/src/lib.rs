@@ -5,6 +5,7 @@ pub mod densify;
 mod engine;
 pub mod filter;
 pub mod init;
+mod nearest;
 pub mod regularize;
 pub mod render;
 mod splats;

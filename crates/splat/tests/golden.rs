@@ -14,6 +14,10 @@ const CASES: [&str; 5] = [
     "c4_n60_edge_77x53_sh3_symclamp",
 ];
 
+/// A gradient's elements must be right to a thousandth of themselves, or of this part of the array's largest: what is left of
+/// sums over hundreds of pixels in single precision.
+const FLOOR: f64 = 1e-3;
+
 fn splats(golden: &Golden) -> Splats {
     let columns = |name: &str| golden.get_f32(name);
     Splats::from_cloud(&GaussianCloud {
@@ -124,9 +128,8 @@ fn gradients_agree() {
                             item.fill(0.0);
                         }
                     }
-                    let d = relative_difference(&wide(&got), golden.get(&format!("{set}_{name}")));
+                    let d = relative_difference(&wide(&got), golden.get(&format!("{set}_{name}")), FLOOR);
                     println!("{case} {} {set}_{name}: {:.2e}", level.name(), d.worst);
-                    // As the issue asks: single precision against double, relative to the largest of the array.
                     assert!(d.worst < 1e-3, "{case} {} {set}_{name}: {d:?}", level.name());
                 }
                 let mut screens = vec![("means2d", &gradients.screen)];
@@ -140,7 +143,7 @@ fn gradients_agree() {
                             item.fill(0.0);
                         }
                     }
-                    let d = relative_difference(&wide(&screen), golden.get(&format!("{set}_{name}")));
+                    let d = relative_difference(&wide(&screen), golden.get(&format!("{set}_{name}")), FLOOR);
                     println!("{case} {} {set}_{name}: {:.2e}", level.name(), d.worst);
                     assert!(d.worst < 1e-3, "{case} {} {set}_{name}: {d:?}", level.name());
                 }
@@ -151,7 +154,7 @@ fn gradients_agree() {
                     got[4 * i..4 * i + 3].copy_from_slice(&camera.rotation[i]);
                     got[4 * i + 3] = camera.translation[i];
                 }
-                let d = relative_difference(&got, &golden.get(&format!("{set}_viewmat"))[..12]);
+                let d = relative_difference(&got, &golden.get(&format!("{set}_viewmat"))[..12], FLOOR);
                 println!("{case} {} {set}_viewmat: {:.2e}", level.name(), d.worst);
                 assert!(d.worst < 1e-3, "{case} {} {set}_viewmat: {d:?}", level.name());
             }

@@ -172,6 +172,13 @@ pub trait Lanes:
     }
     /// As [`Lanes::exp2`], unspecified below -126: one instruction less where such lanes are masked anyway.
     fn exp2_in_range(self) -> Self;
+    /// `e^self` through `2^x`; finite for any finite `self`, so that results above 2^126 and below 2^-126 are taken as these.
+    #[inline(always)]
+    fn exp(self) -> Self {
+        (self * self.splat(std::f64::consts::LOG2_E))
+            .min(self.splat(126.0))
+            .exp2()
+    }
     /// `1 / self`, within two units in the last place.
     fn recip(self) -> Self;
     /// Sum of the lanes, in a fixed order.

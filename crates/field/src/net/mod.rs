@@ -107,12 +107,6 @@ impl<T: Scalar> NetParameters<T> {
     }
 }
 
-/// e^x.
-#[inline(always)]
-pub(crate) fn exp<F: Lanes>(x: F) -> F {
-    (x * x.splat(std::f64::consts::LOG2_E)).exp2()
-}
-
 impl Net {
     /// Lays a network out.
     pub fn new(shape: NetShape) -> Self {
@@ -240,11 +234,11 @@ impl Net {
                 let (density, slope) = match self.shape.activation {
                     Activation::Exp => {
                         let cap = simd.splat(10.0);
-                        let y = exp(x.min(cap));
+                        let y = x.min(cap).exp();
                         (y, y)
                     }
                     Activation::Softplus => {
-                        let e = exp(-x.abs());
+                        let e = (-x.abs()).exp();
                         let slope = one / (one + e);
                         (
                             x.max(zero) + (one + e).map(ln),
@@ -290,7 +284,7 @@ impl Net {
             for s in (0..3 * PANEL).step_by(S::LANES) {
                 let x = simd.load(&block.color_tape.output()[p * out_rows * PANEL + s..]);
                 // The sigmoid by the side on which nothing overflows.
-                let e = exp(-x.abs());
+                let e = (-x.abs()).exp();
                 let right = one / (one + e);
                 let y = right.or_where_not(simd.splat(0.0).le(x), one - right);
                 y.store(&mut block.rgb[p * 3 * PANEL + s..]);

@@ -58,8 +58,8 @@ pub struct Args {
     /// Threads of each training; all cores when absent
     #[arg(long, value_name = "N", value_parser = thread_count())]
     pub threads: Option<usize>,
-    /// LPIPS weights (lpips_squeeze.safetensors)
-    #[arg(long, value_name = "FILE")]
+    /// LPIPS weights: a file, or a folder of them; see irradia lpips
+    #[arg(long, value_name = "PATH")]
     pub lpips: Option<PathBuf>,
     #[command(flatten)]
     pub reading: DataArgs,

@@ -1,7 +1,8 @@
 //! `irradia demo` and `irradia synth`
 
+use super::lpips::lpips_path;
 use super::render::parse_size;
-use super::{lpips_path, thread_count, train, use_threads};
+use super::{thread_count, train, use_threads};
 use crate::terminal::{note, say};
 use anyhow::Result;
 use irradia_runs::synth::SynthOptions;
@@ -62,7 +63,7 @@ pub fn run(args: &Args) -> Result<()> {
     ));
     train::begin(TrainInput {
         steps: Some(args.steps),
-        lpips: lpips_path(None),
+        lpips: lpips_path(None)?,
         overwrite: true,
         ..TrainInput::new(data, out.clone())
     })?;

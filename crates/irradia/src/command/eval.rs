@@ -1,14 +1,15 @@
 //! `irradia eval`
 
-use super::{DataArgs, Split, lpips, thread_count, use_threads};
+use super::lpips::lpips;
+use super::{DataArgs, Split, thread_count, use_threads};
 use crate::Usage;
-use crate::terminal::say;
+use crate::terminal::{note, say};
 use anyhow::{Context, Result};
-use irradia_measure::Evaluation;
+use irradia_measure::{Evaluation, LpipsNet};
 use irradia_runs::formats::write_atomic;
 use irradia_runs::train::eval::{EvalOptions, EvaluatedView, Metrics};
 use irradia_runs::train::half_fit::HalfFit;
-use irradia_runs::{Scene, evaluate, file_stem, scene_of, write_image};
+use irradia_runs::{HOW_TO_GET_LPIPS, Scene, evaluate, file_stem, scene_of, write_image};
 use serde_json::json;
 use std::path::PathBuf;
 
@@ -31,9 +32,12 @@ pub struct Args {
     /// Write the rendered views here
     #[arg(long, value_name = "DIR")]
     pub save_images: Option<PathBuf>,
-    /// LPIPS weights (lpips_squeeze.safetensors)
-    #[arg(long, value_name = "FILE")]
+    /// LPIPS weights: a file, or a folder of them; see irradia lpips
+    #[arg(long, value_name = "PATH")]
     pub lpips: Option<PathBuf>,
+    /// Network of LPIPS: squeeze, alex or vgg; distances of different networks are not comparable
+    #[arg(long, value_name = "NET")]
+    pub lpips_net: Option<LpipsNet>,
     /// Threads; all cores when absent
     #[arg(long, value_parser = thread_count())]
     pub threads: Option<usize>,
@@ -67,7 +71,13 @@ pub fn run(args: &Args) -> Result<()> {
     if indices.is_empty() {
         return Err(Usage(format!("{} has no such views: try --split all", args.data.display())).into());
     }
-    let lpips = lpips(args.lpips.as_ref())?;
+    let lpips = lpips(args.lpips.as_ref(), args.lpips_net)?;
+    if lpips.is_none() {
+        note(format_args!(
+            "LPIPS is not measured, since no weights were found: {HOW_TO_GET_LPIPS}"
+        ));
+    }
+    let net = lpips.as_ref().map(|lpips| lpips.net());
     let options = EvalOptions {
         render: scene.options,
         metrics: Metrics::All(lpips.as_ref()),
@@ -76,7 +86,7 @@ pub fn run(args: &Args) -> Result<()> {
     let mut rows = Vec::new();
     let see = |view: &EvaluatedView| -> Result<()> {
         let m = view.metrics;
-        say(figures(&view.name, &m))?;
+        say(figures(&view.name, &m, net))?;
         rows.push(json!({
             "name": view.name, "psnr": m.psnr, "ssim": m.ssim, "lpips": m.lpips, "half_fit_psnr": m.half_fit_psnr,
         }));
@@ -87,13 +97,13 @@ pub fn run(args: &Args) -> Result<()> {
         Ok(())
     };
     let mean = evaluate(&scene.model, &dataset, &indices, &options, see)?;
-    say(figures(&format!("mean of {}", rows.len()), &mean))?;
+    say(figures(&format!("mean of {}", rows.len()), &mean, net))?;
     if let Some(path) = &args.json {
         let figures = json!({
             "scene": scene_of(&args.scene), "data": args.data,
             "splats": scene.model.splats().map(|splats| splats.len()),
             "parameters": scene.model.field().map(|field| field.len()),
-            "psnr": mean.psnr, "ssim": mean.ssim, "lpips": mean.lpips, "half_fit_psnr": mean.half_fit_psnr, "views": rows,
+            "psnr": mean.psnr, "ssim": mean.ssim, "lpips": mean.lpips, "lpips_net": net.map(LpipsNet::name), "half_fit_psnr": mean.half_fit_psnr, "views": rows,
         });
         let bytes = serde_json::to_vec_pretty(&figures)?;
         write_atomic(path, |out| out.write_all(&bytes))?;
@@ -102,10 +112,10 @@ pub fn run(args: &Args) -> Result<()> {
 }
 
 /// One line of figures.
-fn figures(name: &str, m: &Evaluation) -> String {
+fn figures(name: &str, m: &Evaluation, net: Option<LpipsNet>) -> String {
     let mut line = format!("{name:<40} PSNR {:6.2} dB  SSIM {:.4}", m.psnr, m.ssim);
-    if let Some(lpips) = m.lpips {
-        line += &format!("  LPIPS {lpips:.4}");
+    if let (Some(lpips), Some(net)) = (m.lpips, net) {
+        line += &format!("  LPIPS ({net}) {lpips:.4}");
     }
     if let Some(psnr) = m.half_fit_psnr {
         line += &format!("  after half fit {psnr:6.2} dB");

@@ -4,6 +4,7 @@ pub mod compare;
 pub mod demo;
 pub mod eval;
 pub mod files;
+pub mod lpips;
 mod progress;
 pub mod recipe;
 mod recipe_keys;
@@ -14,10 +15,9 @@ use crate::Usage;
 use crate::terminal::note;
 use anyhow::{Context, Result};
 use clap::builder::RangedU64ValueParser;
-use irradia_measure::Lpips;
 use irradia_runs::scene::Dataset;
 use irradia_runs::{Reading, RunError};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 /// Which part of a dataset.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
@@ -88,22 +88,6 @@ pub fn warn(warnings: &[String]) {
     for warning in warnings {
         note(format_args!("warning: {warning}"));
     }
-}
-
-/// LPIPS's network: the file given, or `$IRRADIA_LPIPS`, or where the shared data lies; `None` when there is none.
-pub fn lpips(given: Option<&PathBuf>) -> Result<Option<Lpips>> {
-    let path = lpips_path(given);
-    path.map(|path| Lpips::load(&path).context("LPIPS weights")).transpose()
-}
-
-/// The file that [`lpips`] reads, absolute.
-pub fn lpips_path(given: Option<&PathBuf>) -> Option<PathBuf> {
-    let shared = || Some(PathBuf::from("../shared/data/lpips/lpips_squeeze.safetensors")).filter(|path| path.exists());
-    let path = given.cloned();
-    let path = path
-        .or_else(|| std::env::var_os("IRRADIA_LPIPS").map(PathBuf::from))
-        .or_else(shared)?;
-    Some(std::path::absolute(&path).unwrap_or(path))
 }
 
 /// What `--threads` takes.

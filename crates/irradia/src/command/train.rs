@@ -1,7 +1,8 @@
 //! `irradia train`
 
+use super::lpips::{self, lpips_path};
 use super::progress::{Progress, size_in_words};
-use super::{DataArgs, by_option, lpips_path, thread_count, use_threads, warn};
+use super::{DataArgs, by_option, thread_count, use_threads, warn};
 use crate::interrupt::stop_flag;
 use crate::terminal::{note, one_line, say};
 use anyhow::{Result, anyhow};
@@ -47,8 +48,8 @@ pub struct Args {
     /// Replace the run that --out holds
     #[arg(long)]
     pub overwrite: bool,
-    /// LPIPS weights (lpips_squeeze.safetensors)
-    #[arg(long, value_name = "FILE")]
+    /// LPIPS weights: a file, or a folder of them; see irradia lpips
+    #[arg(long, value_name = "PATH")]
     pub lpips: Option<PathBuf>,
     #[command(flatten)]
     pub reading: DataArgs,
@@ -72,14 +73,14 @@ pub fn run(args: &Args) -> Result<()> {
     use_threads(args.threads)?;
     match &args.resume {
         Some(run) => resume(run, args),
-        None => begin(input(args)),
+        None => begin(input(args)?),
     }
 }
 
 /// A new run as the command line asks for it.
-fn input(args: &Args) -> TrainInput {
+fn input(args: &Args) -> Result<TrainInput> {
     let given = |path: &Option<PathBuf>| path.clone().expect("clap asks for it");
-    TrainInput {
+    Ok(TrainInput {
         recipe: args.recipe.clone(),
         set: args.set.clone(),
         max_splats: args.max_splats,
@@ -87,11 +88,11 @@ fn input(args: &Args) -> TrainInput {
         budget: args.budget,
         until_psnr: args.until_psnr,
         seed: args.seed,
-        lpips: lpips_path(args.lpips.as_ref()),
+        lpips: lpips_path(args.lpips.as_ref())?,
         reading: args.reading.reading(),
         overwrite: args.overwrite,
         ..TrainInput::new(given(&args.data), given(&args.out))
-    }
+    })
 }
 
 /// Makes a new run, on the threads that there are.
@@ -124,7 +125,7 @@ fn resume(folder: &Path, args: &Args) -> Result<()> {
     input.until_psnr = args.until_psnr.or(input.until_psnr);
     // Those it began with, where they still lie: a perceptual loss without them would train another scene.
     let kept = input.lpips.filter(|path| path.exists());
-    input.lpips = lpips_path(args.lpips.as_ref().or(kept.as_ref()));
+    input.lpips = lpips_path(args.lpips.as_ref().or(kept.as_ref()))?;
     let request = input.check().map_err(by_option)?;
     let dataset = request.read_dataset()?;
     warn(&dataset.warnings);
@@ -137,6 +138,9 @@ fn resume(folder: &Path, args: &Args) -> Result<()> {
 /// Trains, writes everything, and says how it went.
 fn finish(mut run: Run) -> Result<()> {
     let folder = run.folder().path().to_owned();
+    if let (Some(lpips), Some(path)) = (&run.trainer().options.lpips, &run.request().input().lpips) {
+        lpips::tell(lpips, path);
+    }
     let trained = run.train(&mut [&mut Progress::new(stop_flag())]);
     let finished = trained.and_then(|_| run.finish()).map_err(|error| {
         anyhow!(
@@ -154,7 +158,7 @@ fn tell(finished: &Finished) -> Result<()> {
         "held-out PSNR {:.2} dB, SSIM {:.4}{}{}; {}, {:.1} s of training",
         report.psnr,
         report.ssim,
-        report.lpips.map_or(String::new(), |l| format!(", LPIPS {l:.4}")),
+        in_words(report.lpips, report.lpips_net.as_deref()),
         report.half_fit_psnr.map_or(String::new(), |psnr| format!(
             ", {psnr:.2} dB on right halves fitted on left ones"
         )),
@@ -168,4 +172,10 @@ fn tell(finished: &Finished) -> Result<()> {
         ))?;
     }
     say(format_args!("look at {}", folder.file("report.html").display()))
+}
+
+/// `, LPIPS (alex) 0.1234`, where it was measured.
+fn in_words(lpips: Option<f64>, net: Option<&str>) -> String {
+    let pair = lpips.zip(net);
+    pair.map_or(String::new(), |(lpips, net)| format!(", LPIPS ({net}) {lpips:.4}"))
 }

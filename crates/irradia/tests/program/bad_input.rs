@@ -276,7 +276,8 @@ fn a_disk_that_fills_up_leaves_no_partial_file_and_keeps_what_was_there() {
         command
             .args(["-c", &shell])
             .current_dir(folder.path())
-            .env_remove("IRRADIA_LPIPS");
+            .env_remove("IRRADIA_LPIPS")
+            .env("XDG_DATA_HOME", folder.path().join("share"));
         command.output().expect("a shell").into()
     };
     fs::write(folder.path().join("old.ply"), "what was there").expect("written");

@@ -3,6 +3,7 @@
 mod bad_input;
 mod compare;
 mod field;
+mod lpips;
 mod outputs;
 mod process;
 mod real_data;

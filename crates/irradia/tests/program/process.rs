@@ -56,10 +56,11 @@ impl Ended {
     }
 }
 
-/// The program, to be run in `folder`, where no weights of LPIPS are found.
+/// The program, to be run in `folder`, where no weights of LPIPS are found but in `share/irradia`.
 pub fn program(folder: &Path) -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_irradia"));
     command.current_dir(folder).env_remove("IRRADIA_LPIPS");
+    command.env("XDG_DATA_HOME", folder.join("share"));
     command
         .stdin(Stdio::null())
         .stdout(Stdio::piped())

@@ -80,7 +80,7 @@ fn a_perceptual_loss_without_weights_is_left_out_and_said_once() {
     let ended = irradia(folder.path(), &format!("{line} --out with {change}")).well();
     let warnings: Vec<&str> = ended.stderr.lines().filter(|line| line.contains("LPIPS")).collect();
     assert!(
-        matches!(warnings[..], [one] if one.starts_with("warning: ") && one.contains("--lpips FILE")),
+        matches!(warnings[..], [one] if one.starts_with("warning: ") && one.contains("irradia lpips --import")),
         "{ended:?}"
     );
     let report = json(&folder.path().join("with/report.json"));

@@ -218,10 +218,11 @@ fn row_of_cells<S: Simd>(
 
 #[cfg(test)]
 mod tests {
-    use super::super::differences::{Picture, coordinates};
+    use super::super::picture::Picture;
     use super::super::{LossWeights, PhotometricLoss, Truth};
     use super::*;
     use irradia_compute::simd::Double;
+    use irradia_testkit::differences::{Differences, some_of};
 
     fn in_double(picture: &Picture, render: &[f64], factor: usize) -> (f64, Vec<f64>) {
         let mut v = vec![0.0; render.len()];
@@ -266,7 +267,8 @@ mod tests {
                 let picture = Picture::random(width, height, masked, 11);
                 let (_, v) = in_double(&picture, &picture.render, factor);
                 // Quadratic: central differences are exact but for rounding.
-                coordinates(&picture.render, &v, |x| in_double(&picture, x, factor).0, 1e-4, 1e-7);
+                let value = |render: &[f64]| in_double(&picture, render, factor).0;
+                Differences::of_largest(1e-4, 1e-7).hold("coarse", &picture.render, &v, some_of(v.len()), value);
             }
         }
     }

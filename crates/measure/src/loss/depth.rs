@@ -223,9 +223,9 @@ impl Fit {
 
 #[cfg(test)]
 mod tests {
-    use super::super::differences::coordinates;
     use super::*;
     use irradia_scene::Rng;
+    use irradia_testkit::differences::{Differences, some_of};
 
     const PIXELS: usize = 60;
 
@@ -271,20 +271,11 @@ mod tests {
                 assert!(values.samples > 10 && values.loss > 0.0);
                 assert_eq!(values.scale == 0.0, seed == 3 && kind == DepthKind::Relative);
                 // No residual of these seeds lies within a step of its kink, no alpha within one of the threshold.
-                coordinates(
-                    &depth,
-                    &v_depth,
-                    |d| value(d, &alpha, &samples, kind).0.loss,
-                    1e-6,
-                    1e-6,
-                );
-                coordinates(
-                    &alpha,
-                    &v_alpha,
-                    |a| value(&depth, a, &samples, kind).0.loss,
-                    1e-6,
-                    1e-6,
-                );
+                let differences = Differences::of_largest(1e-6, 1e-6);
+                let by_depth = |d: &[f64]| value(d, &alpha, &samples, kind).0.loss;
+                differences.hold("depth", &depth, &v_depth, some_of(depth.len()), by_depth);
+                let by_alpha = |a: &[f64]| value(&depth, a, &samples, kind).0.loss;
+                differences.hold("alpha", &alpha, &v_alpha, some_of(alpha.len()), by_alpha);
             }
         }
     }

@@ -275,6 +275,6 @@ impl<T> Target<'_, T> {
 }
 
 #[cfg(test)]
-mod differences;
+mod picture;
 #[cfg(test)]
 mod tests;

@@ -48,7 +48,7 @@ impl Crop {
 /// With a mask m in \[0, 1\] the render x is first replaced by `y + m (x - y)`, y being the truth.
 ///
 /// # Errors
-/// When a side of `crop` is below [`Lpips::MIN_SIDE`].
+/// When a side of `crop` is below [`LpipsNet::min_side`](crate::LpipsNet::min_side).
 ///
 /// # Panics
 /// When a length does not match the target's size or `crop` leaves the image: that is a bug of the caller.
@@ -60,7 +60,7 @@ pub fn perceptual(
     weight: f32,
     v_render: &mut [f32],
 ) -> Result<f64, LpipsError> {
-    Lpips::check_size(crop.width, crop.height)?;
+    lpips.check_size(crop.width, crop.height)?;
     Ok(on_crop(
         &lpips.network,
         render,
@@ -125,23 +125,12 @@ fn on_crop<T: Real>(
 #[cfg(test)]
 mod tests {
     use super::super::Truth;
-    use super::super::differences::{Picture, directional};
+    use super::super::picture::Picture;
     use super::*;
-    use std::path::Path;
+    use irradia_testkit::differences::directional;
+    use irradia_testkit::shared;
 
-    /// Where the shared weights lie; `None`, said aloud, where they are absent.
-    fn weights() -> Option<std::path::PathBuf> {
-        let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared/data/lpips/lpips_squeeze.safetensors");
-        if !path.exists() {
-            assert!(
-                std::env::var_os("IRRADIA_REQUIRE_SHARED").is_none(),
-                "the weights are absent"
-            );
-            eprintln!("SKIPPED (no ../shared): LPIPS weights");
-            return None;
-        }
-        Some(path)
-    }
+    const WEIGHTS: &str = "data/lpips/lpips_squeeze.safetensors";
 
     fn evaluate(network: &Network<f64>, picture: &Picture, render: &[f64], crop: Crop) -> (f64, Vec<f64>) {
         let mut v_render = vec![0.0; render.len()];
@@ -151,7 +140,7 @@ mod tests {
 
     #[test]
     fn finite_differences_hold_along_random_directions() {
-        let Some(path) = weights() else { return };
+        let Some(path) = shared(WEIGHTS) else { return };
         let network = Network::<f64>::load(&path).unwrap();
         let whole = |p: &Picture| Crop::whole(p.width, p.height);
         let part = |_: &Picture| Crop {
@@ -176,7 +165,7 @@ mod tests {
 
     #[test]
     fn an_image_like_its_truth_is_at_rest_and_others_go_downhill() {
-        let Some(path) = weights() else { return };
+        let Some(path) = shared(WEIGHTS) else { return };
         let lpips = Lpips::load(path).unwrap();
         let picture = Picture::random(48, 40, false, 5);
         let single = |v: &[f64]| v.iter().map(|v| *v as f32).collect::<Vec<f32>>();
@@ -209,7 +198,7 @@ mod tests {
 
     #[test]
     fn the_loss_is_the_metric_and_its_gradient_stays_in_the_crop() {
-        let Some(path) = weights() else { return };
+        let Some(path) = shared(WEIGHTS) else { return };
         let lpips = Lpips::load(path).unwrap();
         let picture = Picture::random(40, 30, false, 6);
         let single = |v: &[f64]| v.iter().map(|v| *v as f32).collect::<Vec<f32>>();
@@ -247,7 +236,7 @@ mod tests {
 
     #[test]
     fn the_number_of_threads_changes_no_bit() {
-        let Some(path) = weights() else { return };
+        let Some(path) = shared(WEIGHTS) else { return };
         let lpips = Lpips::load(path).unwrap();
         let picture = Picture::random(70, 60, true, 7);
         let bytes = picture.image(&picture.truth).to_u8();

@@ -228,9 +228,10 @@ fn edge<T: Real>(target: &Target<T>, a: usize, b: usize, edges: &[T], k: f64) ->
 
 #[cfg(test)]
 mod tests {
-    use super::super::differences::{Picture, coordinates};
+    use super::super::picture::Picture;
     use super::*;
     use irradia_scene::Rng;
+    use irradia_testkit::differences::{Differences, some_of};
 
     fn knobs(of: Smoothed, k: f64) -> Knobs {
         Knobs {
@@ -267,9 +268,10 @@ mod tests {
                     let (_, [v_depth, v_alpha]) = value(&depth, &alpha, &target, &knobs);
                     // No two neighbours of these seeds are within a step of one another, no alpha of the threshold.
                     let by_depth = |depth: &[f64]| value(depth, &alpha, &target, &knobs).0;
-                    coordinates(&depth, &v_depth, by_depth, 1e-7, 1e-6);
+                    let differences = Differences::of_largest(1e-7, 1e-6);
+                    differences.hold("depth", &depth, &v_depth, some_of(depth.len()), by_depth);
                     let by_alpha = |alpha: &[f64]| value(&depth, alpha, &target, &knobs).0;
-                    coordinates(&alpha, &v_alpha, by_alpha, 1e-7, 1e-6);
+                    differences.hold("alpha", &alpha, &v_alpha, some_of(alpha.len()), by_alpha);
                 }
             }
         }

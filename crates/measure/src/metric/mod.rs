@@ -6,7 +6,7 @@ mod psnr;
 mod ssim;
 
 pub use affine::Affine;
-pub use lpips::{Lpips, LpipsError};
+pub use lpips::{ImportedTensor, Lpips, LpipsError, LpipsNet, to_weights_file};
 pub(crate) use lpips::{Map, Network};
 pub use psnr::{psnr, psnr_masked};
 pub use ssim::{ssim, ssim_masked};
@@ -20,7 +20,7 @@ pub struct Evaluation {
     pub psnr: f64,
     /// Mean structural similarity, at most 1.
     pub ssim: f64,
-    /// Learned perceptual distance, 0 for equal images; `None` without weights or for images below [`Lpips::MIN_SIDE`].
+    /// Learned perceptual distance, 0 for equal images; `None` without weights or for images below [`LpipsNet::min_side`].
     pub lpips: Option<f64>,
     /// PSNR in dB over the right half of the view, after exposure or pose were fitted on its left half; `None` where that
     /// was not asked for. [`evaluate`] leaves it so.

@@ -3,12 +3,10 @@
 
 use super::DensityChange;
 use super::split::is_finite;
+use crate::nearest::Nearest;
 use crate::{SplatState, logit};
 use glam::{Mat3, Quat, Vec3};
-use kiddo::SquaredEuclidean;
-use kiddo::immutable::float::kdtree::ImmutableKdTree;
 use rayon::prelude::*;
-use std::num::NonZero;
 
 /// Knobs.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -49,19 +47,15 @@ fn pairs(state: &SplatState, options: &MergeOptions) -> Vec<(u32, u32)> {
         return Vec::new();
     }
     let positions: Vec<[f32; 3]> = whole.iter().map(|i| mean(state, *i as usize).to_array()).collect();
-    let tree: ImmutableKdTree<f32, u32, 3, 32> = ImmutableKdTree::new_from_slice(&positions);
-    let two = NonZero::new(2).expect("not zero");
+    let tree = Nearest::new(&positions);
     let nearest: Vec<u32> = positions
         .par_iter()
         .enumerate()
         .map(|(i, p)| {
-            let found = tree.nearest_n::<SquaredEuclidean>(p, two);
-            // Of two at the same place either may come first.
-            found
-                .iter()
-                .map(|n| n.item)
-                .find(|item| *item != i as u32)
-                .unwrap_or(i as u32)
+            let found: [_; 2] = tree.of(*p);
+            // The splat itself is among them unless two others lie at the same place.
+            let own = usize::from(found[0].1 == i as u32);
+            found[own].1
         })
         .collect();
     (0..whole.len() as u32)

@@ -15,7 +15,6 @@ mod view;
 mod gradients;
 
 pub use blend::{ALPHA_MAX, TRANSMITTANCE_MIN};
-pub(crate) use project::exp;
 pub use project::{ALPHA_MIN, DILATION};
 pub use view::ViewParams;
 
@@ -99,7 +98,8 @@ pub enum Gather<'a> {
     /// The screen gradient of the centre with each fragment's part taken absolutely (AbsGS, Ye et al. 2024, eq. 6).
     Absolute,
     /// `[H, W]`, an error a pixel: each splat collects the error it shows, weighted by how much of the pixel it is, and
-    /// the sum of these weights (Rota Bulo et al. 2024, "Revising Densification in Gaussian Splatting", eq. 5).
+    /// the sum of these weights (Rota Bulo et al. 2024, "Revising Densification in Gaussian Splatting", eq. 5). The weights
+    /// include those in pixels beyond the image's right and lower border that belong to its last tiles; errors are 0 there.
     Error(&'a [f32]),
 }
 

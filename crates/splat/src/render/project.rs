@@ -90,12 +90,6 @@ pub(super) fn dot<F: Lanes>(a: [F; 3], b: [F; 3]) -> F {
     a[0].mul_add(b[0], a[1].mul_add(b[1], a[2] * b[2]))
 }
 
-/// e^x through 2^x; safe for any finite x.
-#[inline(always)]
-pub(crate) fn exp<F: Lanes>(x: F) -> F {
-    (x * x.splat(LOG2_E)).min(x.splat(126.0)).exp2()
-}
-
 #[inline(always)]
 fn intermediate<F: Lanes>(view: &ViewLanes<F>, g: &Geometry<F>, filter: Option<F>) -> Intermediate<F> {
     let one = view.near.splat(1.0);
@@ -124,7 +118,7 @@ fn intermediate<F: Lanes>(view: &ViewLanes<F>, g: &Geometry<F>, filter: Option<F
             one - two * (i * i + j * j),
         ],
     ];
-    let own_scale = each!(k in 3 => exp(g.log_scale[k]));
+    let own_scale = each!(k in 3 => g.log_scale[k].exp());
     // Mip-Splatting (Yu et al. 2024), eq. 8: convolved with an isotropic Gaussian, at the same mass.
     let (scale, share, thinning) = match filter {
         Some(variance) => {
@@ -153,7 +147,7 @@ fn intermediate<F: Lanes>(view: &ViewLanes<F>, g: &Geometry<F>, filter: Option<F
     let det = dot(cross, cross);
     let dilation = one.splat(DILATION);
     let det_dilated = det + dilation * (cov[0] + cov[2]) + dilation * dilation;
-    let sigmoid = one / (one + exp(-g.opacity_logit));
+    let sigmoid = one / (one + (-g.opacity_logit).exp());
     Intermediate {
         x,
         inv_z,

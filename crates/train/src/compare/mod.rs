@@ -128,6 +128,8 @@ pub struct Figures {
     pub ssim: f64,
     /// Perceptual distance.
     pub lpips: Option<f64>,
+    /// Its network.
+    pub lpips_net: Option<String>,
     /// Held-out PSNR as it grew, the final one included.
     pub looks: Vec<Look>,
     /// See [`rises`].
@@ -207,6 +209,23 @@ pub struct Render {
     pub picture: String,
 }
 
+impl Comparison {
+    /// Heading of LPIPS with its network, or with all where the runs do not have one in common.
+    pub fn lpips_head(&self) -> String {
+        let entries = self.scenes.iter().flat_map(|scene| &scene.entries);
+        let figures = entries
+            .flat_map(|entry| &entry.runs)
+            .filter_map(|run| run.figures.as_ref());
+        let mut nets: Vec<&str> = figures.filter_map(|figures| figures.lpips_net.as_deref()).collect();
+        nets.sort_unstable();
+        nets.dedup();
+        match nets[..] {
+            [] => "LPIPS".to_owned(),
+            _ => format!("LPIPS ({})", nets.join(", ")),
+        }
+    }
+}
+
 impl Spread {
     /// Of values that are finite; `None` where there are none.
     pub fn of(values: impl IntoIterator<Item = f64>) -> Option<Self> {
@@ -240,6 +259,7 @@ impl Figures {
             psnr: report.psnr,
             ssim: report.ssim,
             lpips: report.lpips,
+            lpips_net: report.lpips_net.clone(),
             loss_rises: rises(&report.curve.iter().map(|point| point.loss).collect::<Vec<_>>()),
             error_rises: rises(errors),
             psnr_falls: falls(&looks),

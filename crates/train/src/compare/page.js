@@ -34,11 +34,15 @@
   const { cpu, memory, os } = comparison.machine;
   at("where").textContent = [comparison.device, cpu, memory && bytes(memory), os].filter(Boolean).join(" · ");
 
+  const runs = comparison.scenes.flatMap((scene) => scene.entries).flatMap((entry) => entry.runs);
+  const nets = [...new Set(runs.map((run) => run.figures && run.figures.lpips_net).filter(Boolean))].sort();
+  const lpips = nets.length ? `LPIPS (${nets.join(", ")})` : "LPIPS";
+
   // Mean and spread; the best mean of a column is set in bold where more than one recipe has one.
   const MEASURES = [
     ["PSNR, dB", "psnr", (x) => fixed(x, 2), 1],
     ["SSIM", "ssim", (x) => fixed(x, 4), 1],
-    ["LPIPS", "lpips", (x) => fixed(x, 4), -1],
+    [lpips, "lpips", (x) => fixed(x, 4), -1],
     ["Training, s", "seconds", (x) => fixed(x, 1), -1],
     ["CPU, s", "cpu_seconds", (x) => fixed(x, 1), -1],
     ["Splats", "splats", whole, 0],
@@ -157,7 +161,7 @@
     const lines = comparison.overall.map((o, i) =>
       row([colored(o.recipe, i), fixed(o.psnr, 2), fixed(o.ssim, 4), fixed(o.lpips, 4), fixed(o.seconds, 1), size(o),
         ...[o.marks, o.marks_in_a_third].map((n) => (i ? `${n} of ${o.scenes}` : "–"))]));
-    at("overall-table").replaceWith(table(["Recipe", "PSNR, dB", "SSIM", "LPIPS", "Training, s", "Splats", "Reaches the first",
+    at("overall-table").replaceWith(table(["Recipe", "PSNR, dB", "SSIM", lpips, "Training, s", "Splats", "Reaches the first",
       "In a third of its time"], lines));
     at("overall-note").textContent =
       `Means over the ${comparison.overall[0].scenes} scenes on which every recipe has figures, of the means over seeds. ` +

@@ -3,25 +3,28 @@
 use super::{Comparison, Entry, Reached, Spread};
 use crate::report::columns;
 
-const HEADS: [&str; 12] = [
-    "scene",
-    "recipe",
-    "PSNR, dB",
-    "SSIM",
-    "LPIPS",
-    "train, s",
-    "CPU, s",
-    "splats",
-    "memory, MB",
-    "loss rises",
-    "error rises",
-    "runs",
-];
+fn heads(comparison: &Comparison) -> Vec<String> {
+    let lpips = comparison.lpips_head();
+    let heads: [&str; 12] = [
+        "scene",
+        "recipe",
+        "PSNR, dB",
+        "SSIM",
+        &lpips,
+        "train, s",
+        "CPU, s",
+        "splats",
+        "memory, MB",
+        "loss rises",
+        "error rises",
+        "runs",
+    ];
+    heads.map(str::to_owned).to_vec()
+}
 
 /// The table with aligned columns; errors and what the figures mean stand below it.
 pub fn to_text(comparison: &Comparison) -> String {
-    let heads = HEADS.map(str::to_owned).to_vec();
-    let mut text = columns(&[vec![heads], rows(comparison)].concat(), 2);
+    let mut text = columns(&[vec![heads(comparison)], rows(comparison)].concat(), 2);
     if let Some(lines) = marks(comparison) {
         text += &format!("\n{MARKS}:\n{}", columns(&lines, 1));
     }
@@ -63,7 +66,7 @@ fn marks(comparison: &Comparison) -> Option<Vec<Vec<String>>> {
 /// The tables for a page of results: one of figures, one of the times to each whole dB.
 pub fn to_markdown(comparison: &Comparison) -> String {
     let mut text = format!("{}. {}.\n\n", comparison.conditions.join(", "), comparison.device);
-    text += &markdown(&[vec![HEADS.map(str::to_owned).to_vec()], rows(comparison)].concat(), 2);
+    text += &markdown(&[vec![heads(comparison)], rows(comparison)].concat(), 2);
     text.push('\n');
     for line in errors(comparison) {
         text += &format!("- failed: {}\n", escaped(&line));

@@ -50,6 +50,33 @@ fn room() -> Scene {
 }
 
 #[test]
+fn tables_name_the_network_of_lpips() {
+    let with = |net: &str| Report {
+        lpips: Some(0.1),
+        lpips_net: Some(net.to_owned()),
+        ..report(10.0, 26.0)
+    };
+    let head = |nets: &[&str]| {
+        let runs = nets
+            .iter()
+            .zip(0..)
+            .map(|(net, seed)| run(seed, Some(with(net))))
+            .collect();
+        let scene = Scene::new("room".into(), "data/room".into(), vec![("fast".to_owned(), runs)], None);
+        let comparison = Comparison {
+            scenes: vec![scene],
+            ..Comparison::default()
+        };
+        let (text, markdown) = (to_text(&comparison), to_markdown(&comparison));
+        assert!(text.contains(&comparison.lpips_head()) && markdown.contains(&comparison.lpips_head()));
+        comparison.lpips_head()
+    };
+    assert_eq!(head(&["alex", "alex"]), "LPIPS (alex)");
+    assert_eq!(head(&["squeeze", "alex"]), "LPIPS (alex, squeeze)");
+    assert_eq!(head(&[]), "LPIPS");
+}
+
+#[test]
 fn spreads_are_means_with_sample_deviations() {
     assert_eq!(Spread::of([]), None);
     assert_eq!(Spread::of([f64::NAN]), None);

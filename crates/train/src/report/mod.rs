@@ -56,6 +56,9 @@ pub struct Report {
     pub ssim: f64,
     /// Mean over the held-out views; `None` without the network's weights.
     pub lpips: Option<f64>,
+    /// The network whose features it compares: `squeeze`, `alex` or `vgg`.
+    #[serde(default)]
+    pub lpips_net: Option<String>,
     /// PSNR in dB over the right halves of the held-out views, after their exposure or pose was fitted on their left
     /// halves; `None` where the recipe learns neither.
     #[serde(default, skip_serializing_if = "Option::is_none")]

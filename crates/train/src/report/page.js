@@ -1,5 +1,6 @@
 (() => {
   const report = JSON.parse(document.getElementById("data").textContent);
+  const lpips = report.lpips_net ? `LPIPS (${report.lpips_net})` : "LPIPS";
   // Of a field its numbers are told; there are no splats to count.
   const isField = known(report.parameters);
   document.title = `${report.dataset || "Report"} – Irradia`;
@@ -9,7 +10,7 @@
   for (const [label, value, unit] of [
     ["PSNR", fixed(report.psnr, 2), "dB"],
     ["SSIM", fixed(report.ssim, 4)],
-    ["LPIPS", fixed(report.lpips, 4)],
+    [lpips, fixed(report.lpips, 4)],
     isField ? ["Parameters", whole(report.parameters)] : ["Splats", whole(report.splats)],
     ["Steps", whole(report.steps)],
     ["Training", duration(report.seconds)],
@@ -51,7 +52,7 @@
     ["View", (v) => v.name, (v) => v.name],
     ["PSNR, dB", (v) => v.psnr, (v) => fixed(v.psnr, 2)],
     ["SSIM", (v) => v.ssim, (v) => fixed(v.ssim, 4)],
-    ["LPIPS", (v) => v.lpips, (v) => fixed(v.lpips, 4)],
+    [lpips, (v) => v.lpips, (v) => fixed(v.lpips, 4)],
   ];
   let sorted = { column: 0, up: true };
   const before = (a, b) => {

@@ -1,13 +1,18 @@
-//! LPIPS (Zhang, Isola, Efros, Shechtman, Wang 2018), version 0.1 with the SqueezeNet 1.1 backbone.
+//! LPIPS (Zhang, Isola, Efros, Shechtman, Wang 2018), version 0.1, of SqueezeNet 1.1, AlexNet and VGG16.
 
+mod backbone;
 mod layers;
+mod net;
 mod network;
-mod squeezenet;
 mod weights;
 
+#[cfg(test)]
+mod tests;
+
 pub(crate) use layers::Map;
+pub use net::LpipsNet;
 pub(crate) use network::Network;
-pub use weights::LpipsError;
+pub use weights::{ImportedTensor, LpipsError, to_weights_file};
 
 use super::assert_same_size;
 use irradia_scene::Image;
@@ -19,10 +24,8 @@ pub struct Lpips {
 }
 
 impl Lpips {
-    /// Images narrower or lower than this leave nothing after the network's poolings.
-    pub const MIN_SIDE: u32 = 17;
-
-    /// Reads `lpips_squeeze.safetensors`: `features.*` of SqueezeNet 1.1 (OIHW) and the heads `lin0` to `lin6`.
+    /// Reads a weights file: `features.*` (OIHW) of one of the three networks, which its tensors tell, and the heads
+    /// `lin0.model.1.weight`, ..
     ///
     /// # Errors
     /// When the file cannot be read, is no safetensors file, or lacks a tensor of the right shape with finite values.
@@ -31,24 +34,30 @@ impl Lpips {
         Ok(Self { network })
     }
 
+    /// The network whose features are compared.
+    pub fn net(&self) -> LpipsNet {
+        self.network.net
+    }
+
     /// The distance between two images `[H, W, 3]` with values in \[0, 1\]; 0 for equal ones, about 0.1 for good renders.
     ///
     /// # Errors
-    /// When a side is below [`Lpips::MIN_SIDE`].
+    /// When a side is below [`LpipsNet::min_side`].
     ///
     /// # Panics
     /// When sizes differ or there are not three channels: that is a bug of the caller.
     pub fn distance(&self, render: &Image, truth: &Image) -> Result<f64, LpipsError> {
         assert_same_size(render, truth, None);
         assert_eq!(truth.channels, 3, "LPIPS is for colour");
-        Self::check_size(truth.width as usize, truth.height as usize)?;
+        self.check_size(truth.width as usize, truth.height as usize)?;
         Ok(self.network.distance(map_of(render), map_of(truth)))
     }
 
     /// Whether the network leaves anything of an image of this size.
-    pub(crate) fn check_size(width: usize, height: usize) -> Result<(), LpipsError> {
-        if width.min(height) < Self::MIN_SIDE as usize {
-            return Err(LpipsError::TooSmall { width, height });
+    pub(crate) fn check_size(&self, width: usize, height: usize) -> Result<(), LpipsError> {
+        let least = self.net().min_side();
+        if width.min(height) < least as usize {
+            return Err(LpipsError::TooSmall { width, height, least });
         }
         Ok(())
     }

@@ -1,8 +1,9 @@
 //! The distance between the two images' features, and its gradient with regard to the first.
 
+use super::backbone::Backbone;
 use super::layers::Map;
-use super::squeezenet::{SqueezeNet, TAP_CHANNELS, TAPS};
-use super::weights::{self, LpipsError, Weights};
+use super::net::LpipsNet;
+use super::weights::{self, LpipsError, Tensors, Weights};
 use crate::real::{Real, sum_over};
 use rayon::prelude::*;
 use std::path::Path;
@@ -11,11 +12,12 @@ use std::path::Path;
 const SHIFT: [f64; 3] = [-0.030, -0.088, -0.188];
 const SCALE: [f64; 3] = [0.458, 0.448, 0.450];
 
-/// The network with its heads.
+/// A backbone with its heads.
 pub(crate) struct Network<T> {
-    net: SqueezeNet<T>,
-    /// What each channel of each tap counts, `[7][C]`.
-    heads: [Vec<T>; TAPS],
+    pub(super) net: LpipsNet,
+    backbone: Backbone<T>,
+    /// What each channel of each tap counts, `[tap][C]`.
+    heads: Vec<Vec<T>>,
 }
 
 impl<T: Real> Network<T> {
@@ -23,12 +25,14 @@ impl<T: Real> Network<T> {
     pub(crate) fn load(path: &Path) -> Result<Self, LpipsError> {
         let bytes = weights::read(path)?;
         let weights = Weights::parse(path, &bytes)?;
-        let net = SqueezeNet::from_weights(&weights)?;
-        let mut heads: [Vec<T>; TAPS] = Default::default();
-        for (i, head) in heads.iter_mut().enumerate() {
-            *head = weights.tensor(&format!("lin{i}.model.1.weight"), &[1, TAP_CHANNELS[i], 1, 1])?;
-        }
-        Ok(Self { net, heads })
+        Self::from_weights(weights.net()?, &weights)
+    }
+
+    pub(super) fn from_weights(net: LpipsNet, weights: &dyn Tensors) -> Result<Self, LpipsError> {
+        let backbone = Backbone::from_weights(net, weights)?;
+        let head = |head: Vec<f32>| head.iter().map(|v| T::from_f64(f64::from(*v))).collect();
+        let heads = weights::heads(net, weights)?.into_iter().map(head).collect();
+        Ok(Self { net, backbone, heads })
     }
 
     /// The distance between two images `[H, W, 3]` with values in \[0, 1\].
@@ -37,8 +41,8 @@ impl<T: Real> Network<T> {
         let (mut a, mut b) = (scaled(render), scaled(truth));
         let mut total = 0.0;
         for (tap, head) in self.heads.iter().enumerate() {
-            a = self.net.up_to_tap(tap, &a);
-            b = self.net.up_to_tap(tap, &b);
+            a = self.backbone.up_to_tap(tap, &a);
+            b = self.backbone.up_to_tap(tap, &b);
             total += tap_distance(&a, &b, head, None);
         }
         total
@@ -46,17 +50,18 @@ impl<T: Real> Network<T> {
 
     /// The distance and its gradient with regard to the render, `[H, W, 3]`.
     pub(crate) fn distance_and_gradient(&self, render: Map<T>, truth: Map<T>) -> (f64, Map<T>) {
-        let tape = self.net.forward(scaled(render));
+        let tape = self.backbone.forward(scaled(render));
         let mut b = scaled(truth);
         let mut total = 0.0;
-        let v_taps = std::array::from_fn(|tap| {
-            b = self.net.up_to_tap(tap, &b);
+        let mut v_taps = Vec::with_capacity(self.heads.len());
+        for (tap, head) in self.heads.iter().enumerate() {
+            b = self.backbone.up_to_tap(tap, &b);
             let a = tape.tap(tap);
             let mut v = a.zeros_like();
-            total += tap_distance(a, &b, &self.heads[tap], Some(&mut v));
-            v
-        });
-        let mut v = self.net.vjp(&tape, v_taps);
+            total += tap_distance(a, &b, head, Some(&mut v));
+            v_taps.push(v);
+        }
+        let mut v = self.backbone.vjp(&tape, v_taps);
         for pixel in v.data.as_chunks_mut::<3>().0 {
             for (v, scale) in pixel.iter_mut().zip(SCALE) {
                 *v *= T::from_f64(2.0 / scale);

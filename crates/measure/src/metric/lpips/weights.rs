@@ -1,7 +1,10 @@
-//! The weights file, checked before anything is taken from it.
+//! The weights file, checked before anything is taken from it, and how one is made of what the networks' authors publish.
 
-use irradia_compute::simd::Scalar;
-use safetensors::{Dtype, SafeTensors};
+use super::backbone::{Backbone, tap_channels};
+use super::net::LpipsNet;
+use safetensors::{Dtype, SafeTensors, tensor::TensorView};
+use std::cell::RefCell;
+use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::Read;
 use std::path::{Path, PathBuf};
@@ -18,38 +21,48 @@ pub enum LpipsError {
         source: std::io::Error,
     },
     /// It is not the file it should be.
-    #[error("{} holds no LPIPS weights: {reason}; give lpips_squeeze.safetensors (SqueezeNet 1.1, LPIPS v0.1)", .path.display())]
+    #[error(
+        "{} holds no LPIPS weights: {reason}; make the file with `irradia lpips --import FEATURES HEADS`",
+        .path.display()
+    )]
     Weights {
         /// The file.
         path: PathBuf,
         /// What is wrong with it.
         reason: String,
     },
-    /// The network's poolings would leave no pixel.
+    /// What is to be imported does not make a network.
     #[error(
-        "an image of {width}x{height} is too small for LPIPS; use sides of at least {} pixels",
-        super::Lpips::MIN_SIDE
+        "{reason}; give the features of torchvision's SqueezeNet 1.1, AlexNet or VGG16 and the LPIPS v0.1 heads of the same network"
     )]
+    Import {
+        /// What is wrong with it.
+        reason: String,
+    },
+    /// The network's poolings would leave no pixel.
+    #[error("an image of {width}x{height} is too small for LPIPS; use sides of at least {least} pixels")]
     TooSmall {
         /// Pixels.
         width: usize,
         /// Pixels.
         height: usize,
+        /// Pixels, by the network.
+        least: u32,
     },
 }
 
-/// SqueezeNet's weights take 2.9 MB; a file far beyond that is another file, and is not read whole to find out.
-const MAX_BYTES: u64 = 64 << 20;
+/// VGG's weights, the largest, take 59 MB; a file far beyond that is another file, and is not read whole to find out.
+const MAX_BYTES: u64 = 80 << 20;
 
 /// The file's bytes.
 pub(super) fn read(path: &Path) -> Result<Vec<u8>, LpipsError> {
-    let failed = |source| LpipsError::Read {
+    let unreadable = |source| LpipsError::Read {
         path: path.to_owned(),
         source,
     };
     let mut bytes = Vec::new();
-    let file = File::open(path).map_err(failed)?;
-    file.take(MAX_BYTES + 1).read_to_end(&mut bytes).map_err(failed)?;
+    let file = File::open(path).map_err(unreadable)?;
+    file.take(MAX_BYTES + 1).read_to_end(&mut bytes).map_err(unreadable)?;
     if bytes.len() as u64 > MAX_BYTES {
         return Err(LpipsError::Weights {
             path: path.to_owned(),
@@ -59,7 +72,13 @@ pub(super) fn read(path: &Path) -> Result<Vec<u8>, LpipsError> {
     Ok(bytes)
 }
 
-/// Tensors by name.
+/// Where a network's tensors come from.
+pub(super) trait Tensors {
+    /// The values of tensor `name`, which must be of `shape` and finite.
+    fn tensor(&self, name: &str, shape: &[usize]) -> Result<Vec<f32>, LpipsError>;
+}
+
+/// The tensors of our file.
 pub(super) struct Weights<'a> {
     path: &'a Path,
     tensors: SafeTensors<'a>,
@@ -74,27 +93,108 @@ impl<'a> Weights<'a> {
         Ok(Self { path, tensors })
     }
 
-    /// The values of tensor `name`, which must be of `shape`, stored in single precision and finite.
-    pub(super) fn tensor<T: Scalar>(&self, name: &str, shape: &[usize]) -> Result<Vec<T>, LpipsError> {
-        let wrong = |reason: String| LpipsError::Weights {
+    /// The network whose features these are.
+    pub(super) fn net(&self) -> Result<LpipsNet, LpipsError> {
+        LpipsNet::recognise(|name| self.tensors.tensor(name).is_ok())
+            .ok_or_else(|| self.wrong("it has no features of SqueezeNet, AlexNet or VGG16".to_owned()))
+    }
+
+    fn wrong(&self, reason: String) -> LpipsError {
+        LpipsError::Weights {
             path: self.path.to_owned(),
             reason,
-        };
-        let tensor = self
-            .tensors
-            .tensor(name)
-            .map_err(|_| wrong(format!("tensor {name} is missing")))?;
+        }
+    }
+}
+
+impl Tensors for Weights<'_> {
+    fn tensor(&self, name: &str, shape: &[usize]) -> Result<Vec<f32>, LpipsError> {
+        let missing = |_| self.wrong(format!("tensor {name} is missing"));
+        let tensor = self.tensors.tensor(name).map_err(missing)?;
         if tensor.dtype() != Dtype::F32 || tensor.shape() != shape {
             let (dtype, found) = (tensor.dtype(), tensor.shape());
-            return Err(wrong(format!(
-                "tensor {name} is {dtype:?} {found:?} and not F32 {shape:?}"
-            )));
+            return Err(self.wrong(format!("tensor {name} is {dtype:?} {found:?} and not F32 {shape:?}")));
         }
         let (values, _) = tensor.data().as_chunks::<4>();
         let values: Vec<f32> = values.iter().map(|bytes| f32::from_le_bytes(*bytes)).collect();
         if values.iter().any(|v| !v.is_finite()) {
+            return Err(self.wrong(format!("tensor {name} has values that are not finite")));
+        }
+        Ok(values)
+    }
+}
+
+/// The tensor of head `tap`.
+pub(super) fn head_name(tap: usize) -> String {
+    format!("lin{tap}.model.1.weight")
+}
+
+/// The values of every head, `[tap][C]`.
+pub(super) fn heads(net: LpipsNet, weights: &dyn Tensors) -> Result<Vec<Vec<f32>>, LpipsError> {
+    let channels = tap_channels(net);
+    let head = |(tap, channels): (usize, &usize)| weights.tensor(&head_name(tap), &[1, *channels, 1, 1]);
+    channels.iter().enumerate().map(head).collect()
+}
+
+/// A tensor of a file that is imported.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ImportedTensor {
+    /// Sizes, outermost first.
+    pub shape: Vec<usize>,
+    /// Row by row.
+    pub values: Vec<f32>,
+}
+
+/// Tensors by name, and which of them were asked for.
+struct Imported<'a> {
+    tensors: &'a BTreeMap<String, ImportedTensor>,
+    used: RefCell<BTreeMap<String, &'a ImportedTensor>>,
+}
+
+impl Tensors for Imported<'_> {
+    fn tensor(&self, name: &str, shape: &[usize]) -> Result<Vec<f32>, LpipsError> {
+        let wrong = |reason: String| LpipsError::Import { reason };
+        let tensor = self.tensors.get(name);
+        let tensor = tensor.ok_or_else(|| wrong(format!("tensor {name} is missing")))?;
+        if tensor.shape != shape || tensor.values.len() != shape.iter().product::<usize>() {
+            return Err(wrong(format!("tensor {name} is {:?} and not {shape:?}", tensor.shape)));
+        }
+        if tensor.values.iter().any(|v| !v.is_finite()) {
             return Err(wrong(format!("tensor {name} has values that are not finite")));
         }
-        Ok(values.iter().map(|v| T::from_f64(f64::from(*v))).collect())
+        self.used.borrow_mut().insert(name.to_owned(), tensor);
+        Ok(tensor.values.clone())
     }
+}
+
+/// The network that `tensors`, features and heads by the names that torchvision and LPIPS give them, are of, and the bytes
+/// of its weights file. Other tensors are left out.
+///
+/// # Errors
+/// When a tensor of the network is missing, of another shape or not finite.
+pub fn to_weights_file(tensors: &BTreeMap<String, ImportedTensor>) -> Result<(LpipsNet, Vec<u8>), LpipsError> {
+    let wrong = |reason: String| LpipsError::Import { reason };
+    let net = LpipsNet::recognise(|name| tensors.contains_key(name))
+        .ok_or_else(|| wrong("no features of SqueezeNet, AlexNet or VGG16 were found".to_owned()))?;
+    let imported = Imported {
+        tensors,
+        used: RefCell::default(),
+    };
+    Backbone::<f32>::from_weights(net, &imported)?;
+    heads(net, &imported)?;
+    let bytes: Vec<(String, &[usize], Vec<u8>)> = imported
+        .used
+        .into_inner()
+        .into_iter()
+        .map(|(name, tensor)| {
+            let bytes = tensor.values.iter().flat_map(|v| v.to_le_bytes()).collect();
+            (name, tensor.shape.as_slice(), bytes)
+        })
+        .collect();
+    let views = bytes.iter().map(|(name, shape, bytes)| {
+        let view = TensorView::new(Dtype::F32, shape.to_vec(), bytes).expect("as many bytes as the shape says");
+        (name, view)
+    });
+    let file = safetensors::serialize(views, None).map_err(|error| wrong(error.to_string()))?;
+    Ok((net, file))
 }

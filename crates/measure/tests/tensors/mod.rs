@@ -1,25 +1,8 @@
-//! Where the golden files and the real data lie, and how their tensors are read.
+//! How images and golden tensors are read.
 
 use irradia_scene::Image;
 use safetensors::SafeTensors;
 use std::path::PathBuf;
-
-/// `../shared/<path>` beside the repository; `None`, said aloud, where it is absent.
-pub fn shared(path: &str) -> Option<PathBuf> {
-    let full = PathBuf::from(env!("CARGO_MANIFEST_DIR"))
-        .join("../../../shared")
-        .join(path);
-    if full.exists() {
-        return Some(full);
-    }
-    assert!(
-        std::env::var_os("IRRADIA_REQUIRE_SHARED").is_none(),
-        "{} is absent and IRRADIA_REQUIRE_SHARED is set",
-        full.display()
-    );
-    eprintln!("SKIPPED (no ../shared): {}", full.display());
-    None
-}
 
 /// An 8-bit file as `[H, W, 3]` in \[0, 1\].
 #[allow(dead_code, reason = "each test file is a crate of its own and takes what it needs")]

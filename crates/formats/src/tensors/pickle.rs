@@ -1,0 +1,312 @@
+//! The part of Python's pickle protocol 2 that state dicts need, as plain data: a name that a pickle would import stays a
+//! name, and calls are recorded, never made. Opcodes are those of CPython's `pickletools.py`.
+
+use crate::Malformed;
+use crate::bytes::Bytes;
+use std::collections::HashMap;
+
+/// Index of an object. Objects refer to one another by it, so that neither cycles nor depth cost anything.
+pub(super) type Id = usize;
+
+/// What a pickle holds.
+#[derive(Clone, Debug)]
+pub(super) enum Object {
+    /// None, true, false, and integers of more than 8 bytes.
+    Other,
+    Integer(i64),
+    Text(String),
+    Tuple(Vec<Id>),
+    List(Vec<Id>),
+    Dict(Vec<(Id, Id)>),
+    /// `module.name`.
+    Global(String),
+    /// An object kept outside of the pickle, by what identifies it.
+    Persistent(Id),
+    /// A call with its arguments.
+    Call(Id, Id),
+}
+
+/// All objects of a pickle.
+#[derive(Default)]
+pub(super) struct Pickle {
+    objects: Vec<Object>,
+    /// What the pickle is of.
+    pub(super) top: Id,
+}
+
+/// What a pickle may make in all; VGG16's state dict makes some hundred objects.
+const MOST: usize = 1 << 20;
+
+impl Pickle {
+    pub(super) fn object(&self, id: Id) -> &Object {
+        &self.objects[id]
+    }
+
+    pub(super) fn text(&self, id: Id) -> Option<&str> {
+        match self.object(id) {
+            Object::Text(text) => Some(text),
+            _ => None,
+        }
+    }
+
+    pub(super) fn global(&self, id: Id) -> Option<&str> {
+        match self.object(id) {
+            Object::Global(name) => Some(name),
+            _ => None,
+        }
+    }
+
+    pub(super) fn tuple(&self, id: Id) -> Option<&[Id]> {
+        match self.object(id) {
+            Object::Tuple(items) => Some(items),
+            _ => None,
+        }
+    }
+
+    /// A list's or a tuple's.
+    pub(super) fn items(&self, id: Id) -> Option<&[Id]> {
+        match self.object(id) {
+            Object::List(items) => Some(items),
+            _ => self.tuple(id),
+        }
+    }
+
+    pub(super) fn size(&self, id: Id) -> Option<usize> {
+        match self.object(id) {
+            Object::Integer(value) => usize::try_from(*value).ok(),
+            _ => None,
+        }
+    }
+
+    pub(super) fn objects(&self) -> impl Iterator<Item = &Object> {
+        self.objects.iter()
+    }
+}
+
+/// Reads one pickle, up to its end.
+pub(super) fn read(bytes: &mut Bytes) -> Result<Pickle, Malformed> {
+    let mut machine = Machine::default();
+    while !machine.step(bytes)? {}
+    Ok(machine.pickle)
+}
+
+#[derive(Default)]
+struct Machine {
+    pickle: Pickle,
+    stack: Vec<Id>,
+    /// Heights of the stack.
+    marks: Vec<usize>,
+    memo: HashMap<u32, Id>,
+    /// Objects, marks, recollections and copies made so far.
+    grown: usize,
+}
+
+fn wrong(what: impl std::fmt::Display) -> Malformed {
+    Malformed(format!("not a usable PyTorch state dict: {what}"))
+}
+
+impl Machine {
+    /// One opcode; whether it was the last.
+    fn step(&mut self, bytes: &mut Bytes) -> Result<bool, Malformed> {
+        let code = bytes.u8()?;
+        match code {
+            0x80 => {
+                let protocol = bytes.u8()?;
+                if protocol != 2 {
+                    return Err(wrong(format_args!("pickle protocol {protocol} and not 2")));
+                }
+            }
+            b'N' | 0x88 | 0x89 => self.push(Object::Other)?,
+            b'K' => self.push_integer(bytes.u8()?)?,
+            b'M' => self.push_integer(bytes.u16()?)?,
+            b'J' => self.push_integer(bytes.u32()? as i32)?,
+            0x8a => {
+                let length = bytes.u8()?;
+                let digits = bytes.take(length.into())?;
+                self.push(long(digits))?;
+            }
+            b'X' | b'T' => {
+                let length = bytes.u32()?;
+                self.push_text(bytes.take(length as usize)?)?;
+            }
+            b'U' => {
+                let length = bytes.u8()?;
+                self.push_text(bytes.take(length.into())?)?;
+            }
+            b'c' => {
+                let [module, name] = [bytes.line()?, bytes.line()?];
+                self.push(Object::Global(format!("{module}.{name}")))?;
+            }
+            b'(' => {
+                self.grow(1)?;
+                self.marks.push(self.stack.len());
+            }
+            b')' => self.push(Object::Tuple(Vec::new()))?,
+            b']' => self.push(Object::List(Vec::new()))?,
+            b'}' => self.push(Object::Dict(Vec::new()))?,
+            b't' => {
+                let items = self.since_mark()?;
+                self.push(Object::Tuple(items))?;
+            }
+            0x85..=0x87 => {
+                let count = usize::from(code - 0x84);
+                let at = self.stack.len().checked_sub(count);
+                let items = self
+                    .stack
+                    .split_off(at.ok_or_else(|| wrong("it takes more than it has"))?);
+                self.push(Object::Tuple(items))?;
+            }
+            b'a' => {
+                let item = self.pop()?;
+                self.append(&[item])?;
+            }
+            b'e' => {
+                let items = self.since_mark()?;
+                self.append(&items)?;
+            }
+            b's' => {
+                let [value, key] = [self.pop()?, self.pop()?];
+                self.set(&[key, value])?;
+            }
+            b'u' => {
+                let items = self.since_mark()?;
+                self.set(&items)?;
+            }
+            b'q' => self.remember(bytes.u8()?.into())?,
+            b'r' => {
+                let key = bytes.u32()?;
+                self.remember(key)?;
+            }
+            b'h' => self.recall(bytes.u8()?.into())?,
+            b'j' => {
+                let key = bytes.u32()?;
+                self.recall(key)?;
+            }
+            b'Q' => {
+                let id = self.pop()?;
+                self.push(Object::Persistent(id))?;
+            }
+            b'R' => {
+                let [arguments, function] = [self.pop()?, self.pop()?];
+                let made = self.call(function, arguments)?;
+                self.push(made)?;
+            }
+            // Attributes given to an object, such as the versions of a state dict's modules: not needed.
+            b'b' => drop(self.pop()?),
+            b'.' => {
+                self.pickle.top = self.pop()?;
+                return Ok(true);
+            }
+            _ => {
+                return Err(wrong(format_args!(
+                    "it has pickle opcode {code:#04x}, which state dicts do not need"
+                )));
+            }
+        }
+        Ok(false)
+    }
+
+    /// What a call makes: ordered dicts, as Python 2 (with a list of pairs) and 3 (empty) build them, become dicts.
+    fn call(&mut self, function: Id, arguments: Id) -> Result<Object, Malformed> {
+        let call = Object::Call(function, arguments);
+        if self.pickle.global(function) != Some("collections.OrderedDict") {
+            return Ok(call);
+        }
+        match self.pickle.tuple(arguments) {
+            Some([]) => Ok(Object::Dict(Vec::new())),
+            Some([pairs]) => {
+                let pairs = *pairs;
+                self.grow(self.pickle.items(pairs).map_or(0, <[Id]>::len))?;
+                let pair = |id: &Id| match self.pickle.items(*id) {
+                    Some([key, value]) => Some((*key, *value)),
+                    _ => None,
+                };
+                let pairs = self.pickle.items(pairs).unwrap_or_default().iter().map(pair);
+                Ok(pairs.collect::<Option<_>>().map_or(call, Object::Dict))
+            }
+            _ => Ok(call),
+        }
+    }
+
+    /// Holds what `count` more cost against [`MOST`].
+    fn grow(&mut self, count: usize) -> Result<(), Malformed> {
+        self.grown += count;
+        if self.grown > MOST {
+            return Err(wrong("it makes too many objects"));
+        }
+        Ok(())
+    }
+
+    fn push(&mut self, object: Object) -> Result<(), Malformed> {
+        self.grow(1)?;
+        self.stack.push(self.pickle.objects.len());
+        self.pickle.objects.push(object);
+        Ok(())
+    }
+
+    fn push_integer(&mut self, value: impl Into<i64>) -> Result<(), Malformed> {
+        self.push(Object::Integer(value.into()))
+    }
+
+    fn push_text(&mut self, text: &[u8]) -> Result<(), Malformed> {
+        self.push(Object::Text(String::from_utf8_lossy(text).into_owned()))
+    }
+
+    fn pop(&mut self) -> Result<Id, Malformed> {
+        let low = self.marks.last().copied().unwrap_or(0);
+        let popped = if self.stack.len() > low { self.stack.pop() } else { None };
+        popped.ok_or_else(|| wrong("it takes more than it has"))
+    }
+
+    fn since_mark(&mut self) -> Result<Vec<Id>, Malformed> {
+        let mark = self
+            .marks
+            .pop()
+            .ok_or_else(|| wrong("it has no mark where one is needed"))?;
+        Ok(self.stack.split_off(mark.min(self.stack.len())))
+    }
+
+    fn append(&mut self, items: &[Id]) -> Result<(), Malformed> {
+        match self.stack.last().map(|top| &mut self.pickle.objects[*top]) {
+            Some(Object::List(list)) => list.extend(items),
+            _ => return Err(wrong("it appends to what is no list")),
+        }
+        Ok(())
+    }
+
+    fn set(&mut self, items: &[Id]) -> Result<(), Malformed> {
+        match self.stack.last().map(|top| &mut self.pickle.objects[*top]) {
+            Some(Object::Dict(dict)) => dict.extend(items.as_chunks().0.iter().map(|[key, value]| (*key, *value))),
+            _ => return Err(wrong("it sets keys of what is no dict")),
+        }
+        Ok(())
+    }
+
+    fn remember(&mut self, key: u32) -> Result<(), Malformed> {
+        let top = *self.stack.last().ok_or_else(|| wrong("it remembers nothing"))?;
+        self.grow(1)?;
+        self.memo.insert(key, top);
+        Ok(())
+    }
+
+    fn recall(&mut self, key: u32) -> Result<(), Malformed> {
+        self.grow(1)?;
+        let id = self
+            .memo
+            .get(&key)
+            .ok_or_else(|| wrong("it recalls what it never had"))?;
+        self.stack.push(*id);
+        Ok(())
+    }
+}
+
+/// Little-endian, two's complement.
+fn long(digits: &[u8]) -> Object {
+    if digits.len() > 8 {
+        return Object::Other;
+    }
+    let negative = digits.last().is_some_and(|last| last & 0x80 != 0);
+    let mut bytes = [if negative { 0xff } else { 0 }; 8];
+    bytes[..digits.len()].copy_from_slice(digits);
+    Object::Integer(i64::from_le_bytes(bytes))
+}

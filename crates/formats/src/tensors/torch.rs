@@ -1,0 +1,186 @@
+//! State dicts as `torch.save` writes them: since PyTorch 1.6 a zip archive with a pickle of names and shapes and one file of
+//! values a storage; before, a stream of pickles with the storages behind them (`torch/serialization.py`).
+
+use super::pickle::{self, Id, Object, Pickle};
+use super::{Tensor, archive, floats};
+use crate::Malformed;
+use crate::bytes::Bytes;
+use std::collections::{BTreeMap, HashMap};
+
+type Wanted<'a> = &'a dyn Fn(&str) -> bool;
+
+fn wrong(what: impl std::fmt::Display) -> Malformed {
+    Malformed(format!("not a usable PyTorch state dict: {what}"))
+}
+
+/// From the zip archive.
+pub(super) fn from_archive(bytes: &[u8], wanted: Wanted) -> Result<BTreeMap<String, Tensor>, Malformed> {
+    let files = archive::files(bytes)?;
+    let folder = files.keys().find_map(|name| name.strip_suffix("data.pkl"));
+    let folder = folder.ok_or_else(|| wrong("the archive holds no data.pkl"))?;
+    let order = files.get(&format!("{folder}byteorder"));
+    if order.is_some_and(|order| *order != b"little") {
+        return Err(wrong("its values are not little-endian"));
+    }
+    let pickle = pickle::read(&mut Bytes::new(files[&format!("{folder}data.pkl")]))?;
+    let storage = |key: &str| files.get(&format!("{folder}data/{key}")).copied();
+    tensors(&pickle, bytes.len(), wanted, &storage)
+}
+
+/// From the stream of pickles: a magic number, a version, the system it was written on, the state dict, the storages' keys.
+pub(super) fn from_stream(bytes: &[u8], wanted: Wanted) -> Result<BTreeMap<String, Tensor>, Malformed> {
+    const MAGIC: &[u8] = b"\x80\x02\x8a\x0a\x6c\xfc\x9c\x46\xf9\x20\x6a\xa8\x50\x19.";
+    let total = bytes.len();
+    let stream = bytes.strip_prefix(MAGIC);
+    let mut bytes = Bytes::new(stream.ok_or_else(|| wrong("it does not begin as PyTorch's files do"))?);
+    let version = pickle::read(&mut bytes)?;
+    if version.size(version.top) != Some(1001) {
+        return Err(wrong("its version is not 1001"));
+    }
+    pickle::read(&mut bytes)?;
+    let pickle = pickle::read(&mut bytes)?;
+    let keys = pickle::read(&mut bytes)?;
+    let kinds: HashMap<&str, &str> = pickle
+        .objects()
+        .filter_map(|o| Storage::of(&pickle, o))
+        .map(|s| (s.key, s.kind))
+        .collect();
+    let mut storages = HashMap::new();
+    for key in keys
+        .items(keys.top)
+        .ok_or_else(|| wrong("it has no list of storages"))?
+    {
+        let key = keys.text(*key).ok_or_else(|| wrong("a storage has no name"))?;
+        let size = kinds.get(key).and_then(|kind| value_size(kind));
+        let size = size.ok_or_else(|| wrong(format_args!("storage {key} is of no known type")))?;
+        let count = bytes.count(size, "values")?;
+        storages.insert(key, bytes.take(count * size)?);
+    }
+    let storage = |key: &str| storages.get(key).copied();
+    tensors(&pickle, total, wanted, &storage)
+}
+
+/// Bytes of a value in a storage.
+fn value_size(kind: &str) -> Option<usize> {
+    Some(match kind.strip_prefix("torch.")?.strip_suffix("Storage")? {
+        "Double" | "Long" => 8,
+        "Float" | "Int" => 4,
+        "Half" | "BFloat16" | "Short" => 2,
+        "Byte" | "Char" | "Bool" => 1,
+        _ => return None,
+    })
+}
+
+/// What identifies a storage: `("storage", type, key, device, number of values, ..)`.
+struct Storage<'a> {
+    kind: &'a str,
+    key: &'a str,
+}
+
+impl<'a> Storage<'a> {
+    fn of(pickle: &'a Pickle, object: &'a Object) -> Option<Self> {
+        let Object::Persistent(id) = object else { return None };
+        match pickle.tuple(*id)? {
+            [what, kind, key, ..] if pickle.text(*what)? == "storage" => Some(Self {
+                kind: pickle.global(*kind)?,
+                key: pickle.text(*key)?,
+            }),
+            _ => None,
+        }
+    }
+}
+
+/// Dimensions of a tensor.
+const MOST_SIZES: usize = 8;
+
+/// A tensor as the pickle says how to rebuild it.
+struct Rebuilt<'a> {
+    storage: Storage<'a>,
+    offset: usize,
+    shape: Vec<usize>,
+    strides: Vec<usize>,
+}
+
+impl<'a> Rebuilt<'a> {
+    /// `None` for what is no tensor.
+    fn of(pickle: &'a Pickle, id: Id) -> Option<Self> {
+        let call = |id: Id| match pickle.object(id) {
+            Object::Call(function, arguments) => Some((pickle.global(*function)?, pickle.tuple(*arguments)?)),
+            _ => None,
+        };
+        let (mut function, mut arguments) = call(id)?;
+        if function == "torch._utils._rebuild_parameter" {
+            (function, arguments) = call(*arguments.first()?)?;
+        }
+        let ("torch._utils._rebuild_tensor" | "torch._utils._rebuild_tensor_v2", [storage, offset, shape, strides, ..]) =
+            (function, arguments)
+        else {
+            return None;
+        };
+        let sizes = |id: &Id| {
+            let sizes = pickle.tuple(*id).filter(|sizes| sizes.len() <= MOST_SIZES)?;
+            sizes.iter().map(|id| pickle.size(*id)).collect::<Option<Vec<_>>>()
+        };
+        Some(Self {
+            storage: Storage::of(pickle, pickle.object(*storage))?,
+            offset: pickle.size(*offset)?,
+            shape: sizes(shape)?,
+            strides: sizes(strides)?,
+        })
+    }
+
+    /// Number of values, where they lie row by row.
+    fn count(&self) -> Option<usize> {
+        let mut count = 1usize;
+        for (size, stride) in self.shape.iter().zip(&self.strides).rev() {
+            if *size > 1 && *stride != count {
+                return None;
+            }
+            count = count.checked_mul(*size)?;
+        }
+        (self.shape.len() == self.strides.len()).then_some(count)
+    }
+}
+
+/// The wanted tensors of the state dict; all together they have no more values than the file of `total` bytes.
+fn tensors<'a>(
+    pickle: &Pickle,
+    total: usize,
+    wanted: Wanted,
+    storage: &dyn Fn(&str) -> Option<&'a [u8]>,
+) -> Result<BTreeMap<String, Tensor>, Malformed> {
+    let Object::Dict(entries) = pickle.object(pickle.top) else {
+        return Err(wrong("it is of something else; save the model's state_dict()"));
+    };
+    let mut room = total / size_of::<f32>();
+    let mut tensors = BTreeMap::new();
+    for (name, value) in entries {
+        let Some(name) = pickle.text(*name).filter(|name| wanted(name)) else {
+            continue;
+        };
+        let of = |what: &str| wrong(format_args!("tensor {name} {what}"));
+        let tensor = Rebuilt::of(pickle, *value).ok_or_else(|| of("is of a kind that is not read"))?;
+        if tensor.storage.kind != "torch.FloatStorage" {
+            return Err(of(&format!(
+                "is in a {}; only 32-bit floats are read",
+                tensor.storage.kind
+            )));
+        }
+        let count = tensor.count().ok_or_else(|| of("does not lie row by row"))?;
+        let (values, _) = storage(tensor.storage.key)
+            .ok_or_else(|| of("has no values"))?
+            .as_chunks::<4>();
+        let end = tensor.offset.checked_add(count);
+        let values = end.and_then(|end| values.get(tensor.offset..end));
+        let values = values.ok_or_else(|| of("is larger than what is stored of it; the file is truncated"))?;
+        room = room
+            .checked_sub(count)
+            .ok_or_else(|| wrong("its tensors are more than the file holds"))?;
+        let tensor = Tensor {
+            shape: tensor.shape,
+            values: floats(values.as_flattened()),
+        };
+        tensors.insert(name.to_owned(), tensor);
+    }
+    Ok(tensors)
+}

@@ -1,0 +1,134 @@
+//! Where the weights of LPIPS are found, and `irradia lpips`, which imports them.
+
+use crate::Usage;
+use crate::terminal::{note, say};
+use anyhow::{Context, Result, anyhow};
+use irradia_measure::{ImportedTensor, Lpips, LpipsNet, to_weights_file};
+use irradia_runs::HOW_TO_GET_LPIPS as HOW;
+use irradia_runs::formats::{read_tensors, write_atomic};
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+/// The variable that names a weights file, or a folder of them.
+const VARIABLE: &str = "IRRADIA_LPIPS";
+
+#[derive(clap::Args)]
+pub struct Args {
+    /// Make a weights file of what the networks' authors publish: torchvision's SqueezeNet 1.1, AlexNet or VGG16, and the LPIPS
+    /// v0.1 heads of the same network (weights/v0.1/squeeze.pth, alex.pth or vgg.pth), each as .pth or .safetensors
+    #[arg(long, num_args = 2, value_names = ["FEATURES", "HEADS"])]
+    pub import: Option<Vec<PathBuf>>,
+    /// Write the weights here instead of into the user's data directory
+    #[arg(long, value_name = "FILE", requires = "import")]
+    pub out: Option<PathBuf>,
+}
+
+pub fn run(args: &Args) -> Result<()> {
+    match args.import.as_deref() {
+        Some([features, heads]) => import(features, heads, args.out.as_deref()),
+        _ => show(),
+    }
+}
+
+/// Says which weights are found.
+fn show() -> Result<()> {
+    let mut found = false;
+    for net in LpipsNet::ALL {
+        if let Some(path) = find(None, Some(net)).unwrap_or(None) {
+            found = true;
+            say(format_args!("{:<8} {}", net.name(), path.display()))?;
+        }
+    }
+    if found {
+        return Ok(());
+    }
+    say(format_args!("no weights of LPIPS were found: {HOW}"))
+}
+
+fn import(features: &Path, heads: &Path, out: Option<&Path>) -> Result<()> {
+    let mut tensors = BTreeMap::new();
+    for (path, prefix) in [(features, "features."), (heads, "lin")] {
+        let read = read_tensors(path, |name| name.starts_with(prefix))?;
+        tensors.extend(read.into_iter().map(|(name, tensor)| {
+            let (shape, values) = (tensor.shape, tensor.values);
+            (name, ImportedTensor { shape, values })
+        }));
+    }
+    let (net, bytes) = to_weights_file(&tensors)
+        .map_err(|error| anyhow!("{} with {}: {error}", features.display(), heads.display()))?;
+    let path = match out {
+        Some(path) => path.to_owned(),
+        None => {
+            let folder = data_folder().context("the system names no data directory; give --out FILE")?;
+            std::fs::create_dir_all(&folder)
+                .with_context(|| format!("cannot make {}; give --out FILE", folder.display()))?;
+            folder.join(net.file_name())
+        }
+    };
+    write_atomic(&path, |out| out.write_all(&bytes))?;
+    say(format_args!("LPIPS of {net}: {}", path.display()))
+}
+
+/// LPIPS's network, of `net` where one is asked for, and a note of where it was found; `None` when there is none.
+pub fn lpips(given: Option<&PathBuf>, net: Option<LpipsNet>) -> Result<Option<Lpips>> {
+    let Some(path) = find(given, net)? else { return Ok(None) };
+    let lpips = Lpips::load(&path).context("LPIPS weights")?;
+    if let Some(net) = net.filter(|net| *net != lpips.net()) {
+        let (path, own) = (path.display(), lpips.net());
+        return Err(Usage(format!(
+            "{path} holds the weights of {own} and not of {net}: name another file with --lpips"
+        ))
+        .into());
+    }
+    tell(&lpips, &path);
+    Ok(Some(lpips))
+}
+
+/// Says which network is used, and where it was found.
+pub fn tell(lpips: &Lpips, path: &Path) {
+    note(format_args!("LPIPS of {}: {}", lpips.net(), path.display()));
+}
+
+/// The file that [`lpips`] reads, absolute; of any network.
+pub fn lpips_path(given: Option<&PathBuf>) -> Result<Option<PathBuf>> {
+    find(given, None)
+}
+
+/// `--lpips`, `IRRADIA_LPIPS`, then the user's data directory. A file is taken as it is; in a folder the files have their
+/// names, and of several the first of [`LpipsNet::ALL`] is taken unless one is asked for.
+fn find(given: Option<&PathBuf>, net: Option<LpipsNet>) -> Result<Option<PathBuf>> {
+    let variable = || {
+        std::env::var_os(VARIABLE)
+            .filter(|path| !path.is_empty())
+            .map(PathBuf::from)
+    };
+    let named = given.cloned().or_else(variable);
+    let missing = || match net {
+        Some(net) => format!("the weights of LPIPS with {net} ({})", net.file_name()),
+        None => "weights of LPIPS".to_owned(),
+    };
+    let path = match &named {
+        Some(path) if path.is_dir() => {
+            let found = within(path, net);
+            Some(found.ok_or_else(|| Usage(format!("{} does not hold {}: {HOW}", path.display(), missing())))?)
+        }
+        Some(path) => Some(path.clone()),
+        None => data_folder().and_then(|folder| within(&folder, net)),
+    };
+    if let (None, Some(_)) = (&path, net) {
+        return Err(Usage(format!("{} were not found: {HOW}", missing())).into());
+    }
+    Ok(path.map(|path| std::path::absolute(&path).unwrap_or(path)))
+}
+
+fn within(folder: &Path, net: Option<LpipsNet>) -> Option<PathBuf> {
+    let mut nets = LpipsNet::ALL
+        .into_iter()
+        .filter(|other| net.is_none_or(|net| net == *other));
+    nets.find_map(|net| Some(folder.join(net.file_name())).filter(|path| path.exists()))
+}
+
+/// `$XDG_DATA_HOME/irradia` or `~/.local/share/irradia`, and what other systems have in its place.
+fn data_folder() -> Option<PathBuf> {
+    Some(dirs::data_local_dir()?.join("irradia"))
+}

@@ -1,0 +1,113 @@
+//! Weights of LPIPS: imported from PyTorch's files, found in their places, and named in what is measured.
+
+use crate::process::*;
+use irradia_testkit::{shared, torch};
+use safetensors::SafeTensors;
+use std::fs;
+use std::path::Path;
+
+/// Features and heads of the shared weights, as torchvision and the authors of LPIPS would publish them.
+fn publish(weights: &Path, folder: &Path) {
+    let bytes = fs::read(weights).expect("the weights");
+    let file = SafeTensors::deserialize(&bytes).expect("whole");
+    let values = |data: &[u8]| {
+        data.as_chunks()
+            .0
+            .iter()
+            .map(|b| f32::from_le_bytes(*b))
+            .collect::<Vec<_>>()
+    };
+    let tensors: Vec<_> = file
+        .iter()
+        .map(|(name, t)| (name, t.shape().to_vec(), values(t.data())))
+        .collect();
+    let part = |prefix: &str| -> Vec<torch::NamedTensor> {
+        let part = tensors.iter().filter(|(name, ..)| name.starts_with(prefix));
+        part.map(|(name, shape, values)| (*name, &shape[..], &values[..]))
+            .collect()
+    };
+    let mut features = part("features.");
+    features.push(("classifier.1.bias", &[2], &[1.0, 2.0]));
+    fs::write(folder.join("features.pth"), torch::archive(&features)).expect("written");
+    fs::write(folder.join("heads.pth"), torch::stream(&part("lin"))).expect("written");
+}
+
+#[test]
+fn weights_are_imported_found_and_named() {
+    let [Some(squeeze), Some(alex)] =
+        ["squeeze", "alex"].map(|net| shared(&format!("data/lpips/lpips_{net}.safetensors")))
+    else {
+        return;
+    };
+    let folder = with_run();
+    let here = folder.path();
+    assert!(
+        irradia(here, "lpips")
+            .well()
+            .stdout
+            .contains("no weights of LPIPS were found")
+    );
+    let without = irradia(here, "eval run --data data").well();
+    assert_eq!(
+        without.stderr.matches("LPIPS is not measured").count(),
+        1,
+        "{without:?}"
+    );
+    irradia(here, "eval run --data data --lpips-net alex").refused(2, &["lpips_alex.safetensors", "--import"]);
+
+    for weights in [&squeeze, &alex] {
+        publish(weights, here);
+        irradia(here, "lpips --import features.pth heads.pth").well();
+    }
+    let listed = irradia(here, "lpips").well().stdout;
+    assert!(listed.contains("squeeze") && listed.contains("lpips_alex.safetensors") && !listed.contains("vgg"));
+    // The same tensors as in the file that they were taken from.
+    let [got, want] =
+        [here.join("share/irradia/lpips_alex.safetensors"), alex.clone()].map(|path| fs::read(path).unwrap());
+    let [got, want] = [&got, &want].map(|bytes| SafeTensors::deserialize(bytes).unwrap());
+    assert_eq!(got.len(), want.len());
+    for (name, tensor) in want.iter() {
+        let imported = got.tensor(name).unwrap();
+        assert!(
+            imported.shape() == tensor.shape() && imported.data() == tensor.data(),
+            "{name}"
+        );
+    }
+
+    let measure = |more: &str| {
+        let ended = irradia(here, &format!("eval run --data data --json figures.json {more}")).well();
+        assert_eq!(ended.stderr.matches("LPIPS of ").count(), 1, "{ended:?}");
+        let figures = json(&here.join("figures.json"));
+        let net = figures["lpips_net"].as_str().expect("a network").to_owned();
+        assert!(ended.stdout.contains(&format!("LPIPS ({net}) ")), "{ended:?}");
+        (net, figures["lpips"].as_f64().expect("a number"))
+    };
+    let (net, by_squeeze) = measure("");
+    assert_eq!(net, "squeeze");
+    let (net, by_alex) = measure("--lpips-net alex");
+    assert!(net == "alex" && by_alex != by_squeeze);
+    // A file tells its network by its tensors, a folder holds files by name.
+    assert_eq!(
+        measure(&format!("--lpips {}", alex.display())),
+        ("alex".to_owned(), by_alex)
+    );
+    let given = alex.parent().unwrap().display().to_string();
+    assert_eq!(
+        measure(&format!("--lpips {given} --lpips-net alex")),
+        ("alex".to_owned(), by_alex)
+    );
+
+    let name = alex.display().to_string();
+    irradia_with(here, "eval run --data data --lpips-net squeeze --lpips", &[&name]).refused(2, &["alex", "squeeze"]);
+    irradia(here, "eval run --data data --lpips-net vgg --lpips share/irradia").refused(2, &["lpips_vgg.safetensors"]);
+    irradia(here, "eval run --data data --lpips-net vgg16").refused(2, &["squeeze, alex or vgg"]);
+    // Features of one network with the heads of another.
+    publish(&squeeze, here);
+    fs::copy(here.join("heads.pth"), here.join("other.pth")).unwrap();
+    publish(&alex, here);
+    irradia(here, "lpips --import features.pth other.pth --out x.safetensors")
+        .refused(1, &["lin1.model.1.weight", "other.pth"]);
+    irradia(here, "lpips --import heads.pth heads.pth").refused(1, &["no features of SqueezeNet"]);
+    irradia(here, "lpips --import run/report.json heads.pth").refused(1, &["run/report.json", "neither a PyTorch"]);
+    assert!(!here.join("x.safetensors").exists());
+}

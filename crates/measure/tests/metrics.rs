@@ -137,7 +137,7 @@ fn weights_that_are_broken_are_refused_in_one_line() {
     };
     refused(&whole(&[("something", vec![64], &bias)]), "no features of SqueezeNet");
     let mark = ("features.3.squeeze.weight", vec![64], &bias[..]);
-    refused(&whole(&[mark.clone()]), "features.0.weight is missing");
+    refused(&whole(std::slice::from_ref(&mark)), "features.0.weight is missing");
     refused(
         &whole(&[mark.clone(), ("features.0.weight", vec![64], &bias)]),
         "[64] and not F32 [64, 3, 3, 3]",

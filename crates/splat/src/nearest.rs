@@ -85,7 +85,8 @@ mod tests {
     fn the_nearest_are_those_of_a_search_through_all() {
         let mut rng = Rng::new(5, 0);
         // A cloud, a plane, a line with many at the same place, a grid of equal distances, and far coordinates.
-        let kinds: [&dyn Fn(&mut Rng, usize) -> [f32; 3]; 5] = [
+        type Make<'a> = &'a dyn Fn(&mut Rng, usize) -> [f32; 3];
+        let kinds: [Make; 5] = [
             &|rng, _| std::array::from_fn(|_| rng.normal()),
             &|rng, _| [rng.normal(), rng.normal(), 2.0],
             &|rng, _| [rng.below(7) as f32, 0.0, 0.0],

@@ -8,16 +8,18 @@ use crate::recipe::{Density, Represents};
 use crate::schedule::{Ahead, StepPlan, ahead};
 use crate::trainer::Trainer;
 
-/// Work of a step, microseconds of a core on which these were fitted (fox_colmap, chair, fern, lund_door; AVX-512): a pixel,
-const PIXEL: f64 = 0.02;
+/// Work of a step, microseconds of a core (AVX-512), by least squares of the relative error over the first 250 to 500 steps of
+/// six runs: chair with `classic`, `fast` and `curriculum`, fox_colmap with `fast`, fern with `mcmc`, demo with `classic`. A step
+/// was 0.65 to 1.22 of this. A pixel,
+const PIXEL: f64 = 0.09;
 /// a splat-pixel pair that blending visits,
-const PAIR: f64 = 0.001;
+const PAIR: f64 = 0.00065;
 /// a splat,
-const SPLAT: f64 = 0.11;
+const SPLAT: f64 = 0.26;
 /// each of its parameters in use,
-const PARAMETER: f64 = 0.006;
-/// a pixel that LPIPS looks at,
-const PERCEPTUAL_PIXEL: f64 = 0.55;
+const PARAMETER: f64 = 0.0016;
+/// a pixel that LPIPS compares,
+const PERCEPTUAL_PIXEL: f64 = 1.15;
 /// and a sample of a field.
 const SAMPLE: f64 = 2.0;
 /// Parameters of a splat beside its harmonics.
@@ -26,8 +28,13 @@ const GEOMETRY: f64 = 11.0;
 const PAIRS_POWER: f64 = 0.5;
 /// `mcmc` adds splats as large as those it copies (0.7 to 0.9 on fox, lund_door, maryRose).
 const MCMC_PAIRS_POWER: f64 = 0.75;
-/// Moments of the future that are looked at.
-const MOMENTS: usize = 48;
+/// Parts into which the rest of the run is cut.
+const PARTS: usize = 48;
+/// Steps between two measurements of a run without a budget, since each walks all tile entries and the rest of the recipe: at
+/// most so many,
+const MEASURE_EVERY: usize = 16;
+/// and this part of the steps made, for costs change fast at first.
+const MEASURE_PART: usize = 16;
 /// Steps over which costs are averaged: so many, but not more than the last quarter, for they change fast at first.
 const WINDOW: usize = 50;
 /// What overdraw falls to in the end is not foretold below this share of what it is.
@@ -48,8 +55,10 @@ const SPLATS_FOLLOW: f64 = 0.12;
 pub struct Forecast {
     /// Steps seen.
     steps: usize,
-    /// The trainer's seconds when it was last looked at.
+    /// The trainer's seconds at the last measurement.
     seconds: f64,
+    /// Steps since then.
+    since: usize,
     /// The step that comes and its number of splats.
     next: Option<(Ahead, f64)>,
     /// Pairs a pixel of each step on splats, at an image scale and a number of splats of 1.
@@ -96,28 +105,48 @@ impl Aim {
 }
 
 impl Forecast {
-    /// Takes in what the last step cost; to be called before each step, of which `plan` is the plan.
-    pub fn observe(&mut self, trainer: &Trainer, plan: &StepPlan) {
+    /// Takes in what the last steps cost; to be called before each step, of which `plan` is the plan. A run whose pace follows
+    /// the forecast measures every step (`closely`), others ever fewer, down to one in [`MEASURE_EVERY`].
+    pub fn observe(&mut self, trainer: &Trainer, plan: &StepPlan, closely: bool) {
         if self.pixels == 0.0 {
             let cameras = trainer.train_cameras();
             let sizes = cameras.iter().map(|c| &c.intrinsics);
             let pixels: f64 = sizes.map(|k| f64::from(k.width) * f64::from(k.height)).sum();
             self.pixels = pixels / cameras.len().max(1) as f64;
         }
+        self.since += usize::from(self.next.is_some());
+        self.follow_growth(trainer, plan);
+        // Another size of image or another stage costs another time: what was measured until then must not be mixed with it.
+        let other = self.next.is_some_and(|(step, _)| {
+            step.stage != trainer.clock.stage || (f64::from(plan.image_scale) / step.image_scale - 1.0).abs() > 0.05
+        });
+        if !closely && !other && self.since < (self.steps / MEASURE_PART).min(MEASURE_EVERY) {
+            return;
+        }
         if let Some((step, count)) = self.next.take() {
-            self.steps += 1;
-            let share = 1.0 / window(self.steps) as f64;
+            let before = self.steps;
+            self.steps += self.since;
+            let share = (self.since as f64 / window(self.steps) as f64).min(1.0);
             let pairs = trainer.engine.pairs() as f64 / (self.pixels * step.image_scale.powi(2));
             // A field has none, and tells nothing of the splats that come after it.
             if pairs > 0.0 {
                 let power = pairs_power(trainer);
+                let overdraw = pairs / (count.max(1.0) / step.image_scale).powf(power);
                 self.overdraws
-                    .push(pairs / (count.max(1.0) / step.image_scale).powf(power));
+                    .resize(self.overdraws.len() + self.steps - before, overdraw);
             }
-            let unit = (trainer.seconds - self.seconds) / self.work(trainer, &step, count, pairs);
+            let seconds = (trainer.seconds - self.seconds) / self.since as f64;
+            let unit = seconds / self.work(trainer, &step, count, pairs);
             self.unit = Some(self.unit.map_or(unit, |mean| mean + share * (unit - mean)));
         }
-        self.seconds = trainer.seconds;
+        (self.seconds, self.since) = (trainer.seconds, 0);
+        let ahead = ahead(&trainer.recipe, &trainer.clock, PARTS);
+        self.next = ahead.first().map(|next| (*next, trainer.engine.len() as f64));
+        self.whole = self.look_ahead(trainer, &ahead);
+    }
+
+    /// Takes in the number of splats and the size of images that the coming step has.
+    fn follow_growth(&mut self, trainer: &Trainer, plan: &StepPlan) {
         let (stage, time, count) = (trainer.clock.stage, trainer.clock.time, trainer.engine.len() as f64);
         match self.last_round {
             Some((then, at, before)) if then == stage => {
@@ -134,9 +163,6 @@ impl Forecast {
             self.aim = Some(Aim::new(trainer, image_scale / self.image_scale, time, count));
         }
         self.image_scale = image_scale;
-        let ahead = ahead(&trainer.recipe, &trainer.clock, MOMENTS);
-        self.next = ahead.first().map(|next| (*next, count));
-        self.whole = self.look_ahead(trainer, &ahead);
     }
 
     /// [`Self::whole`] for the recipe that is left.
@@ -197,7 +223,7 @@ impl Forecast {
         }
         let pixels = self.pixels * step.image_scale.powi(2);
         let parameters = GEOMETRY + 3.0 * (step.sh_degree + 1.0).powi(2);
-        let perceptual = if step.perceptual {
+        let perceptual = if step.perceptual && trainer.options.lpips.is_some() {
             PERCEPTUAL_PIXEL * pixels.min(crate::objective::PATCH.pow(2) as f64)
         } else {
             0.0
@@ -207,7 +233,7 @@ impl Forecast {
 
     /// Seconds that the rest of the run takes at its present pace.
     pub fn seconds_left(&self, trainer: &Trainer) -> f64 {
-        self.whole / trainer.pace
+        (self.whole / trainer.pace - (trainer.seconds - self.seconds)).max(0.0)
     }
 
     /// The pace at which the rest of the run takes `seconds`.

@@ -73,7 +73,7 @@ pub fn run(
     let mut reason = None;
     while reason.is_none() && !wishes.stop && !trainer.finished() {
         let due = plan(&trainer.recipe, &trainer.clock);
-        forecast.observe(trainer, &due);
+        forecast.observe(trainer, &due, limits.budget.is_some());
         if let Some(budget) = limits.budget {
             trainer.pace = forecast.pace(trainer, budget - trainer.seconds);
         }

@@ -164,6 +164,9 @@ impl<T: Real> Fire<T> {
     }
 }
 
+/// A step's output and, of a fire module, what lies inside it.
+type Output<T> = (Map<T>, Option<Map<T>>);
+
 /// A [`Plan`] with its weights.
 enum Step<T> {
     Convolution(Convolution<T>),
@@ -212,8 +215,7 @@ impl<T: Real> Step<T> {
         })
     }
 
-    /// The output, and what lies inside where it is a fire module.
-    fn forward(&self, input: &Map<T>) -> (Map<T>, Option<Map<T>>) {
+    fn forward(&self, input: &Map<T>) -> Output<T> {
         match self {
             Self::Convolution(layer) => (layer.forward(input), None),
             Self::Pool(pool) => (max_pool(input, *pool), None),
@@ -225,7 +227,7 @@ impl<T: Real> Step<T> {
     }
 
     /// The gradient of `input`, given the step's output with what lies inside and the gradient of the output.
-    fn vjp(&self, input: &Map<T>, (out, inside): &(Map<T>, Option<Map<T>>), mut v_out: Map<T>) -> Map<T> {
+    fn vjp(&self, input: &Map<T>, (out, inside): &Output<T>, mut v_out: Map<T>) -> Map<T> {
         match self {
             Self::Convolution(layer) => {
                 stop_where_zero(out, &mut v_out);
@@ -250,8 +252,8 @@ pub(super) struct Backbone<T> {
 /// What the VJP needs of a forward pass.
 pub(super) struct Tape<T> {
     input: Map<T>,
-    /// The output of every step with what lies inside it, tap by tap.
-    outputs: Vec<Vec<(Map<T>, Option<Map<T>>)>>,
+    /// Of every step, tap by tap.
+    outputs: Vec<Vec<Output<T>>>,
 }
 
 impl<T: Real> Tape<T> {
@@ -283,7 +285,7 @@ impl<T: Real> Backbone<T> {
             outputs: Vec::with_capacity(self.taps.len()),
         };
         for (tap, steps) in self.taps.iter().enumerate() {
-            let mut outputs: Vec<(Map<T>, Option<Map<T>>)> = Vec::with_capacity(steps.len());
+            let mut outputs: Vec<Output<T>> = Vec::with_capacity(steps.len());
             for step in steps {
                 let input = match (outputs.last(), tap) {
                     (Some((before, _)), _) => before,

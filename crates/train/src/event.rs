@@ -103,6 +103,8 @@ pub struct StepReport {
     pub seconds: f64,
     /// Seconds of training still to come, as far as is known.
     pub seconds_left: f64,
+    /// Between which that lies in nine of ten runs.
+    pub seconds_left_range: [f64; 2],
     /// Index of the view in the dataset.
     pub view: usize,
     /// The loss, weighted.

@@ -2,7 +2,7 @@
 
 use crate::eval::{EvalOptions, Metrics, evaluate_views};
 use crate::event::{Event, Observer, Signal, StepReport};
-use crate::forecast::Forecast;
+use crate::forecast::{self, Forecast};
 use crate::half_fit::HalfFit;
 use crate::schedule::{is_due, plan};
 use crate::trainer::{TrainError, Trainer};
@@ -79,8 +79,14 @@ pub fn run(
         }
         let looks = due.evaluate || (limits.until_psnr.is_some() && is_due(&trainer.clock, UNTIL_PSNR_EVERY));
         let left = forecast.seconds_left(trainer);
+        let range = match limits.budget {
+            // The pace is set such that it holds.
+            Some(_) => [left; 2],
+            None => forecast::range(left, &trainer.recipe, &trainer.clock),
+        };
         let report = StepReport {
             seconds_left: left,
+            seconds_left_range: range,
             ..trainer.step(&mut events)?
         };
         events.insert(0, Event::Step(report));

@@ -356,6 +356,7 @@ impl Trainer {
             step: self.clock.step + 1,
             seconds: self.seconds,
             seconds_left: 0.0,
+            seconds_left_range: [0.0; 2],
             view,
             loss: loss.total,
             mse: loss.mse,

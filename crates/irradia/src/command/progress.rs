@@ -75,20 +75,30 @@ impl Progress {
             Some(bar) => {
                 bar.set_length(trainer.total_steps());
                 bar.set_position(report.step);
-                let left = HumanDuration(Duration::from_secs(report.seconds_left.round() as u64));
-                bar.set_message(format!("eta {left:#} {message}"));
+                bar.set_message(format!("eta {} {message}", eta(report.seconds_left_range)));
             }
             None if self.last_line.elapsed() >= LINE_EVERY => {
                 note(format_args!(
-                    "step {}/{} {message} eta {:.0} s",
+                    "step {}/{} {message} eta {}",
                     report.step,
                     trainer.total_steps(),
-                    report.seconds_left
+                    eta(report.seconds_left_range)
                 ));
                 self.last_line = Instant::now();
             }
             None => {}
         }
+    }
+}
+
+/// A range of seconds in words; one value where its ends are close.
+fn eta([low, high]: [f64; 2]) -> String {
+    let words = |seconds: f64| format!("{:#}", HumanDuration(Duration::from_secs(seconds.round() as u64)));
+    let (from, to) = (words(low), words(high));
+    if from == to || high < 1.3 * low {
+        words((low * high).sqrt())
+    } else {
+        format!("{from} to {to}")
     }
 }
 

@@ -69,7 +69,6 @@ impl Sockets {
     /// # Errors
     /// When a residual field finds no space that the cameras share.
     pub fn new(recipe: &Recipe, dataset: &Dataset, transparent: bool, seed: u64) -> Result<Self, TrainError> {
-        let views = dataset.views.len();
         let residual = match &recipe.residual {
             Some(knobs) => {
                 let cameras: Vec<Camera> = dataset.train.iter().map(|i| dataset.views[*i].camera).collect();
@@ -79,9 +78,11 @@ impl Sockets {
             None => None,
         };
         Ok(Self {
-            poses: recipe.refine_poses.then(|| PoseRefinement::new(views)),
+            poses: recipe.refine_poses.then(|| PoseRefinement::new(dataset)),
             residual,
-            exposure: recipe.exposure.then(|| Exposure::new(views)),
+            exposure: recipe
+                .exposure
+                .then(|| Exposure::new(dataset.views.len(), &dataset.train)),
             developed: Vec::new(),
         })
     }

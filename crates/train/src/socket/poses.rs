@@ -8,27 +8,32 @@ use super::Occupant;
 use super::per_view::PerViewAdam;
 use crate::tensor_file::{NamedTensor, TensorSource, to_bytes};
 use glam::{Quat, Vec3};
-use irradia_scene::{Camera, Pose};
+use irradia_scene::{Camera, Dataset, Pose};
 use irradia_splat::CameraGradient;
 
 /// Refined camera space from the dataset's: quaternion w, x, y, z and translation, world units.
 const NUMBERS: usize = 7;
 const IDENTITY: [f32; NUMBERS] = [1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0];
 
-/// A correction of each view's pose, none at first.
+/// A correction of each view's pose, none at first. A motion that all training views share is the scene's and is taken out
+/// of them: held-out cameras, which are not refined, stay where they are in the scene.
 #[derive(Clone, Debug, PartialEq)]
 pub struct PoseRefinement {
     /// `[views][NUMBERS]`.
     corrections: Vec<[f32; NUMBERS]>,
+    /// The views that are trained on, with their cameras in the dataset.
+    train: Vec<(usize, Camera)>,
     /// Of the tangent: rotation in radians, translation in world units.
     adam: PerViewAdam<6>,
 }
 
 impl PoseRefinement {
-    /// For `views` views.
-    pub fn new(views: usize) -> Self {
+    /// For the views of `dataset`.
+    pub fn new(dataset: &Dataset) -> Self {
+        let views = dataset.views.len();
         Self {
             corrections: vec![IDENTITY; views],
+            train: dataset.train.iter().map(|i| (*i, dataset.views[*i].camera)).collect(),
             adam: PerViewAdam::new(views),
         }
     }
@@ -45,11 +50,67 @@ impl PoseRefinement {
         let v = tangent_gradient(camera, gradient);
         let shift = rate * extent;
         let step = self.adam.step(view, v, [rate, rate, rate, shift, shift, shift]);
+        let shared = Twist::from(step)
+            .to_world(&camera.pose)
+            .scaled(-1.0 / self.train.len() as f32);
+        for at in 0..self.train.len() {
+            let (other, base) = self.train[at];
+            let camera = self.refined(other, &base);
+            self.move_by(other, shared.to_camera(&camera.pose));
+        }
+        self.move_by(view, Twist::from(step));
+    }
+
+    /// Appends a small motion in camera space to the correction of `view`.
+    fn move_by(&mut self, view: usize, motion: Twist) {
         let (rotation, translation) = parts(&self.corrections[view]);
-        let turned = exp([step[0], step[1], step[2]]);
+        let turned = Quat::from_scaled_axis(motion.omega);
         let q = (turned * rotation).normalize();
-        let t = turned * translation + Vec3::new(step[3], step[4], step[5]);
+        let t = turned * translation + motion.tau;
         self.corrections[view] = [q.w, q.x, q.y, q.z, t.x, t.y, t.z];
+    }
+}
+
+/// A small rigid motion `x_new = x + omega x x + tau`.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct Twist {
+    /// Radians.
+    omega: Vec3,
+    /// World units.
+    tau: Vec3,
+}
+
+impl From<[f32; 6]> for Twist {
+    fn from([x, y, z, tau @ ..]: [f32; 6]) -> Self {
+        let (omega, tau) = (Vec3::new(x, y, z), Vec3::from_array(tau));
+        Self { omega, tau }
+    }
+}
+
+impl Twist {
+    fn scaled(self, factor: f32) -> Self {
+        Self {
+            omega: factor * self.omega,
+            tau: factor * self.tau,
+        }
+    }
+
+    /// The same motion of a point in the world, for one in the space of a camera at `pose`.
+    fn to_world(self, pose: &Pose) -> Self {
+        let omega = pose.rotation * self.omega;
+        Self {
+            omega,
+            tau: pose.rotation * self.tau + pose.position.cross(omega),
+        }
+    }
+
+    /// The inverse of [`Self::to_world`].
+    fn to_camera(self, pose: &Pose) -> Self {
+        let back = pose.rotation.inverse();
+        Self {
+            omega: back * self.omega,
+            tau: back * (self.tau + self.omega.cross(pose.position)),
+        }
     }
 }
 
@@ -67,18 +128,13 @@ fn moved(camera: &Camera, rotation: Quat, translation: Vec3) -> Camera {
 
 /// `camera` after `x_new = exp(omega) x + tau`; `tangent` is omega in radians, then tau in world units.
 pub(crate) fn turned(camera: &Camera, tangent: [f32; 6]) -> Camera {
-    let [x, y, z, tau @ ..] = tangent;
-    moved(camera, exp([x, y, z]), Vec3::from_array(tau))
+    let Twist { omega, tau } = tangent.into();
+    moved(camera, Quat::from_scaled_axis(omega), tau)
 }
 
 fn parts(correction: &[f32; NUMBERS]) -> (Quat, Vec3) {
     let [w, x, y, z, tx, ty, tz] = *correction;
     (Quat::from_xyzw(x, y, z, w), Vec3::new(tx, ty, tz))
-}
-
-/// The rotation of the vector's length in radians about its direction.
-fn exp(omega: [f32; 3]) -> Quat {
-    Quat::from_scaled_axis(Vec3::from_array(omega))
 }
 
 /// The gradient with regard to `(omega, tau)` of `exp(omega) (R x + t) + tau` at zero, from that of R and t: with
@@ -120,8 +176,9 @@ impl Occupant for PoseRefinement {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use irradia_scene::{Intrinsics, Rng};
+    use irradia_scene::{Intrinsics, Photo, Rng, View};
     use irradia_splat::{Engine, OutputGradient, RenderOptions, SplatState, Splats};
+    use std::sync::Arc;
 
     fn camera() -> Camera {
         Camera::new(
@@ -135,10 +192,56 @@ mod tests {
         let (camera, x) = (camera(), Vec3::new(0.2, 0.5, 0.7));
         let tangent = [0.1, -0.2, 0.05, 0.3, 0.1, -0.4];
         let before = camera.pose.camera_from_world(x);
-        let want = exp([0.1, -0.2, 0.05]) * before + Vec3::new(0.3, 0.1, -0.4);
+        let want = Quat::from_scaled_axis(Vec3::new(0.1, -0.2, 0.05)) * before + Vec3::new(0.3, 0.1, -0.4);
         let got = turned(&camera, tangent).pose.camera_from_world(x);
         assert!((got - want).length() < 1e-5, "{got} and {want}");
         assert!((turned(&camera, [0.0; 6]).pose.position - camera.pose.position).length() < 1e-6);
+    }
+
+    #[test]
+    fn a_motion_that_all_views_share_is_not_theirs() {
+        let view = |x: f32| View {
+            name: String::new(),
+            camera: Camera::new(
+                Pose::look_at(Vec3::new(x, 0.3, -3.0), Vec3::ZERO, Vec3::NEG_Y),
+                Intrinsics::from_fov_x(48, 40, 0.8),
+            ),
+            photo: Arc::new(Photo {
+                width: 0,
+                height: 0,
+                channels: 3,
+                data: vec![],
+                mask: None,
+            }),
+            depth_bounds: None,
+            time: None,
+            points_seen: vec![],
+        };
+        let dataset = Dataset {
+            views: [-1.0, 0.0, 1.0].map(view).into(),
+            train: vec![0, 2],
+            ..Dataset::default()
+        };
+        let mut poses = PoseRefinement::new(&dataset);
+        for (i, view) in [0, 2, 0].into_iter().cycle().take(20).enumerate() {
+            let gradient = CameraGradient {
+                translation: [1.0, -2.0 * i as f64, 0.5],
+                rotation: [[0.1; 3], [0.2 * i as f64; 3], [-0.3; 3]],
+            };
+            let camera = poses.refined(view, &dataset.views[view].camera);
+            poses.step(view, &camera, &gradient, 1e-3, 1.0);
+        }
+        // Each correction as a motion of the world, of which the first order is enough.
+        let motion = |view: usize| {
+            let [_, x, y, z, tau @ ..] = poses.corrections[view];
+            let (omega, tau) = (2.0 * Vec3::new(x, y, z), Vec3::from_array(tau));
+            Twist { omega, tau }.to_world(&dataset.views[view].camera.pose)
+        };
+        let [a, b] = [motion(0), motion(2)];
+        assert!(a.omega.length() > 1e-3 && a.tau.length() > 1e-3, "{a:?}");
+        assert!((a.omega + b.omega).length() < 0.05 * a.omega.length(), "{a:?} {b:?}");
+        assert!((a.tau + b.tau).length() < 0.05 * a.tau.length(), "{a:?} {b:?}");
+        assert_eq!(poses.corrections[1], IDENTITY, "held-out cameras stay");
     }
 
     #[test]

@@ -49,9 +49,9 @@ impl Kernel for Adam<'_> {
             let p_old = simd.load(if whole { &self.parameters[at..] } else { &copies[3] });
             let [mut p, mut m, mut v] = rule.step(g, p_old, m_old, v_old);
             if self.sparse {
-                m = m.or_where_not(on, m_old);
-                v = v.or_where_not(on, v_old);
-                p = p.or_where_not(on, p_old);
+                m = m.select(on, m_old);
+                v = v.select(on, v_old);
+                p = p.select(on, p_old);
             }
             if whole {
                 m.store(&mut self.first[at..]);

@@ -3,7 +3,7 @@
 use super::Frequency;
 use crate::Num;
 use crate::mlp::PANEL;
-use irradia_compute::each;
+use irradia_compute::unroll;
 use irradia_compute::simd::{Lanes, Simd};
 use irradia_scene::sh::{C0, C1, C2, C3};
 use serde::{Deserialize, Serialize};
@@ -33,7 +33,7 @@ impl DirectionEncoding {
         match self {
             Self::Harmonics => {
                 for s in (0..PANEL).step_by(S::LANES) {
-                    let b = harmonics(each!(c in 3 => simd.load(&directions[c * PANEL + s..])));
+                    let b = harmonics(unroll!(c in 3 => simd.load(&directions[c * PANEL + s..])));
                     for k in 0..16 {
                         b[k].store(&mut to[k * PANEL + s..]);
                     }
@@ -77,8 +77,8 @@ pub fn harmonics_vjp<F: Lanes>([x, y, z]: [F; 3], v: &[F; 16]) -> [F; 3] {
     let (xx, yy, zz) = (x * x, y * y, z * z);
     let (xy, yz, xz) = (x * y, y * z, x * z);
     let (two, three, four, six) = (k.splat(2.0), k.splat(3.0), k.splat(4.0), k.splat(6.0));
-    let a: [F; 5] = each!(i in 5 => k.splat(C2[i]) * v[4 + i]);
-    let b: [F; 7] = each!(i in 7 => k.splat(C3[i]) * v[9 + i]);
+    let a: [F; 5] = unroll!(i in 5 => k.splat(C2[i]) * v[4 + i]);
+    let b: [F; 7] = unroll!(i in 7 => k.splat(C3[i]) * v[9 + i]);
     let c1 = k.splat(C1);
     [
         -c1 * v[3]

@@ -5,7 +5,7 @@
 
 use crate::Num;
 use crate::mlp::PANEL;
-use irradia_compute::each;
+use irradia_compute::unroll;
 use irradia_compute::simd::{Lanes, Scalar, Simd};
 use serde::{Deserialize, Serialize};
 
@@ -285,12 +285,12 @@ pub fn encode_level_point_vjp<S: Simd>(
             let mut inside = [zero; 3];
             for c in 0..3 {
                 let p = simd.load(&points[c * PANEL + s..]);
-                inside[c] = cells.zero_where_not(mask_between(zero, p, one));
+                inside[c] = cells.masked(mask_between(zero, p, one));
                 let p = p.max(zero).min(one) * cells;
                 fraction[c] = p - p.floor().min(last);
             }
             let high = fraction;
-            let low = each!(c in 3 => one - high[c]);
+            let low = unroll!(c in 3 => one - high[c]);
             for c in 0..3 {
                 let (d, e) = ((c + 1) % 3, (c + 2) % 3);
                 let mut slope = zero;

@@ -116,7 +116,7 @@ fn tiles<S: Simd, const O: usize, const V: usize>(
                             Finish::Relu => sums[k][v].max(zero),
                             Finish::Mask(mask) => {
                                 let mask = simd.load(&mask[(row + k) * PANEL + at..]);
-                                sums[k][v].zero_where_not(zero.lt(mask))
+                                sums[k][v].masked(zero.lt(mask))
                             }
                         };
                         sum.store(&mut to[o + k][at..]);

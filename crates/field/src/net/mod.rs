@@ -242,10 +242,10 @@ impl Net {
                         let slope = one / (one + e);
                         (
                             x.max(zero) + (one + e).map(ln),
-                            slope.or_where_not(zero.le(x), one - slope),
+                            slope.select(zero.le(x), one - slope),
                         )
                     }
-                    Activation::Relu => (x.max(zero), one.zero_where_not(zero.lt(x))),
+                    Activation::Relu => (x.max(zero), one.masked(zero.lt(x))),
                 };
                 density.store(&mut block.density[p * PANEL + s..]);
                 slope.store(&mut block.slope[p * PANEL + s..]);
@@ -286,7 +286,7 @@ impl Net {
                 // The sigmoid by the side on which nothing overflows.
                 let e = (-x.abs()).exp();
                 let right = one / (one + e);
-                let y = right.or_where_not(simd.splat(0.0).le(x), one - right);
+                let y = right.select(simd.splat(0.0).le(x), one - right);
                 y.store(&mut block.rgb[p * 3 * PANEL + s..]);
             }
         }

@@ -104,7 +104,7 @@ impl<T: Scalar> Job<'_, T> {
             let (weight, truth) = (simd.load(&m[at..]), simd.load(&y[at..]));
             // Selected and not only multiplied: a render that is not finite must not come through a weight of 0.
             let counted = simd.splat(0.0).lt(weight);
-            let difference = ((simd.load(&x[at..]) - truth) * weight).zero_where_not(counted);
+            let difference = ((simd.load(&x[at..]) - truth) * weight).masked(counted);
             (truth + difference).store(&mut x[at..]);
         }
     }

@@ -27,8 +27,8 @@ impl<F: Lanes> Differences<F> {
         let d = x - y;
         self.absolute += d.abs();
         self.squared = d.mul_add(d, self.squared);
-        let positive = gain_l1.zero_where_not(zero.lt(d));
-        let l1 = (-gain_l1).or_where_not(d.lt(zero), positive);
+        let positive = gain_l1.masked(zero.lt(d));
+        let l1 = (-gain_l1).select(d.lt(zero), positive);
         d.mul_add(gain_mse, l1)
     }
 

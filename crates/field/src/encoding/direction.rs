@@ -3,8 +3,8 @@
 use super::Frequency;
 use crate::Num;
 use crate::mlp::PANEL;
-use irradia_compute::unroll;
 use irradia_compute::simd::{Lanes, Simd};
+use irradia_compute::unroll;
 use irradia_scene::sh::{C0, C1, C2, C3};
 use serde::{Deserialize, Serialize};
 
@@ -19,7 +19,7 @@ pub enum DirectionEncoding {
 }
 
 impl DirectionEncoding {
-    /// Features of a direction.
+    /// Number of features.
     pub fn features(&self) -> usize {
         match self {
             Self::Harmonics => 16,
@@ -27,7 +27,7 @@ impl DirectionEncoding {
         }
     }
 
-    /// Features of a panel of unit directions, `[3, 32]` to the first rows of `to [rows, 32]`.
+    /// Encodes a panel of unit directions `[3, 32]` to the first rows of `to [rows, 32]`.
     #[inline(always)]
     pub fn encode<S: Simd>(&self, simd: S, directions: &[Num<S>], to: &mut [Num<S>]) {
         match self {
@@ -70,7 +70,7 @@ pub fn harmonics<F: Lanes>([x, y, z]: [F; 3]) -> [F; 16] {
     ]
 }
 
-/// The gradient of `[x, y, z]` through [`harmonics`]; the sphere is left freely, as the polynomials are.
+/// The VJP of [`harmonics`], of the polynomials without the constraint to the unit sphere.
 #[inline(always)]
 pub fn harmonics_vjp<F: Lanes>([x, y, z]: [F; 3], v: &[F; 16]) -> [F; 3] {
     let k = x.simd();

@@ -18,7 +18,7 @@ const H: f64 = 1e-5;
 
 /// Compares `gradient` with central differences of `f` at `x`, in the components `which`.
 fn check(what: &str, x: &[f64], gradient: &[f64], which: impl Iterator<Item = usize>, f: impl Fn(&[f64]) -> f64) {
-    Differences::of_largest(H, 1e-6).hold(what, x, gradient, which, f);
+    Differences::of_largest(H, 1e-6).check(what, x, gradient, which, f);
 }
 
 fn random(rng: &mut Rng, n: usize, low: f32, high: f32) -> Vec<f64> {

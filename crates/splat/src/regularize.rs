@@ -194,7 +194,7 @@ mod tests {
                 ..Differences::of_largest(1e-5, 0.0)
             };
             let value = |x: &[f64]| regularizer(&w, [x[0], x[1], x[2]], x[3]).0;
-            differences.hold(&format!("{weights:?}"), &x, &gradient, 0..4, value);
+            differences.check(&format!("{weights:?}"), &x, &gradient, 0..4, value);
         }
     }
 

@@ -46,8 +46,8 @@ pub fn distortion<T: Scalar>(s: &[T], w: &[T], scale: T, v: &mut [T]) -> T {
     let (mut before, mut moment_before) = (T::default(), T::default());
     for i in 0..w.len() {
         let (m, length) = (middle(i), s[i + 1] - s[i]);
-        let (behind, moment_behind) = (total - before - w[i], moment - moment_before - w[i] * m);
-        let pull = m * before - moment_before + moment_behind - m * behind;
+        let (after, moment_after) = (total - before - w[i], moment - moment_before - w[i] * m);
+        let pull = m * before - moment_before + moment_after - m * after;
         loss = loss + scale * (w[i] * pull + third * w[i] * w[i] * length);
         v[i] = v[i] + scale * (two * pull + two * third * w[i] * length);
         before = before + w[i];

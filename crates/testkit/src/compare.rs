@@ -49,7 +49,8 @@ pub fn max_abs_difference(got: &[f64], want: &[f64], counts: impl Fn(usize) -> b
 /// # Panics
 /// When lengths differ.
 pub fn relative_difference(got: &[f64], want: &[f64], floor: f64) -> Difference {
-    let least = floor * want.iter().fold(1e-30f64, |m, v| m.max(v.abs()));
+    // Positive even without a floor, so that two zeros differ by zero.
+    let least = (floor * want.iter().fold(0.0f64, |m, v| m.max(v.abs()))).max(f64::MIN_POSITIVE);
     let scaled = |values: &[f64]| -> Vec<f64> {
         let pairs = values.iter().zip(want);
         pairs.map(|(value, want)| value / (want.abs() + least)).collect()

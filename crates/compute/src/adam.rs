@@ -1,26 +1,26 @@
-//! Adam (Kingma and Ba 2015) on planar arrays, sparse: items that took no part in the step keep parameters and moments.
+//! Sparse Adam (Kingma and Ba 2015) on planar arrays: inactive items keep their parameters and moments.
 
 use crate::Planes;
 use crate::simd::{Kernel, Lanes, Level, Mask, Simd};
 use rayon::prelude::*;
 
-/// The constants of one step.
+/// Hyperparameters of one step.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct AdamStep {
     /// Decay of the first moment; 0.9 in the paper and in 3DGS.
     pub beta1: f32,
     /// Decay of the second moment; 0.999 in the paper and in 3DGS.
     pub beta2: f32,
-    /// Added to the root; 1e-15 in 3DGS, whose gradients are tiny.
+    /// Added to the square root; 1e-15 in 3DGS, whose gradients are tiny.
     pub epsilon: f32,
-    /// Steps made so far, this one included, from 1: for the bias correction.
+    /// Number of this step, counted from 1, for the bias correction.
     pub step: u64,
 }
 
-/// One step on every plane.
+/// Takes one step on every plane.
 ///
-/// `parameters`, `gradients` and both `moments` have the same shape; `rates[c]` is plane `c`'s learning rate; an item
-/// takes part where `active` (length: the stride) is not 0. Planes run in parallel; the result does not depend on how.
+/// `parameters`, `gradients` and both `moments` have the same shape; `rates[c]` is the learning rate of plane `c`; an item is
+/// updated where `active` (length: the stride) is not 0. Planes run in parallel, which does not affect the result.
 ///
 /// # Panics
 /// When shapes differ.
@@ -42,7 +42,7 @@ pub fn adam(
     );
     assert!(
         rates.len() == count && active.len() == stride,
-        "a rate a plane, a flag an item"
+        "one rate per plane, one flag per item"
     );
     if stride == 0 {
         return;
@@ -68,7 +68,7 @@ pub fn adam(
         });
 }
 
-/// A step's constants in lanes.
+/// The constants of a step in lanes.
 #[derive(Clone, Copy, Debug)]
 pub struct AdamRule<L> {
     rate: L,
@@ -79,8 +79,8 @@ pub struct AdamRule<L> {
 }
 
 impl<L: Lanes<Scalar = f32>> AdamRule<L> {
-    /// Of `step` at the learning rate `rate`. The corrections are applied to the rate and to epsilon's partner, once, instead
-    /// of to every moment.
+    /// The rule for `step` at the learning rate `rate`. The bias corrections are folded into the rate and the scale of the
+    /// root once, instead of being applied to every moment.
     #[inline(always)]
     pub fn new<S: Simd<F = L>>(simd: S, step: &AdamStep, rate: f32) -> Self {
         let t = step.step as f64;
@@ -135,9 +135,9 @@ impl Kernel for AdamPlane<'_> {
             let v_old = simd.load(&self.second[at..]);
             let p_old = simd.load(&self.parameter[at..]);
             let [p, m, v] = rule.step(g, p_old, m_old, v_old);
-            m.or_where_not(on, m_old).store(&mut self.first[at..]);
-            v.or_where_not(on, v_old).store(&mut self.second[at..]);
-            p.or_where_not(on, p_old).store(&mut self.parameter[at..]);
+            m.select(on, m_old).store(&mut self.first[at..]);
+            v.select(on, v_old).store(&mut self.second[at..]);
+            p.select(on, p_old).store(&mut self.parameter[at..]);
         }
     }
 }
@@ -147,7 +147,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn three_steps_agree_with_the_paper_in_double_precision_and_inactive_items_rest() {
+    fn three_steps_match_the_paper_in_double_precision_and_skip_inactive_items() {
         let n = 21;
         for level in Level::all() {
             let mut p = Planes::zeros(2, n);
@@ -177,8 +177,8 @@ mod tests {
                 adam(level, &mut p, &g, [&mut m, &mut v], &[0.0, 0.01], &active, step);
             }
             for i in 0..n {
-                assert_eq!(p.get(0, i), 0.0, "a plane with rate 0 rests");
-                // 1 - 0.999f32 is off by 5e-5 of itself; its root moves a step of 0.03 by less than 2e-6.
+                assert_eq!(p.get(0, i), 0.0, "a plane with rate 0 is unchanged");
+                // 1 - 0.999f32 has a relative error of 5e-5; its root changes a step of 0.03 by less than 2e-6.
                 assert!((f64::from(p.get(1, i)) - expected[i].0).abs() < 2e-6, "item {i}");
             }
         }

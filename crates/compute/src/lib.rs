@@ -1,6 +1,6 @@
-//! What numeric code shares: SIMD lanes with run-time dispatch, planar arrays, and the kernels sort and Adam.
+//! Shared numerics: SIMD lanes with run-time dispatch, planar arrays, radix sort and Adam.
 //!
-//! `unsafe` lives in `simd::x86` alone.
+//! All `unsafe` code is in `simd::x86`.
 
 pub mod adam;
 pub mod planes;

@@ -1,9 +1,9 @@
-//! The device array: one contiguous run per component.
+//! Planar arrays: one contiguous run per component.
 
 /// Components ("planes") of `len` items each, planar: `[planes, stride]` with `stride >= len` a multiple of
-/// [`Planes::ALIGN`], so that every plane can be read in whole vectors. What lies past `len` is padding, initially zero.
+/// [`Planes::ALIGN`], so that every plane can be read in whole vectors. Values past `len` are padding, initially zero.
 ///
-/// Planar, because sixteen neighbours of one component are then one load; an interleaved `[N, 3]` takes a gather.
+/// Planar, because sixteen neighbours of one component are then a single load; an interleaved `[N, 3]` needs a gather.
 #[derive(Clone, Debug, PartialEq, Default)]
 pub struct Planes {
     data: Vec<f32>,
@@ -13,7 +13,7 @@ pub struct Planes {
 }
 
 impl Planes {
-    /// Every plane's length is a multiple of this: the widest vector.
+    /// The stride is a multiple of this, the width of the widest vector.
     pub const ALIGN: usize = 16;
 
     /// `count` planes of `len` zeros.
@@ -27,10 +27,10 @@ impl Planes {
         }
     }
 
-    /// From interleaved `[N, count]` values.
+    /// Converts from interleaved `[N, count]` values.
     ///
     /// # Panics
-    /// When the length is no multiple of `count`.
+    /// When the length is not a multiple of `count`.
     pub fn from_interleaved(count: usize, values: &[f32]) -> Self {
         assert_eq!(values.len() % count, 0, "whole items");
         let mut planes = Self::zeros(count, values.len() / count);
@@ -42,7 +42,7 @@ impl Planes {
         planes
     }
 
-    /// To interleaved `[N, count]` values.
+    /// Converts to interleaved `[N, count]` values.
     pub fn to_interleaved(&self) -> Vec<f32> {
         let mut values = Vec::with_capacity(self.len * self.count);
         for i in 0..self.len {
@@ -51,7 +51,7 @@ impl Planes {
         values
     }
 
-    /// Items a plane.
+    /// Items per plane.
     pub fn len(&self) -> usize {
         self.len
     }
@@ -61,32 +61,32 @@ impl Planes {
         self.len == 0
     }
 
-    /// Planes.
+    /// Number of planes.
     pub fn count(&self) -> usize {
         self.count
     }
 
-    /// Items and padding a plane.
+    /// Length of a plane including padding.
     pub fn stride(&self) -> usize {
         self.stride
     }
 
-    /// Plane `c`, padding included.
+    /// Plane `c`, including padding.
     pub fn plane(&self, c: usize) -> &[f32] {
         &self.data[c * self.stride..(c + 1) * self.stride]
     }
 
-    /// Plane `c`, to be written.
+    /// Plane `c`, mutable, including padding.
     pub fn plane_mut(&mut self, c: usize) -> &mut [f32] {
         &mut self.data[c * self.stride..(c + 1) * self.stride]
     }
 
-    /// All planes one after the other, `[count, stride]`.
+    /// All planes in order, `[count, stride]`.
     pub fn as_slice(&self) -> &[f32] {
         &self.data
     }
 
-    /// The same, to be written; `chunks_mut(stride)` are the planes.
+    /// All planes in order, mutable; `chunks_mut(stride)` yields the planes.
     pub fn as_mut_slice(&mut self) -> &mut [f32] {
         &mut self.data
     }
@@ -103,7 +103,7 @@ impl Planes {
         self.data[c * self.stride + i] = value;
     }
 
-    /// The items `indices`, in that order: keeping, sorting and cloning are all this.
+    /// Gathers the items `indices`, in that order: for pruning, sorting and cloning.
     pub fn gather(&self, indices: &[u32]) -> Self {
         let mut out = Self::zeros(self.count, indices.len());
         for c in 0..self.count {
@@ -115,7 +115,7 @@ impl Planes {
         out
     }
 
-    /// Adds the items of `other` behind these.
+    /// Appends the items of `other`.
     ///
     /// # Panics
     /// When the number of planes differs.
@@ -130,12 +130,12 @@ impl Planes {
         *self = out;
     }
 
-    /// All values zero, padding too.
+    /// Sets all values to zero, including padding.
     pub fn clear(&mut self) {
         self.data.fill(0.0);
     }
 
-    /// `len` items a plane, whose values are unspecified; reuses the memory where it suffices.
+    /// Changes the shape, leaving values unspecified; reuses memory where possible.
     pub fn reshape(&mut self, count: usize, len: usize) {
         let stride = len.next_multiple_of(Self::ALIGN);
         if (self.count, self.len) != (count, len) {
@@ -144,7 +144,7 @@ impl Planes {
         }
     }
 
-    /// Bytes held.
+    /// Memory used, bytes.
     pub fn bytes(&self) -> usize {
         self.data.capacity() * size_of::<f32>()
     }
@@ -155,7 +155,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn gather_and_append_agree_with_interleaved_lists() {
+    fn gather_and_append_match_interleaved_arrays() {
         let values: Vec<f32> = (0..51).map(|v| v as f32).collect();
         let mut planes = Planes::from_interleaved(3, &values);
         assert_eq!(

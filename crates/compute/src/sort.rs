@@ -4,10 +4,10 @@ use rayon::prelude::*;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 
 /// Key in the upper half, payload in the lower. Atomic so that threads can scatter into one array without `unsafe`;
-/// a relaxed store is an ordinary store to the processor.
+/// a relaxed store compiles to an ordinary store.
 pub type Pair = AtomicU64;
 
-/// Makes a pair.
+/// Packs a key and a payload.
 #[inline(always)]
 pub fn pair(key: u32, payload: u32) -> Pair {
     Pair::new(u64::from(key) << 32 | u64::from(payload))
@@ -21,12 +21,12 @@ pub fn payload(pair: &Pair) -> u32 {
 
 const DIGIT_BITS: u32 = 11;
 const BUCKETS: usize = 1 << DIGIT_BITS;
-/// Below this one thread is faster than the hand-over.
+/// Below this length one thread is faster than several.
 const PARALLEL_FROM: usize = 1 << 15;
 
-/// Sorts `items` by key, equal keys in their present order; `scratch` is resized to match and reused.
+/// Sorts `items` by key, stably; `scratch` is resized to match and reused.
 ///
-/// The result depends on neither the number of threads nor on how the work is split, since the sort is stable.
+/// Because the sort is stable, the result depends neither on the number of threads nor on how the work is split.
 pub fn sort_by_key(items: &mut Vec<Pair>, scratch: &mut Vec<Pair>) {
     let n = items.len();
     scratch.resize_with(n, Pair::default);
@@ -85,13 +85,13 @@ mod tests {
     }
 
     #[test]
-    fn agrees_with_the_standard_stable_sort_small_and_large() {
+    fn matches_the_standard_stable_sort() {
         for n in [0usize, 1, 2, 1000, 3 * PARALLEL_FROM + 17] {
             let mut state = 12345u32;
             let keys: Vec<u32> = (0..n)
                 .map(|_| {
                     state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
-                    // Few distinct keys in some runs: stability shows.
+                    // Few distinct keys in one run, to test stability.
                     if n == 1000 { state >> 28 } else { state }
                 })
                 .collect();

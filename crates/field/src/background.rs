@@ -1,13 +1,13 @@
-//! A background that is learnt with the field: a colour for every direction, behind everything.
+//! A background learnt with the field: a colour for every direction, behind everything else.
 //!
-//! Symbols: d unit direction in the world; Y_k real harmonics; c `[(degree + 1)^2, 3]` what is learnt; C the colour.
+//! Symbols: d unit direction in the world; Y_k real harmonics; c `[(degree + 1)^2, 3]` learnt coefficients; C the colour.
 //!
 //! ```text
 //! C = sigmoid(sum_k c_k Y_k(d))
 //! ```
 //!
-//! The sigmoid keeps C an sRGB colour, so that no light can hide behind a negative one, and has a slope everywhere. Sums are in
-//! double precision: it is one colour a ray beside the networks of all its samples.
+//! The sigmoid keeps C a valid sRGB colour, which cannot cancel light by being negative, and has a slope everywhere. Sums are
+//! in double precision: one colour per ray costs little beside the networks of all its samples.
 
 use crate::encoding::direction::harmonics;
 use irradia_compute::simd::{Double, Lanes, Scalar, Simd};
@@ -15,7 +15,7 @@ use irradia_compute::simd::{Double, Lanes, Scalar, Simd};
 /// The highest degree.
 pub(crate) const MAX_DEGREE: u32 = 3;
 
-/// Numbers of a background of `degree`, of none where there is none.
+/// Number of coefficients of a background of `degree`, 0 for none.
 pub(crate) fn numbers(degree: Option<u32>) -> usize {
     degree.map_or(0, |degree| 3 * (degree as usize + 1).pow(2))
 }
@@ -35,7 +35,7 @@ pub fn background_color<T: Scalar>(coefficients: &[T], direction: [T; 3]) -> [T;
     sums.map(|x| T::from_f64(1.0 / (1.0 + (-x).exp())))
 }
 
-/// Adds to `v_coefficients` the gradient through [`background_color`], which gave `color`, of `v_color`.
+/// The VJP of [`background_color`], which returned `color`: adds the gradient of the coefficients to `v_coefficients`.
 pub fn background_vjp<T: Scalar>(color: [T; 3], direction: [T; 3], v_color: [T; 3], v_coefficients: &mut [T]) {
     let v_sum: [f64; 3] = std::array::from_fn(|c| {
         let color = color[c].to_f64();

@@ -1,4 +1,4 @@
-//! What a field's shape depends on.
+//! The configuration of a field.
 
 use crate::FieldError;
 use crate::background::{MAX_DEGREE, numbers};
@@ -7,67 +7,67 @@ use crate::net::{Activation, ColorShape, Net, NetShape};
 use crate::sample::march::Steps;
 use serde::{Deserialize, Serialize};
 
-/// Where along a ray samples lie.
+/// How samples are placed along a ray.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "kind", rename_all = "snake_case")]
 pub enum Sampler {
     /// Steps through the occupied cells of a grid (Instant-NGP).
     Occupancy(Occupancy),
-    /// NeRF: a coarse network over even intervals, a fine one over these and more, drawn from the coarse weights.
+    /// NeRF: a coarse network over even intervals, and a fine one over these and more, drawn from the coarse weights.
     Hierarchy {
         /// Even intervals: 64.
         coarse: usize,
-        /// More for the fine network: 128.
+        /// Additional intervals for the fine network: 128.
         fine: usize,
     },
-    /// mip-NeRF 360: small networks propose where the last one looks.
+    /// mip-NeRF 360: small proposal networks place the samples of the last one.
     Proposal {
         /// Each proposal network with its number of intervals.
         rounds: Vec<(NetShape, usize)>,
         /// Intervals of the last network.
         last: usize,
     },
-    /// Nowhere along rays: points are given, such as splats whose colour the field adds to ([`crate::residual_at`]).
+    /// No ray sampling: points are given, such as splats to whose colour the field adds ([`crate::residual_at`]).
     Given {
-        /// Directions are those that a mirror across the point's surface would show, and not those of view.
+        /// Directions are view directions reflected at the point's surface, instead of view directions.
         mirrored: bool,
     },
 }
 
-/// What is to be said about an occupancy grid.
+/// Options of the occupancy grid.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Occupancy {
-    /// Cells a side; 128 in Instant-NGP.
+    /// Cells per side; 128 in Instant-NGP.
     pub side: usize,
-    /// How long steps are.
+    /// Step lengths.
     pub steps: Steps,
-    /// A cell is occupied where a step in it has this optical thickness; 0.01 in Instant-NGP.
+    /// A cell is occupied if a step in it has at least this optical depth; 0.01 in Instant-NGP.
     pub thickness: f32,
-    /// What is left of a remembered density at each look; 0.95 in Instant-NGP.
+    /// Decay of a cell's density at each update; 0.95 in Instant-NGP.
     pub decay: f32,
 }
 
-/// Everything that a field's shape depends on.
+/// Everything that determines the shape of a field.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct FieldConfig {
-    /// The network that gives out colour (both of them, where the sampler is a hierarchy).
+    /// The network that outputs colour (both of them, for a hierarchy).
     pub net: NetShape,
-    /// Where samples lie.
+    /// How samples are placed.
     pub sampler: Sampler,
-    /// Photographs with an appearance code each, where [`ColorShape::appearance`] is not 0.
+    /// Number of photographs with an appearance code, if [`ColorShape::appearance`] is not 0.
     pub images: usize,
-    /// Degree in direction, 0 to 3, of a background that is learnt with the field; `None`: what lies behind is given.
+    /// Degree of the spherical harmonics, 0 to 3, of a background learnt with the field; `None` if the background is given.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub background_degree: Option<u32>,
 }
 
-/// The most samples of a ray in a round.
+/// Most samples per ray and round.
 const MOST_SAMPLES: usize = 1 << 16;
 
 impl FieldConfig {
-    /// Instant-NGP's shape at sizes for processors: 8 levels of 4 features in tables of 2^15 corners, hidden layers of 32.
+    /// Instant-NGP at sizes suited to CPUs: 8 levels of 4 features in tables of 2^15 corners, hidden layers of 32.
     pub fn hash_grid() -> Self {
         Self {
             net: NetShape {
@@ -105,7 +105,7 @@ impl FieldConfig {
         }
     }
 
-    /// NeRF's shape: `width` is 256 as published, half of it in the head for colour.
+    /// NeRF: `width` is 256 as published, and half of that in the colour head.
     pub fn nerf(width: usize, coarse: usize, fine: usize) -> Self {
         Self {
             net: NetShape {
@@ -139,7 +139,7 @@ impl FieldConfig {
         }
     }
 
-    /// Numbers of an appearance code.
+    /// Length of an appearance code.
     pub fn appearance(&self) -> usize {
         self.net.color.map_or(0, |color| color.appearance)
     }
@@ -153,7 +153,7 @@ impl FieldConfig {
         }
     }
 
-    /// Numbers that [`crate::Field::tensors`] holds: what is trained, and the occupancy grid.
+    /// Number of values in [`crate::Field::tensors`]: the trained parameters and the occupancy grid.
     pub fn numbers(&self) -> usize {
         let nets = self.nets().into_iter().map(|shape| Net::new(shape).sizes());
         let grid = match &self.sampler {
@@ -163,16 +163,16 @@ impl FieldConfig {
         nets.flatten().sum::<usize>() + self.images * self.appearance() + numbers(self.background_degree) + grid
     }
 
-    /// Whether all sizes can be.
+    /// Checks that all sizes are within bounds.
     ///
     /// # Errors
-    /// The first that cannot.
+    /// The first size that is not.
     pub fn check(&self) -> Result<(), FieldError> {
         let wrong = |what, value: String, hint| Err(FieldError::Config { what, value, hint });
         if let Some(degree) = self.background_degree.filter(|degree| *degree > MAX_DEGREE) {
-            return wrong("degree of the background", degree.to_string(), "say 0 to 3");
+            return wrong("degree of the background", degree.to_string(), "must be  0 to 3");
         }
-        // Beyond these a file that says so is broken, and sums of sizes could overflow.
+        // A file beyond these limits is broken, and sums of its sizes could overflow.
         let limits = |net: &NetShape| {
             let octaves = match net.encoding {
                 PositionEncoding::Frequency(f) => f.octaves,
@@ -184,17 +184,17 @@ impl FieldConfig {
             };
             let color = net.color.map_or([0; 3], |c| [c.width, c.depth, c.appearance]);
             [
-                ("width of a hidden layer", net.width, 4096, "say at most 4096"),
-                ("number of hidden layers", net.depth, 64, "say at most 64"),
-                ("geometry", net.geometry, 4096, "say at most 4096"),
-                ("octaves", octaves.max(toward), 32, "say at most 32"),
-                ("width of a colour layer", color[0], 4096, "say at most 4096"),
-                ("number of colour layers", color[1], 64, "say at most 64"),
-                ("appearance code", color[2], 4096, "say at most 4096"),
+                ("width of a hidden layer", net.width, 4096, "must be  at most 4096"),
+                ("number of hidden layers", net.depth, 64, "must be  at most 64"),
+                ("geometry", net.geometry, 4096, "must be  at most 4096"),
+                ("octaves", octaves.max(toward), 32, "must be  at most 32"),
+                ("width of a colour layer", color[0], 4096, "must be  at most 4096"),
+                ("number of colour layers", color[1], 64, "must be  at most 64"),
+                ("appearance code", color[2], 4096, "must be  at most 4096"),
             ]
         };
         if self.images > 1 << 24 {
-            return wrong("number of images", self.images.to_string(), "say at most 2^24");
+            return wrong("number of images", self.images.to_string(), "must be  at most 2^24");
         }
         for net in self.nets() {
             for (what, value, most, hint) in limits(&net) {
@@ -204,28 +204,32 @@ impl FieldConfig {
             }
             if let PositionEncoding::HashGrid(g) = &net.encoding {
                 if ![1, 2, 4, 8].contains(&g.features) {
-                    return wrong("features of a level", g.features.to_string(), "say 1, 2, 4 or 8");
+                    return wrong("features of a level", g.features.to_string(), "must be  1, 2, 4 or 8");
                 }
                 if !(1..=32).contains(&g.levels) {
-                    return wrong("levels", g.levels.to_string(), "say 1 to 32");
+                    return wrong("levels", g.levels.to_string(), "must be  1 to 32");
                 }
                 if !(4..=24).contains(&g.log2_table) {
-                    return wrong("log2 of a table", g.log2_table.to_string(), "say 4 to 24");
+                    return wrong("log2 of a table", g.log2_table.to_string(), "must be  4 to 24");
                 }
                 if g.coarsest < 1 || g.finest < g.coarsest || g.finest > 1 << 20 {
                     let range = format!("{}..{}", g.coarsest, g.finest);
-                    return wrong("resolution of the grid", range, "say ascending sizes of 1 to 2^20");
+                    return wrong("resolution of the grid", range, "must be ascending, from 1 to 2^20");
                 }
             }
             if net.width == 0 || !net.width.is_multiple_of(8) {
-                return wrong("width of a hidden layer", net.width.to_string(), "say a multiple of 8");
+                return wrong(
+                    "width of a hidden layer",
+                    net.width.to_string(),
+                    "must be  a multiple of 8",
+                );
             }
             if let Some(color) = net.color {
                 if color.width == 0 || !color.width.is_multiple_of(8) {
                     return wrong(
                         "width of a colour layer",
                         color.width.to_string(),
-                        "say a multiple of 8",
+                        "must be  a multiple of 8",
                     );
                 }
                 if color.appearance != self.appearance() {
@@ -233,40 +237,44 @@ impl FieldConfig {
                     return wrong(
                         "appearance code",
                         value,
-                        "say the same for all networks that know colour",
+                        "must be the same for all networks that output colour",
                     );
                 }
                 if color.appearance > 0 && self.images == 0 {
-                    return wrong("number of images", "0".into(), "appearance codes need one an image");
+                    return wrong("number of images", "0".into(), "appearance codes need one per image");
                 }
             }
         }
         if self.net.color.is_none() {
-            return wrong("colour part", "absent".into(), "the last network must know colour");
+            return wrong("colour part", "absent".into(), "the last network must output colour");
         }
         match &self.sampler {
             Sampler::Occupancy(o) => {
                 if !(4..=512).contains(&o.side) {
-                    return wrong("side of the occupancy grid", o.side.to_string(), "say 4 to 512");
+                    return wrong("side of the occupancy grid", o.side.to_string(), "must be  4 to 512");
                 }
                 if !(o.steps.shortest > 1e-5 && o.steps.cone >= 0.0 && o.steps.cone < 1.0) {
                     return wrong(
                         "step",
                         o.steps.shortest.to_string(),
-                        "say more than 1e-5, and a cone of 0 to 1",
+                        "must be more than 1e-5, with a cone of 0 to 1",
                     );
                 }
             }
             Sampler::Hierarchy { coarse, fine } => {
                 if !(2..=MOST_SAMPLES).contains(coarse) || !(1..=MOST_SAMPLES).contains(fine) {
                     let value = format!("{coarse} + {fine}");
-                    return wrong("samples", value, "say at least 2 and 1, and at most 65536");
+                    return wrong("samples", value, "must be  at least 2 and 1, and at most 65536");
                 }
             }
             Sampler::Proposal { rounds, last } => {
                 let mut counts = rounds.iter().map(|(_, n)| n).chain([last]);
                 if rounds.is_empty() || counts.any(|n| !(2..=MOST_SAMPLES).contains(n)) {
-                    return wrong("samples of a round", last.to_string(), "say a round and 2 to 65536");
+                    return wrong(
+                        "samples of a round",
+                        last.to_string(),
+                        "needs at least one round, and 2 to 65536 samples in each",
+                    );
                 }
             }
             Sampler::Given { .. } => {}

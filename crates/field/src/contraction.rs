@@ -1,5 +1,5 @@
-//! The contraction of unbounded space into a cube of half size 2 (mip-NeRF 360, equation 10), with the largest coordinate for
-//! a norm, so that a grid's cube is filled: `c(x) = x` inside, `(2 - 1 / m) x / m` with `m = max |x_i|` outside.
+//! The contraction of unbounded space into a cube of half size 2 (mip-NeRF 360, equation 10), with the maximum
+//! norm, so that a grid's cube is filled: `c(x) = x` inside, `(2 - 1 / m) x / m` with `m = max |x_i|` outside.
 
 use irradia_compute::simd::Scalar;
 
@@ -37,7 +37,7 @@ pub fn uncontract<T: Scalar>(y: [T; 3]) -> [T; 3] {
     if k < one {
         return y;
     }
-    // k = 2 - 1 / m; a hair inside, so that the rim is far away instead of nowhere.
+    // k = 2 - 1 / m; kept below 2, so that the boundary maps to a large but finite distance.
     let k_inside = if k < T::from_f64(1.9999) {
         k
     } else {

@@ -1,4 +1,4 @@
-//! A radiance field and its numbers.
+//! A radiance field and its parameters.
 
 use crate::background::{background_color, numbers};
 use crate::config::{FieldConfig, Sampler};
@@ -8,27 +8,27 @@ use crate::space::Space;
 use crate::tensors::{Tensors, fill, fill_one, named};
 use irradia_scene::Rng;
 
-/// What a [`FieldConfig`] or a list of tensors has wrong.
+/// An invalid [`FieldConfig`] or list of tensors.
 #[derive(Debug, thiserror::Error)]
 pub enum FieldError {
-    /// A size that cannot be.
+    /// The configuration is invalid.
     #[error("field: {what} is {value}; {hint}")]
     Config {
-        /// Which.
+        /// The offending setting.
         what: &'static str,
-        /// What it is.
+        /// Its value.
         value: String,
-        /// What to do.
+        /// What is allowed.
         hint: &'static str,
     },
-    /// A tensor that is missing or has another size than the configuration says.
-    #[error("field: tensor {name} has {found} values and not {expected}; was it written with another configuration?")]
+    /// A tensor is missing or its size does not match the configuration.
+    #[error("field: tensor {name} has {found} values, expected {expected}; was it written with another configuration?")]
     Tensor {
         /// Its name.
         name: String,
         /// Values found, 0 where it is missing.
         found: usize,
-        /// Values wanted.
+        /// Values expected.
         expected: usize,
     },
 }
@@ -36,27 +36,27 @@ pub enum FieldError {
 /// A radiance field.
 #[derive(Clone, Debug)]
 pub struct Field {
-    /// What it was built from.
+    /// Its configuration.
     pub config: FieldConfig,
-    /// Where it lives.
+    /// The space it is defined in.
     pub space: Space,
     /// Its networks, the last one last.
     pub nets: Vec<Net>,
-    /// Their numbers.
+    /// Their parameters.
     pub parameters: Vec<NetParameters<f32>>,
     /// Appearance codes `[images, appearance]`.
     pub codes: Vec<f32>,
     /// The background's harmonics `[(degree + 1)^2, 3]`, empty where none is learnt: see [`crate::background_color`].
     pub background: Vec<f32>,
-    /// Where something is, for [`Sampler::Occupancy`].
+    /// The occupancy grid of [`Sampler::Occupancy`].
     pub occupancy: Option<OccupancyGrid>,
 }
 
 impl Field {
-    /// A field with random numbers.
+    /// A randomly initialised field.
     ///
     /// # Errors
-    /// When the configuration cannot be.
+    /// When the configuration is invalid.
     pub fn new(config: FieldConfig, space: Space, seed: u64) -> Result<Self, FieldError> {
         config.check()?;
         let nets: Vec<Net> = config.nets().into_iter().map(Net::new).collect();
@@ -82,28 +82,28 @@ impl Field {
         })
     }
 
-    /// A field that adds nothing to any colour yet, for [`crate::residual_at`].
+    /// A field for [`crate::residual_at`], initialised to add nothing to any colour.
     ///
     /// # Errors
-    /// When its network cannot be.
+    /// When the configuration of its network is invalid.
     pub fn residual(net: NetShape, mirrored: bool, space: Space, seed: u64) -> Result<Self, FieldError> {
         let mut field = Self::new(FieldConfig::residual(net, mirrored), space, seed)?;
-        field.nets[0].silence(&mut field.parameters[0]);
+        field.nets[0].zero_color(&mut field.parameters[0]);
         Ok(field)
     }
 
-    /// Numbers that are trained.
+    /// Number of trained parameters.
     pub fn len(&self) -> usize {
         let net = |p: &NetParameters<f32>| p.table.len() + p.density.len() + p.color.len();
         self.parameters.iter().map(net).sum::<usize>() + self.codes.len() + self.background.len()
     }
 
-    /// Whether there are none; never so.
+    /// Whether there are no parameters; never true.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
 
-    /// Names and values of everything that makes the field: enough to render it again with its configuration and space.
+    /// Names, shapes and values of all tensors: with configuration and space, enough to restore the field.
     pub fn tensors(&self) -> Tensors<'_> {
         let mut list = named("", &self.parameters, [&self.codes, &self.background]);
         if let Some(grid) = &self.occupancy {
@@ -112,10 +112,10 @@ impl Field {
         list
     }
 
-    /// The field of [`Self::tensors`].
+    /// Restores a field from [`Self::tensors`].
     ///
     /// # Errors
-    /// When the configuration cannot be, or a tensor is missing or has another size.
+    /// When the configuration is invalid, or a tensor is missing or has another size.
     pub fn from_tensors(
         config: FieldConfig,
         space: Space,
@@ -133,7 +133,7 @@ impl Field {
         Ok(field)
     }
 
-    /// The appearance code of a photograph; zeros, the mean, of none and of one that was not trained on.
+    /// The appearance code of a photograph; zeros, the mean code, for `None` and for photographs not trained on.
     pub(crate) fn code(&self, image: Option<u32>) -> Vec<f32> {
         let size = self.config.appearance();
         let at = image.map_or(usize::MAX, |image| image as usize * size);
@@ -142,13 +142,13 @@ impl Field {
             .map_or_else(|| vec![0.0; size], <[f32]>::to_vec)
     }
 
-    /// What the field has learnt to lie behind everything in the unit world `direction`, sRGB; `None` where it has not.
-    pub(crate) fn behind(&self, direction: [f32; 3]) -> Option<[f32; 3]> {
+    /// The learnt background colour in the unit world `direction`, sRGB; `None` if the field has none.
+    pub(crate) fn background_toward(&self, direction: [f32; 3]) -> Option<[f32; 3]> {
         (!self.background.is_empty()).then(|| background_color(&self.background, direction))
     }
 
-    /// The networks' weights turned over, for going back.
-    pub(crate) fn turned(&self) -> Vec<NetParameters<f32>> {
+    /// The networks' transposed weights, for the backward pass.
+    pub(crate) fn transposed(&self) -> Vec<NetParameters<f32>> {
         self.nets
             .iter()
             .zip(&self.parameters)
@@ -156,7 +156,7 @@ impl Field {
             .collect()
     }
 
-    /// Makes the occupancy bits from the remembered densities.
+    /// Recomputes the occupancy bits from the cells' densities.
     pub(crate) fn mark_occupied(&mut self) {
         if let (Some(grid), Sampler::Occupancy(o)) = (&mut self.occupancy, &self.config.sampler) {
             let space = &self.space;

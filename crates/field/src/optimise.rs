@@ -1,4 +1,4 @@
-//! Adam on flat lists, where a gradient of exactly zero can mean that a number took no part.
+//! Adam on flat lists, where a gradient of exactly zero can mean that a parameter is inactive.
 
 use irradia_compute::adam::{AdamRule, AdamStep};
 use irradia_compute::simd::{Kernel, Lanes, Mask, Simd};
@@ -11,7 +11,7 @@ pub(crate) struct Adam<'a> {
     pub second: &'a mut [f32],
     pub rate: f32,
     pub step: AdamStep,
-    /// Numbers whose gradient is zero keep everything, as entries of a table that no sample touched do.
+    /// Parameters whose gradient is zero keep value and moments, such as table entries that no sample touched.
     pub sparse: bool,
 }
 
@@ -28,7 +28,7 @@ impl Kernel for Adam<'_> {
         let n = self.parameters.len();
         let mut at = 0;
         while at < n {
-            // The last vector of a list that is no multiple goes by way of a copy.
+            // A last vector that is not whole goes through a copy.
             let mut copies = [[0.0f32; 16]; 4];
             let whole = at + S::LANES <= n;
             let count = if whole { S::LANES } else { n - at };
@@ -49,9 +49,9 @@ impl Kernel for Adam<'_> {
             let p_old = simd.load(if whole { &self.parameters[at..] } else { &copies[3] });
             let [mut p, mut m, mut v] = rule.step(g, p_old, m_old, v_old);
             if self.sparse {
-                m = m.or_where_not(on, m_old);
-                v = v.or_where_not(on, v_old);
-                p = p.or_where_not(on, p_old);
+                m = m.select(on, m_old);
+                v = v.select(on, v_old);
+                p = p.select(on, p_old);
             }
             if whole {
                 m.store(&mut self.first[at..]);

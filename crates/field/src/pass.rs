@@ -1,7 +1,7 @@
-//! A few rays on their way through a field: samples, densities, weights, colours. Training and rendering share it.
+//! Evaluation of a field along a few rays: samples, densities, weights, colours. Shared by training and rendering.
 //!
-//! A chunk is as many rays as give a block of samples that stays in the cache: everything from encoding to compositing (and
-//! back) happens there before the next chunk begins.
+//! A chunk holds as many rays as yield a block of samples that stays in the cache: everything from encoding to compositing
+//! (and back) runs on it before the next chunk begins.
 
 use crate::Rows;
 use crate::config::Sampler;
@@ -18,27 +18,28 @@ use irradia_compute::Level;
 use irradia_compute::simd::{Kernel, Lanes, Simd};
 use irradia_scene::Rng;
 
-/// Samples at which a chunk is full: 16 panels, whose activations fit the second cache.
+/// Samples that fill a chunk: 16 panels, whose activations fit the L2 cache.
 const CHUNK: usize = 512;
-/// Rays that walk through an occupancy grid together: the first of a chunk, and the most.
+/// Rays marched together through an occupancy grid: at the start of a chunk, and at most.
 const TOGETHER: [usize; 2] = [4, 16];
 
-/// One network's samples on a chunk of rays.
+/// One network's samples along a chunk of rays.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Pass {
-    /// Where each ray's samples begin, and the end.
+    /// First sample of each ray, and the total as the last element.
     pub starts: Vec<usize>,
     /// Distances of the samples, field units.
     pub middles: Vec<f32>,
     /// Lengths of their intervals, field units; padded with zeros to whole panels.
     pub lengths: Vec<f32>,
-    /// Edges of the intervals from 0 to 1, ray after ray, where the sampler works with them.
+    /// Interval edges in \[0, 1\], ray by ray, for samplers that use them.
     pub edges: Vec<f32>,
     pub block: Block<f32>,
+    /// Transmittance of each interval, `exp(-sigma_i delta_i)`.
     pub through: Vec<f32>,
     pub weights: Vec<f32>,
-    /// What each ray lets through in all.
-    pub behind: Vec<f32>,
+    /// Transmittance of each whole ray.
+    pub transmittance: Vec<f32>,
     /// `[panels, 3, 32]`, after [`Self::slope`].
     pub slopes: Rows<f32>,
     kept: Vec<u32>,
@@ -52,10 +53,10 @@ impl Pass {
         self.middles.clear();
         self.lengths.clear();
         self.edges.clear();
-        self.behind.clear();
+        self.transmittance.clear();
     }
 
-    /// Ray `r`'s samples.
+    /// The samples of ray `r`.
     pub fn of(&self, r: usize) -> std::ops::Range<usize> {
         self.starts[r]..self.starts[r + 1]
     }
@@ -70,10 +71,10 @@ impl Pass {
                 color[c] += w * rgb[c];
             }
         }
-        (color, 1.0 - self.behind[r])
+        (color, 1.0 - self.transmittance[r])
     }
 
-    /// The sample at which half of ray `r` is covered.
+    /// The sample at which the accumulated weight of ray `r` reaches a half.
     pub fn median(&self, r: usize) -> Option<usize> {
         let mut covered = 0.0;
         self.of(r).find(|i| {
@@ -82,19 +83,19 @@ impl Pass {
         })
     }
 
-    /// The derivative of each sample's density by its point of the unit cube, to [`Self::slopes`].
-    pub fn slope(&mut self, level: Level, field: &Field, net: usize, turned: &NetParameters<f32>) {
+    /// Writes the derivative of each sample's density by its point in the unit cube to [`Self::slopes`].
+    pub fn slope(&mut self, level: Level, field: &Field, net: usize, transposed: &NetParameters<f32>) {
         level.run(Slopes {
             net: &field.nets[net],
             parameters: &field.parameters[net],
-            turned,
+            transposed,
             block: &mut self.block,
             slopes: &mut self.slopes,
         });
     }
 
-    /// Positions to densities to weights; where `last`, samples behind the end of their rays are forgotten.
-    fn look(&mut self, level: Level, field: &Field, net: usize, rays: &[Ray], last: bool) {
+    /// Computes densities and weights from positions; if `last`, drops samples past the end of their rays.
+    fn evaluate_density(&mut self, level: Level, field: &Field, net: usize, rays: &[Ray], last: bool) {
         let n = self.middles.len();
         self.block.reset(n);
         for (r, ray) in rays.iter().enumerate() {
@@ -114,8 +115,8 @@ impl Pass {
         self.kept.clear();
         for r in 0..rays.len() {
             let range = self.of(r);
-            let (counted, behind) = weights(&self.through[range.clone()], &mut self.weights[range.clone()]);
-            self.behind.push(behind);
+            let (counted, transmittance) = weights(&self.through[range.clone()], &mut self.weights[range.clone()]);
+            self.transmittance.push(transmittance);
             self.kept.extend((range.start..range.start + counted).map(|i| i as u32));
         }
         if last && self.kept.len() < n {
@@ -141,8 +142,8 @@ impl Pass {
         }
     }
 
-    /// Colours of all samples.
-    fn paint(&mut self, level: Level, field: &Field, net: usize, rays: &[Ray], images: &[u32]) {
+    /// Computes the colours of all samples.
+    fn evaluate_color(&mut self, level: Level, field: &Field, net: usize, rays: &[Ray], images: &[u32]) {
         let panels = self.block.panels();
         self.block.directions.clear();
         self.block.directions.resize(panels * 3 * PANEL, 0.0);
@@ -169,7 +170,7 @@ impl Pass {
         });
     }
 
-    /// Fills middles and lengths from edges, `n` intervals a ray.
+    /// Fills middles and lengths from edges, `n` intervals per ray.
     fn place_intervals(&mut self, field: &Field, rays: &[Ray], n: usize) {
         for (r, ray) in rays.iter().enumerate() {
             let (near, far) = (field.space.spread(ray.near), field.space.spread(ray.far.max(ray.near)));
@@ -184,8 +185,8 @@ impl Pass {
     }
 }
 
-/// Takes as many of `rays` as make a chunk through the field, one [`Pass`] for each network; returns how many. `rng` moves the
-/// samples; without it they lie in the middle of their intervals.
+/// Evaluates the field along the first `rays` that fill a chunk, with one [`Pass`] per network; returns how many. `rng` jitters
+/// the samples; without it they lie in the middle of their intervals.
 pub(crate) fn trace(
     level: Level,
     field: &Field,
@@ -207,7 +208,7 @@ pub(crate) fn trace(
                 steps: options.steps,
             };
             while taken < rays.len() && pass.middles.len() < CHUNK {
-                // As many as fill the chunk, by those that are in it.
+                // As many as should fill the chunk, judging by the rays already in it.
                 let missing = (CHUNK - pass.middles.len()) * taken / pass.middles.len().max(1);
                 let count = if taken == 0 {
                     TOGETHER[0]
@@ -216,23 +217,23 @@ pub(crate) fn trace(
                 };
                 let group = &rays[taken..rays.len().min(taken + count)];
                 let offset = || rng.as_mut().map_or(0.5, |rng| rng.uniform());
-                for walk in pass.walks.go(level, field, &march, group, offset) {
+                for walk in pass.walks.march(level, field, &march, group, offset) {
                     pass.middles.extend_from_slice(&walk.middles);
                     pass.lengths.extend_from_slice(&walk.lengths);
                     pass.starts.push(pass.middles.len());
                 }
                 taken += group.len();
             }
-            pass.look(level, field, 0, &rays[..taken], true);
-            pass.paint(level, field, 0, &rays[..taken], images);
+            pass.evaluate_density(level, field, 0, &rays[..taken], true);
+            pass.evaluate_color(level, field, 0, &rays[..taken], images);
             return taken;
         }
-        // No point lies on a ray.
+        // The points do not lie on rays.
         Sampler::Given { .. } => {
             let pass = &mut passes[0];
             pass.starts.resize(rays.len() + 1, 0);
-            pass.look(level, field, 0, rays, true);
-            pass.paint(level, field, 0, rays, images);
+            pass.evaluate_density(level, field, 0, rays, true);
+            pass.evaluate_color(level, field, 0, rays, images);
             return rays.len();
         }
         Sampler::Hierarchy { coarse, fine } => vec![(*coarse, false), (*fine, true)],
@@ -270,17 +271,17 @@ pub(crate) fn trace(
             pass.edges.extend_from_slice(&edges);
         }
         pass.place_intervals(field, rays, n);
-        pass.look(level, field, net, rays, net + 1 == rounds.len());
+        pass.evaluate_density(level, field, net, rays, net + 1 == rounds.len());
         if field.nets[net].shape.color.is_some() {
-            pass.paint(level, field, net, rays, images);
+            pass.evaluate_color(level, field, net, rays, images);
         }
         before = n;
     }
     taken
 }
 
-/// The larger of two neighbours' maxima, averaged, and a little everywhere: samples then surround what was found and nowhere is
-/// out of reach (mip-NeRF, section 3.3).
+/// The weights max-filtered over neighbours, then averaged, plus a small constant: samples then surround what was found and
+/// every interval keeps a chance (mip-NeRF, section 3.3).
 fn blurred(weights: &[f32]) -> Vec<f32> {
     let n = weights.len();
     let at = |i: usize| weights[i.min(n - 1)];
@@ -289,7 +290,7 @@ fn blurred(weights: &[f32]) -> Vec<f32> {
         .collect()
 }
 
-/// Positions to densities, and what intervals of `lengths`, as many as the block has panels' samples, let through.
+/// Computes densities from positions, and the transmittance of intervals of `lengths`, `[panels * 32]`.
 pub(crate) struct Densities<'a> {
     pub net: &'a Net,
     pub parameters: &'a NetParameters<f32>,
@@ -309,13 +310,13 @@ impl Kernel for Densities<'_> {
         self.net.density(simd, self.parameters, self.block);
         self.through.resize(self.lengths.len(), 0.0);
         for s in (0..self.lengths.len()).step_by(S::LANES) {
-            let thickness = simd.load(&self.block.density[s..]) * simd.load(&self.lengths[s..]);
-            (-thickness).exp().store(&mut self.through[s..]);
+            let optical_depth = simd.load(&self.block.density[s..]) * simd.load(&self.lengths[s..]);
+            (-optical_depth).exp().store(&mut self.through[s..]);
         }
     }
 }
 
-/// Positions to densities, of a block of any points.
+/// Computes the densities of a block of arbitrary points.
 pub(crate) struct Density<'a> {
     pub net: &'a Net,
     pub parameters: &'a NetParameters<f32>,
@@ -355,7 +356,7 @@ impl Kernel for Colors<'_> {
 struct Slopes<'a> {
     net: &'a Net,
     parameters: &'a NetParameters<f32>,
-    turned: &'a NetParameters<f32>,
+    transposed: &'a NetParameters<f32>,
     block: &'a mut Block<f32>,
     slopes: &'a mut Rows<f32>,
 }
@@ -369,6 +370,6 @@ impl Kernel for Slopes<'_> {
         S::F: Lanes<Scalar = f32>,
     {
         self.net
-            .density_slope(simd, self.parameters, self.turned, self.block, self.slopes);
+            .density_slope(simd, self.parameters, self.transposed, self.block, self.slopes);
     }
 }

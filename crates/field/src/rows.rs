@@ -1,12 +1,12 @@
-//! Lists that begin on a cache line.
+//! Lists aligned to a cache line.
 
 use std::ops::{Deref, DerefMut};
 
-/// Bytes of a cache line, and of the widest vector.
+/// Bytes per cache line, and per widest vector.
 const LINE: usize = 64;
 
-/// A list whose first value lies on a cache line, so that no vector of a panel's row spans two: with 64-byte vectors every load
-/// of an ordinary list does, and costs twice. Memory is kept when it gets shorter. A clone has the values, and may have them elsewhere.
+/// A list aligned to a cache line, so that no vector of a panel's row spans two lines: with 64-byte vectors every load from an
+/// unaligned list does, and costs twice. Shrinking keeps the memory. A clone has the same values, not necessarily aligned.
 #[derive(Clone, Debug)]
 pub struct Rows<T> {
     data: Vec<T>,
@@ -15,17 +15,17 @@ pub struct Rows<T> {
 }
 
 impl<T: Copy + Default> Rows<T> {
-    /// No values, the memory kept.
+    /// Removes all values, keeping the memory.
     pub fn clear(&mut self) {
         self.len = 0;
     }
 
-    /// The first `len` values, new ones being `value`.
+    /// Resizes to `len` values, filling new ones with `value`.
     pub fn resize(&mut self, len: usize, value: T) {
         let spare = LINE / size_of::<T>();
         if self.start + len > self.data.len() {
             let mut data = vec![value; len + len / 2 + spare];
-            // Where the address tells nothing (it may not), 0 is as right as any.
+            // `align_offset` may decline to answer; any offset is then correct.
             let start = data.as_ptr().align_offset(LINE).min(spare);
             data[start..start + self.len].copy_from_slice(self);
             (self.data, self.start) = (data, start);
@@ -37,12 +37,12 @@ impl<T: Copy + Default> Rows<T> {
         }
     }
 
-    /// The first `len` values.
+    /// Keeps the first `len` values.
     pub fn truncate(&mut self, len: usize) {
         self.len = self.len.min(len);
     }
 
-    /// Adds values behind.
+    /// Appends values.
     pub fn extend_from_slice(&mut self, values: &[T]) {
         let old = self.len;
         self.resize(old + values.len(), T::default());
@@ -78,7 +78,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn grows_and_shrinks_as_a_list_does_and_stays_on_the_line() {
+    fn resizes_like_a_vec_and_stays_aligned() {
         let mut rows = Rows::default();
         for len in [3usize, 1000, 17, 5000] {
             rows.clear();

@@ -1,14 +1,14 @@
-//! From the world to the space a field lives in.
+//! The mapping from the world to field space.
 //!
-//! Field space is centred and scaled so that what matters lies within -1..1; a field's networks see the unit cube, into which
-//! [`Space::unit`] maps it. Distances along rays and densities are in field units.
+//! Field space is centred and scaled so that the scene of interest lies within -1..1; networks take points of the unit cube, to
+//! which [`Space::unit`] maps it. Distances along rays and densities are in field units.
 
 use crate::contraction::{contract, contract_vjp, uncontract};
 use glam::{Mat3, Quat, Vec2, Vec3};
 use irradia_scene::Camera;
 use serde::{Deserialize, Serialize};
 
-/// What lies outside the cube -1..1.
+/// What is outside the cube -1..1.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Outside {
@@ -27,58 +27,58 @@ pub struct Frustum {
     pub rotation: [f32; 4],
     /// Centre of the mean camera, world units.
     pub position: [f32; 3],
-    /// Focal length over half the width and over half the height, less a margin for the cameras that stand aside.
+    /// Focal length over half the width and over half the height, less a margin for cameras off the mean position.
     pub focal: [f32; 2],
     /// Depth of the near plane, world units.
     pub near: f32,
 }
 
-/// The way from the world to field space.
+/// The mapping from the world to field space.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Space {
     /// The world point that is 0 in field space.
     pub center: [f32; 3],
-    /// Field units a world unit.
+    /// Field units per world unit.
     pub scale: f32,
-    /// What lies outside.
+    /// What is outside the cube.
     pub outside: Outside,
 }
 
 /// A ray in field space.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Ray {
-    /// Where it starts.
+    /// Origin, field space.
     pub origin: [f32; 3],
     /// Unit direction in field space.
     pub direction: [f32; 3],
-    /// Unit direction in the world, which colour depends on.
+    /// Unit direction in the world, on which colour depends.
     pub view: [f32; 3],
-    /// Where it enters what can be seen, field units.
+    /// Distance at which it enters the field, field units.
     pub near: f32,
-    /// Where it leaves it; not above `near` where it misses.
+    /// Distance at which it leaves the field; at most `near` if it misses.
     pub far: f32,
-    /// How distance along it becomes distance in the world.
+    /// Conversion of distances along the ray to world distances.
     pub measure: Measure,
 }
 
-/// How distance along a ray of field space becomes distance in the world.
+/// Conversion of distances along a ray in field space to world distances.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Measure {
-    /// World units a field unit.
+    /// World units per field unit.
     Linear(f32),
     /// Normalised device coordinates.
     Ndc {
         /// World distance to the near plane.
         start: f32,
-        /// World distance in which the depth grows by that of the near plane.
+        /// World distance over which depth grows by the depth of the near plane.
         near: f32,
         /// Length of the whole ray to infinity, field units.
         length: f32,
     },
 }
 
-/// Contracted rays end here, field units: what lies farther moves by less than a cell of any grid.
+/// Length of contracted rays, field units: beyond it, points move by less than a cell of any grid.
 const FAR: f32 = 200.0;
 
 impl Space {
@@ -91,7 +91,7 @@ impl Space {
         }
     }
 
-    /// The same cube, uncontracted, in an unbounded world.
+    /// The same cube in an unbounded world, contracted outside it.
     pub fn contracted(center: [f32; 3], half: f32) -> Self {
         Self {
             outside: Outside::Contracted,
@@ -99,10 +99,10 @@ impl Space {
         }
     }
 
-    /// The space of what `cameras` look at: about the point nearest to all their axes, as large as the median camera sees at that
-    /// distance. `None` without two cameras that look at something.
+    /// The space that `cameras` look at: centred at the point nearest to all their axes, as large as the median camera's view at
+    /// that distance. `None` without two cameras whose axes differ.
     ///
-    /// Where the world is `unbounded` the cube reaches as far as the cameras, since what lies between them matters.
+    /// If the world is `unbounded`, the cube extends to the cameras, to include what lies between them.
     pub fn around(cameras: &[Camera], unbounded: bool) -> Option<Self> {
         // The normal equations of the point nearest to all axes: sum of (1 - d d^T) (x - o) = 0.
         let (mut a, mut b) = (Mat3::ZERO, Vec3::ZERO);
@@ -112,7 +112,7 @@ impl Space {
             a += across;
             b += across * camera.pose.position;
         }
-        // Where all cameras look one way there is no such point.
+        // Parallel axes have no such point.
         if cameras.len() < 2 || a.determinant().abs() < 1e-6 * (cameras.len() as f32).powi(3) {
             return None;
         }
@@ -140,7 +140,7 @@ impl Space {
     }
 
     /// Normalised device coordinates for forward-facing `cameras` whose scene lies beyond depth `near`, world units; `None`
-    /// without cameras or where they do not face one way.
+    /// without cameras or if they do not all face forward.
     pub fn ndc(cameras: &[Camera], near: f32) -> Option<Self> {
         let forward: Vec3 = cameras.iter().map(|c| c.pose.rotation * Vec3::Z).sum();
         let down: Vec3 = cameras.iter().map(|c| c.pose.rotation * Vec3::Y).sum();
@@ -203,7 +203,7 @@ impl Space {
         ray
     }
 
-    /// A point of field space in the unit cube.
+    /// Maps a point of field space to the unit cube.
     #[inline]
     pub fn unit(&self, p: [f32; 3]) -> [f32; 3] {
         match self.outside {
@@ -212,7 +212,7 @@ impl Space {
         }
     }
 
-    /// The gradient of the point of field space through [`Self::unit`].
+    /// The VJP of [`Self::unit`] at the point `p` of field space.
     pub fn unit_vjp(&self, p: [f32; 3], v: [f32; 3]) -> [f32; 3] {
         match self.outside {
             Outside::Contracted => contract_vjp(p, v).map(|v| 0.25 * v),
@@ -220,7 +220,7 @@ impl Space {
         }
     }
 
-    /// The point of field space that is `u` in the unit cube.
+    /// Maps a point of the unit cube to field space: the inverse of [`Self::unit`].
     pub fn from_unit(&self, u: [f32; 3]) -> [f32; 3] {
         match self.outside {
             Outside::Contracted => uncontract(u.map(|v| 4.0 * v - 2.0)),
@@ -228,7 +228,7 @@ impl Space {
         }
     }
 
-    /// A world point in field space; normalised device coordinates where the space has them (`None` at and behind the camera).
+    /// Maps a world point to field space, or to normalised device coordinates (`None` at and behind the camera).
     pub fn from_world(&self, world: [f32; 3]) -> Option<[f32; 3]> {
         match &self.outside {
             Outside::Ndc(frustum) => frustum.point(world),
@@ -236,7 +236,7 @@ impl Space {
         }
     }
 
-    /// The world point of one in field space.
+    /// Maps a point of field space to the world.
     pub fn to_world(&self, p: [f32; 3]) -> [f32; 3] {
         match &self.outside {
             Outside::Ndc(frustum) => frustum.world(p),
@@ -244,7 +244,7 @@ impl Space {
         }
     }
 
-    /// The direction in the world of the gradient `v` at a point of field space (its length is of no account).
+    /// The world direction of the gradient `v` at a point of field space, of unspecified length.
     pub fn world_gradient(&self, p: [f32; 3], v: [f32; 3]) -> [f32; 3] {
         match &self.outside {
             Outside::Ndc(frustum) => frustum.gradient(p, v),
@@ -252,8 +252,8 @@ impl Space {
         }
     }
 
-    /// Distance `t` from 0 to 1 in which samples are spread: even in distance, and beyond 1 in disparity where the world is
-    /// contracted.
+    /// Maps distance `t` to the measure in which samples are evenly spread: distance, and disparity beyond 1 in a contracted
+    /// world, where the measure is in \[0, 1\].
     pub fn spread(&self, t: f32) -> f32 {
         match self.outside {
             Outside::Contracted if t < 1.0 => 0.5 * t,
@@ -262,7 +262,7 @@ impl Space {
         }
     }
 
-    /// The distance whose [`Self::spread`] is `s`.
+    /// The inverse of [`Self::spread`].
     pub fn unspread(&self, s: f32) -> f32 {
         match self.outside {
             Outside::Contracted if s < 0.5 => 2.0 * s,
@@ -273,47 +273,47 @@ impl Space {
 }
 
 impl Frustum {
-    fn turned(&self) -> Quat {
+    fn orientation(&self) -> Quat {
         Quat::from_array(self.rotation)
     }
 
-    /// The straight line that a world ray becomes: its start on the near plane, the way from there to infinity, and
-    /// `[start, near]` of [`Measure::Ndc`]. `None` for rays that do not go forward.
+    /// The straight line to which a world ray maps: its start on the near plane, the vector from there to infinity, and
+    /// `[start, near]` of [`Measure::Ndc`]. `None` for rays that do not point forward.
     fn line(&self, origin: [f32; 3], direction: [f32; 3]) -> Option<([f32; 3], [f32; 3], [f32; 2])> {
-        let back = self.turned().inverse();
-        let d = back * Vec3::from(direction);
-        let o = back * (Vec3::from(origin) - Vec3::from(self.position));
+        let to_camera = self.orientation().inverse();
+        let d = to_camera * Vec3::from(direction);
+        let o = to_camera * (Vec3::from(origin) - Vec3::from(self.position));
         if d.z < 1e-4 {
             return None;
         }
         let start = (self.near - o.z) / d.z;
         let o = o + start * d;
         let [ax, ay] = self.focal;
-        // Appendix C, equations 25 and 26, for a camera that looks along +Z; at the near plane 2 n / z is 2.
+        // Appendix C, equations 25 and 26, for a camera looking along +Z; at the near plane 2 n / z is 2.
         let from = [ax * o.x / o.z, ay * o.y / o.z, -1.0];
         let along = [ax * (d.x / d.z - o.x / o.z), ay * (d.y / d.z - o.y / o.z), 2.0];
         Some((from, along, [start, self.near / d.z]))
     }
 
     fn point(&self, world: [f32; 3]) -> Option<[f32; 3]> {
-        let p = self.turned().inverse() * (Vec3::from(world) - Vec3::from(self.position));
+        let p = self.orientation().inverse() * (Vec3::from(world) - Vec3::from(self.position));
         let [ax, ay] = self.focal;
         (p.z > 1e-6).then(|| [ax * p.x / p.z, ay * p.y / p.z, 1.0 - 2.0 * self.near / p.z])
     }
 
-    /// The VJP of [`Self::point`] at the world point that is `p`.
+    /// The VJP of [`Self::point`] at the world point that maps to `p`.
     fn gradient(&self, p: [f32; 3], v: [f32; 3]) -> [f32; 3] {
         let z = 2.0 * self.near / (1.0 - p[2]).max(1e-4);
         let [ax, ay] = self.focal;
         let along = (2.0 * self.near / z * v[2] - p[0] * v[0] - p[1] * v[1]) / z;
-        (self.turned() * Vec3::new(ax * v[0] / z, ay * v[1] / z, along)).to_array()
+        (self.orientation() * Vec3::new(ax * v[0] / z, ay * v[1] / z, along)).to_array()
     }
 
     fn world(&self, p: [f32; 3]) -> [f32; 3] {
         let z = 2.0 * self.near / (1.0 - p[2]).max(1e-4);
         let [ax, ay] = self.focal;
         let camera = Vec3::new(p[0] * z / ax, p[1] * z / ay, z);
-        (self.turned() * camera + Vec3::from(self.position)).to_array()
+        (self.orientation() * camera + Vec3::from(self.position)).to_array()
     }
 }
 
@@ -329,8 +329,8 @@ impl Ray {
         match self.measure {
             Measure::Linear(scale) => world / scale,
             Measure::Ndc { start, near, length } => {
-                let behind = (world - start).max(0.0);
-                length * behind / (behind + near)
+                let past_near = (world - start).max(0.0);
+                length * past_near / (past_near + near)
             }
         }
     }
@@ -341,8 +341,8 @@ impl Ray {
             Measure::Linear(scale) => t * scale,
             // Appendix C: t' = 1 - z / (z + t d_z).
             Measure::Ndc { start, near, length } => {
-                let share = (t / length).min(0.9999);
-                start + near * share / (1.0 - share)
+                let fraction = (t / length).min(0.9999);
+                start + near * fraction / (1.0 - fraction)
             }
         }
     }

@@ -1,4 +1,4 @@
-//! A field while it is trained.
+//! The training state of a field.
 
 use crate::config::FieldConfig;
 use crate::field::{Field, FieldError};
@@ -6,7 +6,7 @@ use crate::net::NetParameters;
 use crate::space::Space;
 use crate::tensors::{Tensors, fill, named};
 
-/// A field while it is trained: with both moments of Adam.
+/// A field in training, with both moments of Adam.
 #[derive(Clone, Debug)]
 pub struct FieldState {
     /// The field.
@@ -17,23 +17,23 @@ pub struct FieldState {
     pub code_moments: [Vec<f32>; 2],
     /// First and second moments of the background.
     pub background_moments: [Vec<f32>; 2],
-    /// Steps made.
+    /// Steps taken.
     pub step: u64,
-    /// Rays of the next batch that [`crate::train_views`] draws.
+    /// Rays in the next batch of [`crate::train_views`].
     pub rays: usize,
-    /// Gradients and buffers, which carry nothing from one step to the next.
+    /// Gradients and buffers, which carry no state from one step to the next.
     pub(crate) scratch: crate::train::Scratch,
 }
 
 impl FieldState {
-    /// Nothing trained yet.
+    /// The state before the first step.
     pub fn new(field: Field) -> Self {
         let zeros: Vec<_> = field.parameters.iter().map(NetParameters::zeros_like).collect();
-        let nothing = |list: &[f32]| [0, 1].map(|_| vec![0.0; list.len()]);
+        let no_moments = |list: &[f32]| [0, 1].map(|_| vec![0.0; list.len()]);
         Self {
             moments: [zeros.clone(), zeros],
-            code_moments: nothing(&field.codes),
-            background_moments: nothing(&field.background),
+            code_moments: no_moments(&field.codes),
+            background_moments: no_moments(&field.background),
             step: 0,
             rays: FIRST_RAYS,
             scratch: crate::train::Scratch::default(),
@@ -41,8 +41,8 @@ impl FieldState {
         }
     }
 
-    /// The field's tensors and the moments': a checkpoint, with [`Self::step`] and [`Self::rays`]. Nothing else is carried
-    /// from one step to the next: whatever is random follows from the seed and the step.
+    /// The tensors of the field and of the moments: with [`Self::step`] and [`Self::rays`], a complete checkpoint, since random
+    /// numbers depend only on the seed and the step.
     pub fn tensors(&self) -> Tensors<'_> {
         let mut list = self.field.tensors();
         for (k, prefix) in PREFIXES.into_iter().enumerate() {
@@ -52,7 +52,7 @@ impl FieldState {
         list
     }
 
-    /// The state of [`Self::tensors`] after `step` steps, with `rays` in the next batch.
+    /// Restores the state of [`Self::tensors`] after `step` steps, with `rays` in the next batch.
     ///
     /// # Errors
     /// As [`Field::from_tensors`].
@@ -73,7 +73,7 @@ impl FieldState {
     }
 }
 
-/// A field that knows nothing yet is full of fog: few rays are many samples.
+/// An untrained field is dense everywhere, so that few rays yield many samples.
 const FIRST_RAYS: usize = 128;
 
 const PREFIXES: [&str; 2] = ["first.", "second."];

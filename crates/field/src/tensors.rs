@@ -1,12 +1,12 @@
-//! A field's numbers by name, as files want them.
+//! A field's parameters by name, for files.
 
 use crate::field::FieldError;
 use crate::net::NetParameters;
 
-/// Name, shape and values, row after row.
+/// Name, shape and row-major values.
 pub type Tensors<'a> = Vec<(String, Vec<usize>, &'a [f32])>;
 
-/// What is learnt beside the networks.
+/// Names of the parameters beside the networks'.
 const LISTS: [&str; 2] = ["codes", "background"];
 
 /// `lists` are those of [`LISTS`].

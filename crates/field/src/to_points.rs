@@ -1,4 +1,4 @@
-//! A trained field's surfaces as points: where a Gaussian cloud may start.
+//! The surfaces of a trained field as points, to initialise a Gaussian cloud.
 
 use crate::field::Field;
 use crate::pass::{Pass, trace};
@@ -10,16 +10,16 @@ use rayon::prelude::*;
 /// How surfaces are sampled.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct PointsOptions {
-    /// The most points to give.
+    /// Maximum number of points.
     pub count: usize,
-    /// A ray has met a surface where the field covers this much of it.
+    /// Minimum alpha of a ray that counts as hitting a surface.
     pub alpha: f32,
-    /// Everything random follows from it.
+    /// Random seed.
     pub seed: u64,
 }
 
 impl Default for PointsOptions {
-    /// 100,000 points where half of the ray is covered.
+    /// 100,000 points on rays with an alpha of at least a half.
     fn default() -> Self {
         Self {
             count: 100_000,
@@ -34,24 +34,24 @@ impl Default for PointsOptions {
 pub struct FieldPoints {
     /// World positions.
     pub positions: Vec<[f32; 3]>,
-    /// sRGB in \[0, 1\], the mean over the cameras that met the point.
+    /// sRGB in \[0, 1\], the mean over the rays that hit the point's cell.
     pub colors: Vec<[f32; 3]>,
-    /// How much a ray through the point is covered, 0 to 1.
+    /// Mean alpha of the rays that hit the point's cell, 0 to 1.
     pub opacities: Vec<f32>,
-    /// Half the distance to the neighbours, world units: a standard deviation with which Gaussians join.
+    /// Half the distance to the neighbours, world units: a standard deviation at which neighbouring Gaussians overlap.
     pub sizes: Vec<f32>,
 }
 
-/// Rays that meet something for each point wanted: a surface's cells are then met more than once on average.
-const HITS_A_POINT: usize = 2;
-/// Rounds of as many rays after which what was met must do: most of a picture may be empty.
+/// Hits per point requested: a surface's cells are then hit more than once on average.
+const HITS_PER_POINT: usize = 2;
+/// Most rounds of as many rays: much of each image may be empty.
 const ROUNDS: u64 = 16;
-/// Rays of one task.
+/// Rays per task.
 const CHUNK: usize = 1024;
-/// The finest thinning, cells a side of the unit cube.
+/// The finest thinning, cells per side of the unit cube.
 const FINEST: u32 = 4096;
 
-/// What one ray met.
+/// Where one ray hit a surface.
 #[derive(Clone, Copy)]
 struct Hit {
     unit: [f32; 3],
@@ -59,21 +59,24 @@ struct Hit {
     alpha: f32,
 }
 
-/// Sends rays through random pixels of `cameras` and keeps one point a cell of the finest even grid (in the field's own space,
-/// so that far things are thinned as the field knows them) that has no more than `options.count` cells with points.
+/// Traces rays through random pixels of `cameras` and keeps one point per cell of the finest even grid that has at most
+/// `options.count` non-empty cells. The grid is in the field's own space, so that distant surfaces are thinned to the field's
+/// resolution there.
 pub fn to_points(field: &Field, cameras: &[Camera], options: &PointsOptions) -> FieldPoints {
     if cameras.is_empty() || options.count == 0 {
         return FieldPoints::default();
     }
-    let wanted = HITS_A_POINT * options.count;
+    let wanted = HITS_PER_POINT * options.count;
     let chunks = wanted.div_ceil(CHUNK) as u64;
     let mut hits: Vec<Hit> = Vec::new();
     for round in 0..ROUNDS {
-        let met: Vec<Vec<Hit>> = (round * chunks..(round + 1) * chunks)
+        let traced: Vec<Vec<Hit>> = (round * chunks..(round + 1) * chunks)
             .into_par_iter()
-            .map_init(Vec::new, |passes, chunk| meet(field, cameras, options, chunk, passes))
+            .map_init(Vec::new, |passes, chunk| {
+                trace_hits(field, cameras, options, chunk, passes)
+            })
             .collect();
-        hits.extend(met.into_iter().flatten());
+        hits.extend(traced.into_iter().flatten());
         if hits.len() >= wanted {
             break;
         }
@@ -93,7 +96,13 @@ pub fn to_points(field: &Field, cameras: &[Camera], options: &PointsOptions) -> 
     thin(field, &hits, low)
 }
 
-fn meet(field: &Field, cameras: &[Camera], options: &PointsOptions, chunk: u64, passes: &mut Vec<Pass>) -> Vec<Hit> {
+fn trace_hits(
+    field: &Field,
+    cameras: &[Camera],
+    options: &PointsOptions,
+    chunk: u64,
+    passes: &mut Vec<Pass>,
+) -> Vec<Hit> {
     let mut rng = Rng::new(options.seed, chunk);
     let rays: Vec<_> = (0..CHUNK)
         .map(|_| {
@@ -121,13 +130,13 @@ fn meet(field: &Field, cameras: &[Camera], options: &PointsOptions, chunk: u64, 
     hits
 }
 
-/// The number of the cell of a grid of `side` cells a side.
+/// The index of a point's cell in a grid of `side` cells per side.
 fn cell(unit: [f32; 3], side: u32) -> u64 {
     let [x, y, z] = unit.map(|u| ((u * side as f32) as u64).min(u64::from(side) - 1));
     x | y << 20 | z << 40
 }
 
-/// One point for each cell: the mean of what was met there.
+/// One point per cell: the mean of its hits.
 fn thin(field: &Field, hits: &[Hit], side: u32) -> FieldPoints {
     let mut order: Vec<(u64, u32)> = (0u32..).zip(hits).map(|(i, hit)| (cell(hit.unit, side), i)).collect();
     order.par_sort_unstable();

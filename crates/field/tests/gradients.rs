@@ -1,5 +1,5 @@
-//! Every gradient against central differences in double precision, through the very code that trains: encodings and networks
-//! are generic over lanes, and here a lane is one `f64`.
+//! Every gradient against central differences in double precision, with the very code that trains: encodings and networks are
+//! generic over lanes, and here a lane is one `f64`.
 
 use irradia_compute::simd::Double;
 use irradia_field::contraction::{contract, contract_vjp, uncontract};
@@ -13,12 +13,12 @@ use irradia_field::{Rows, background_color, background_vjp};
 use irradia_scene::Rng;
 use irradia_testkit::differences::Differences;
 
-/// Steps of the differences; their error is of its square, 1e-10, beside rounding of 1e-16 / 1e-5.
+/// Step of the differences; truncation error is its square, 1e-10, and rounding error 1e-16 / 1e-5.
 const H: f64 = 1e-5;
 
-/// Holds `gradient` against central differences of `f` at `x`, in the components `which`.
+/// Compares `gradient` with central differences of `f` at `x`, in the components `which`.
 fn check(what: &str, x: &[f64], gradient: &[f64], which: impl Iterator<Item = usize>, f: impl Fn(&[f64]) -> f64) {
-    Differences::of_largest(H, 1e-6).hold(what, x, gradient, which, f);
+    Differences::of_largest(H, 1e-6).check(what, x, gradient, which, f);
 }
 
 fn random(rng: &mut Rng, n: usize, low: f32, high: f32) -> Vec<f64> {
@@ -36,7 +36,7 @@ fn rows(values: &[f64]) -> Rows<f64> {
 }
 
 #[test]
-fn contraction() {
+fn contraction_gradients_match_finite_differences() {
     let mut rng = Rng::new(1, 1);
     for scale in [0.5f32, 1.5, 3.0, 40.0] {
         let x: [f64; 3] = std::array::from_fn(|_| f64::from(rng.range(-scale, scale)));
@@ -50,7 +50,7 @@ fn contraction() {
 }
 
 #[test]
-fn direction_harmonics() {
+fn direction_harmonics_gradients_match_finite_differences() {
     let mut rng = Rng::new(2, 1);
     let x: [f64; 3] = std::array::from_fn(|_| f64::from(rng.range(-1.0, 1.0)));
     let v: [f64; 16] = std::array::from_fn(|_| f64::from(rng.range(-1.0, 1.0)));
@@ -71,7 +71,7 @@ fn number(lane: Lane) -> f64 {
 }
 
 #[test]
-fn frequencies() {
+fn frequency_encoding_gradients_match_finite_differences() {
     let mut rng = Rng::new(3, 1);
     let encoding = Frequency { octaves: 4 };
     let rows = encoding.features().next_multiple_of(8);
@@ -89,14 +89,14 @@ fn frequencies() {
     assert!((encoded[(6 + 12 + 1) * PANEL + 5] - angle.cos()).abs() < 1e-12);
     let mut gradient = vec![0.0; 3 * PANEL];
     encoding.encode_vjp(Double, &encoded, &v, &mut gradient);
-    // Padding rows of `v` meet zeros.
+    // The padding rows of `v` multiply zeros.
     check("frequency", &points, &gradient, (0..96).step_by(7), |p| {
         dot(&encode(p), &v)
     });
 }
 
 #[test]
-fn multilayer_perceptron_with_a_skip() {
+fn mlp_gradients_with_a_skip_match_finite_differences() {
     let mut rng = Rng::new(4, 1);
     let mlp = Mlp::new(MlpShape {
         inputs: 11,
@@ -123,9 +123,9 @@ fn multilayer_perceptron_with_a_skip() {
     mlp.forward(Double, &parameters, &x, &mut tape);
     tape.output_gradient().extend_from_slice(&v);
     let (mut grads, mut v_x) = (vec![0.0; parameters.len()], Rows::default());
-    let turned = mlp.transposed(&parameters);
-    mlp.backward(Double, &turned, &x, &mut tape, &mut grads, Some(&mut v_x));
-    // Zero weights of padding have gradients of zero where the padding rows of the output have none.
+    let transposed = mlp.transposed(&parameters);
+    mlp.backward(Double, &transposed, &x, &mut tape, &mut grads, Some(&mut v_x));
+    // Padding weights have zero gradients, since `v` is zero in the padding rows of the output.
     check(
         "mlp parameter",
         &parameters,
@@ -174,7 +174,7 @@ fn shapes() -> [NetShape; 3] {
         }),
         ..grid
     };
-    // The ReLU is what NeRF has; with the bias its kink lies apart from where the samples do.
+    // NeRF uses a ReLU; the bias keeps its kink away from the samples.
     let relu = NetShape {
         activation: Activation::Relu,
         density_bias: 0.3,
@@ -183,7 +183,7 @@ fn shapes() -> [NetShape; 3] {
     [grid, frequency, relu]
 }
 
-/// A block of 37 samples in a network, and a loss that is linear in densities and colours.
+/// A network, a block of 37 samples, and a loss that is linear in densities and colours.
 struct Scene {
     net: Net,
     points: Vec<f64>,
@@ -236,7 +236,7 @@ impl Scene {
 }
 
 #[test]
-fn whole_networks_of_both_kinds() {
+fn network_gradients_match_finite_differences() {
     for shape in shapes() {
         let mut rng = Rng::new(5, 1);
         let scene = Scene::new(shape, &mut rng);
@@ -252,8 +252,8 @@ fn whole_networks_of_both_kinds() {
         block.v_density = rows(&scene.v_density);
         block.v_rgb = rows(&scene.v_rgb);
         let mut grads = parameters.zeros_like();
-        let turned = scene.net.transposed(&parameters);
-        scene.net.backward(Double, &turned, &mut block, &mut grads, true);
+        let transposed = scene.net.transposed(&parameters);
+        scene.net.backward(Double, &transposed, &mut block, &mut grads, true);
         scene
             .net
             .table_gradient(Double, &block.points, &block.v_encoded, &mut grads.table);
@@ -298,7 +298,7 @@ fn whole_networks_of_both_kinds() {
 }
 
 #[test]
-fn density_alone_has_the_same_slope_as_the_whole_way_back() {
+fn density_slope_matches_finite_differences() {
     for shape in shapes() {
         let mut rng = Rng::new(6, 1);
         let scene = Scene::new(shape, &mut rng);
@@ -310,11 +310,11 @@ fn density_alone_has_the_same_slope_as_the_whole_way_back() {
             color: wide(&start.color, 1.0),
         };
         let mut block = scene.forward(&parameters, &scene.points, &scene.codes);
-        let turned = scene.net.transposed(&parameters);
+        let transposed = scene.net.transposed(&parameters);
         let mut slope = Rows::default();
         scene
             .net
-            .density_slope(Double, &parameters, &turned, &mut block, &mut slope);
+            .density_slope(Double, &parameters, &transposed, &mut block, &mut slope);
         let total = |points: &[f64]| {
             scene.forward(&parameters, points, &scene.codes).density[..SAMPLES]
                 .iter()
@@ -325,8 +325,8 @@ fn density_alone_has_the_same_slope_as_the_whole_way_back() {
 }
 
 #[test]
-fn a_grid_level_interpolates() {
-    // A dense level whose corners hold their own coordinates gives a point its coordinates.
+fn a_dense_grid_level_interpolates_linearly() {
+    // A dense level whose corners store their own coordinates returns the coordinates of any point.
     let shape = NetShape {
         encoding: PositionEncoding::HashGrid(HashGrid {
             levels: 1,
@@ -353,7 +353,7 @@ fn a_grid_level_interpolates() {
     let mut block = Block::default();
     block.reset(40);
     let points: Vec<[f64; 3]> = (0..40)
-        // The faces belong to the grid.
+        // The far faces belong to the grid.
         .map(|i| {
             if i == 0 {
                 [1.0; 3]
@@ -372,30 +372,32 @@ fn a_grid_level_interpolates() {
         for c in 0..3 {
             let got = block.encoded[place(rows, i) + c * PANEL];
             // Corners are stored in single precision.
-            assert!((got - point[c]).abs() < 1e-7, "{got} and not {}", point[c]);
+            assert!((got - point[c]).abs() < 1e-7, "{got}, expected {}", point[c]);
         }
     }
 }
 
 #[test]
-fn compositing() {
+fn compositing_gradients_match_finite_differences() {
     let mut rng = Rng::new(9, 1);
-    let thickness = random(&mut rng, 12, 0.0, 0.6);
+    let optical_depths = random(&mut rng, 12, 0.0, 0.6);
     let v = random(&mut rng, 12, -1.0, 1.0);
-    let forward = |thickness: &[f64]| {
-        let through: Vec<f64> = thickness.iter().map(|t| (-t).exp()).collect();
+    let forward = |optical_depths: &[f64]| {
+        let through: Vec<f64> = optical_depths.iter().map(|t| (-t).exp()).collect();
         let mut w = vec![0.0; 12];
-        let (counted, behind) = weights(&through, &mut w);
-        (through, w, counted, behind)
+        let (counted, transmittance) = weights(&through, &mut w);
+        (through, w, counted, transmittance)
     };
-    let (through, w, counted, _) = forward(&thickness);
+    let (through, w, counted, _) = forward(&optical_depths);
     let mut gradient = vec![0.0; 12];
     weights_vjp(&through, &w, &v, counted, &mut gradient);
-    check("thickness", &thickness, &gradient, 0..12, |t| dot(&forward(t).1, &v));
+    check("optical depth", &optical_depths, &gradient, 0..12, |t| {
+        dot(&forward(t).1, &v)
+    });
 }
 
 #[test]
-fn learnt_backgrounds_of_every_degree() {
+fn background_gradients_of_every_degree_match_finite_differences() {
     for degree in 0..=3usize {
         let mut rng = Rng::new(12, degree as u64);
         let coefficients = random(&mut rng, 3 * (degree + 1).pow(2), -1.0, 1.0);
@@ -416,7 +418,7 @@ fn learnt_backgrounds_of_every_degree() {
 }
 
 #[test]
-fn losses_of_proposals() {
+fn proposal_losses_match_their_equations_and_finite_differences() {
     let mut rng = Rng::new(10, 1);
     let mut edges = |n: usize| {
         let mut list = random(&mut rng, n + 1, 0.0, 1.0);
@@ -429,7 +431,7 @@ fn losses_of_proposals() {
     let (w, w_hat) = (random(&mut rng, 9, 0.0, 0.3), random(&mut rng, 6, 0.0, 0.15));
     let mut gradient = vec![0.0; 6];
     let loss = interlevel(&s, &w, &s_hat, &w_hat, 0.7, &mut gradient);
-    // Equation 13 as it is written: a proposal's interval bounds where the two overlap.
+    // Equation 13 literally: the bound sums the proposal's overlapping intervals.
     let plain: f64 = (0..9)
         .map(|i| {
             let bound: f64 = (0..6)

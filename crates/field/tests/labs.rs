@@ -1,4 +1,4 @@
-//! The labs of radiance fields with their figures: what encodings and sampling where it matters win.
+//! Experiments with known outcomes: what positional encoding and importance sampling gain.
 
 use irradia_compute::simd::Double;
 use irradia_field::Rows;
@@ -49,8 +49,8 @@ fn fit(encode: impl Fn(&[f64], &mut [f64]), inputs: usize) -> f64 {
             v[p * rows..][..PANEL].copy_from_slice(errors);
         }
         let mut grads = vec![0.0; parameters.len()];
-        let turned = mlp.transposed(&parameters);
-        mlp.backward(Double, &turned, &x, &mut tape, &mut grads, None);
+        let transposed = mlp.transposed(&parameters);
+        mlp.backward(Double, &transposed, &x, &mut tape, &mut grads, None);
         for i in 0..grads.len() {
             first[i] = 0.9 * first[i] + 0.1 * grads[i];
             second[i] = 0.99 * second[i] + 0.01 * grads[i] * grads[i];
@@ -74,13 +74,13 @@ fn positional_encoding_beats_raw_coordinates() {
     assert!(raw > 0.1 && encoded < 0.01, "raw {raw}, encoded {encoded}");
 }
 
-/// A narrow bump on a line, and its integral from 0 to 1.
+/// A narrow bump on a line.
 fn bump(x: f64) -> f64 {
     (-((x - 0.37) / 0.02).powi(2)).exp()
 }
 
 #[test]
-fn importance_sampling_beats_even_sampling_at_equal_count() {
+fn importance_sampling_beats_stratified_sampling_at_equal_count() {
     let truth = 0.02 * std::f64::consts::PI.sqrt();
     let (mut coarse, mut edges, mut samples) = (Vec::new(), Vec::new(), Vec::new());
     stratified(32, None, &mut coarse);
@@ -92,7 +92,7 @@ fn importance_sampling_beats_even_sampling_at_equal_count() {
     let mut squares = [0.0f64; 2];
     for round in 0..rounds {
         let mut rng = Rng::new(round, 1);
-        // 64 samples, each worth what it says over the density it was drawn with.
+        // 64 samples, each weighted by the inverse of its sampling density.
         stratified(64, Some(&mut rng), &mut edges);
         let even: f64 = edges
             .windows(2)
@@ -112,20 +112,20 @@ fn importance_sampling_beats_even_sampling_at_equal_count() {
 }
 
 #[test]
-fn importance_follows_its_density() {
+fn importance_samples_follow_their_density() {
     let edges = [0.0, 0.1, 0.4, 0.5, 1.0];
     let weights = [0.2, 0.0, 0.7, 0.1];
     let mut samples = Vec::new();
     importance(&edges, &weights, 1000, None, &mut samples);
     assert!(samples.is_sorted());
     for (bin, weight) in weights.iter().enumerate() {
-        let share = samples
+        let count = samples
             .iter()
             .filter(|s| (edges[bin]..edges[bin + 1]).contains(*s))
             .count();
-        assert!((share as f32 - 1000.0 * weight).abs() <= 1.0, "bin {bin}: {share}");
+        assert!((count as f32 - 1000.0 * weight).abs() <= 1.0, "bin {bin}: {count}");
     }
-    // The density is a density, and the derivative of the distribution that samples invert.
+    // The density integrates to 1 and is the derivative of the distribution function that samples invert.
     let total: f32 = (0..4)
         .map(|b| density(&edges, &weights, edges[b] + 0.01) * (edges[b + 1] - edges[b]))
         .sum();
@@ -139,13 +139,13 @@ fn importance_follows_its_density() {
         let middle = samples[k] + 0.5 * gap;
         let p = density(&edges, &weights, middle);
         if p > 0.0 && gap < 0.01 {
-            // 1/1000 of probability lies between two samples, unless an edge does too.
+            // Two samples of the same bin are 1/1000 of probability apart.
             let same_bin =
                 edges.partition_point(|e| *e <= samples[k]) == edges.partition_point(|e| *e <= samples[k + 1]);
             assert!(!same_bin || (p * gap - 1e-3).abs() < 1e-4, "{p} * {gap}");
         }
     }
-    // Nothing seen is even; nonsense does not panic.
+    // A histogram of zeros is uniform; NaN does not panic.
     importance(&edges, &[0.0; 4], 10, None, &mut samples);
     assert!(
         samples
@@ -158,7 +158,7 @@ fn importance_follows_its_density() {
 }
 
 #[test]
-fn rays_meet_boxes() {
+fn ray_box_intersections_are_exact() {
     let (low, high) = ([-1.0; 3], [1.0; 3]);
     assert_eq!(
         intersect([0.0, 0.0, -3.0], [0.0, 0.0, 1.0], low, high),

@@ -1,4 +1,4 @@
-//! Networks on every instruction set against double precision, in the sizes where tiles, strips and blocks end early.
+//! Networks on every instruction set against double precision, at sizes with partial tiles, strips and blocks.
 
 use irradia_compute::Level;
 use irradia_compute::simd::{Double, Kernel, Lanes, Scalar, Simd};
@@ -6,7 +6,7 @@ use irradia_field::Rows;
 use irradia_field::mlp::{Mlp, MlpShape, MlpTape, PANEL};
 use irradia_scene::Rng;
 
-/// What goes through a network and comes back.
+/// A network with its inputs and output gradients.
 struct Case {
     mlp: Mlp,
     parameters: Vec<f32>,
@@ -45,10 +45,10 @@ impl Case {
         self.mlp.forward(simd, &parameters, &x, &mut tape);
         let out = double(tape.output());
         tape.output_gradient().extend_from_slice(&convert(&self.v));
-        let turned = self.mlp.transposed(&parameters);
+        let transposed = self.mlp.transposed(&parameters);
         let (mut grads, mut v_x) = (convert(&vec![0.0; parameters.len()]), Rows::default());
         self.mlp
-            .backward(simd, &turned, &x, &mut tape, &mut grads, Some(&mut v_x));
+            .backward(simd, &transposed, &x, &mut tape, &mut grads, Some(&mut v_x));
         [out, double(&grads), double(&v_x)]
     }
 }
@@ -66,7 +66,7 @@ impl Kernel for &Case {
 }
 
 #[test]
-fn every_level_gives_what_double_precision_gives() {
+fn every_level_matches_double_precision() {
     for (inputs, width, outputs, skip, panels) in [
         (3, 8, 1, None, 1),
         (11, 24, 5, Some(1), 5),
@@ -88,7 +88,7 @@ fn every_level_gives_what_double_precision_gives() {
                 let norm = |values: &mut dyn Iterator<Item = f64>| values.map(|v| v * v).sum::<f64>().sqrt();
                 let size = norm(&mut want.iter().copied());
                 let error = norm(&mut got.iter().zip(want).map(|(a, b)| a - b));
-                // Sums of some hundred products in single precision, and now and then a ReLU that rounding turns over.
+                // Sums of some hundred products in single precision, and the occasional ReLU that rounding flips.
                 assert!(
                     error <= 1e-4 * size && size > 0.0,
                     "{what} of {shape:?} with {}: off by {error:e} of {size:e}",

@@ -1,4 +1,4 @@
-//! Scenes whose answer can be said aloud: fog, a wall, nothing.
+//! Scenes with known answers: fog, a wall, empty space.
 
 use glam::{Quat, Vec3};
 use irradia_field::encoding::{DirectionEncoding, HashGrid, PositionEncoding};
@@ -11,7 +11,7 @@ use irradia_field::{
 };
 use irradia_scene::{Camera, Intrinsics, Pose};
 
-/// A camera at z = -3 that looks along +Z at the cube -1..1.
+/// A camera at z = -3, looking along +Z at the cube -1..1.
 fn camera() -> Camera {
     let pose = Pose {
         position: Vec3::new(0.0, 0.0, -3.0),
@@ -20,8 +20,8 @@ fn camera() -> Camera {
     Camera::new(pose, Intrinsics::from_fov_x(16, 12, 0.5))
 }
 
-/// A field of density e^x, everywhere the same grey, in the cube -1..1 where `where_to` says.
-fn even(x: f32, where_to: impl Fn([usize; 3]) -> bool) -> Field {
+/// A uniform grey field of density e^x in the cells of the cube -1..1 for which `occupied` is true.
+fn uniform(x: f32, occupied: impl Fn([usize; 3]) -> bool) -> Field {
     let config = FieldConfig {
         net: NetShape {
             encoding: PositionEncoding::HashGrid(HashGrid {
@@ -63,7 +63,7 @@ fn even(x: f32, where_to: impl Fn([usize; 3]) -> bool) -> Field {
         parameters.color.fill(0.0);
     }
     let density = (0..32usize.pow(3)).map(|c| {
-        if where_to([c % 32, c / 32 % 32, c / 1024]) {
+        if occupied([c % 32, c / 32 % 32, c / 1024]) {
             1e3
         } else {
             0.0
@@ -75,7 +75,7 @@ fn even(x: f32, where_to: impl Fn([usize; 3]) -> bool) -> Field {
     field
 }
 
-fn with_black() -> RenderOptions {
+fn with_normals() -> RenderOptions {
     RenderOptions {
         normals: true,
         ..RenderOptions::default()
@@ -83,35 +83,35 @@ fn with_black() -> RenderOptions {
 }
 
 #[test]
-fn uniform_fog_lets_through_what_beer_and_lambert_say() {
-    let field = even(0.3f32.ln(), |_| true);
-    let view = render_view(&field, &camera(), &with_black());
-    // The ray through the middle of the picture crosses 2 units; those of the middle pixels lie within 1e-4 of it.
+fn uniform_fog_obeys_the_beer_lambert_law() {
+    let field = uniform(0.3f32.ln(), |_| true);
+    let view = render_view(&field, &camera(), &with_normals());
+    // The ray through the image centre crosses 2 units; the lengths for the central pixels differ by less than 1e-4.
     let (middle, want) = (16 * 6 + 8, 1.0 - (-0.3f32 * 2.0).exp());
-    // The first and last step may stand half a step outside: 0.3 * 0.005.
+    // The first and last step may extend half a step outside: 0.3 * 0.005.
     assert!(
         (view.alpha[middle] - want).abs() < 1.5e-3,
-        "{} and not {want}",
+        "{}, expected {want}",
         view.alpha[middle]
     );
-    assert!((view.color[middle] - 0.5 * want).abs() < 1e-3, "grey of 0.5 a weight");
-    assert_eq!(view.median_depth[middle], 0.0, "half of it is never covered");
-    // Of an even density the slope is nothing.
+    assert!((view.color[middle] - 0.5 * want).abs() < 1e-3, "grey 0.5 times alpha");
+    assert_eq!(view.median_depth[middle], 0.0, "alpha stays below a half");
+    // A uniform density has no gradient.
     assert!(view.normals.iter().all(|n| n.is_finite()));
     let densities = density_at(&field, &[[0.1, 0.2, 0.3], [1.2, 0.0, 0.0], [f32::NAN; 3]]);
     assert!((densities[0] - 0.3).abs() < 1e-6, "{}", densities[0]);
-    assert_eq!(densities[1..], [0.0; 2], "outside there is nothing");
+    assert_eq!(densities[1..], [0.0; 2], "zero outside the field");
 }
 
 #[test]
-fn an_opaque_wall_gives_its_depth_and_colour() {
-    // The wall begins at z = 0 of the world, 3 in front of the camera.
-    let field = even(8.0, |[_, _, z]| z >= 16);
-    let view = render_view(&field, &camera(), &with_black());
+fn an_opaque_wall_renders_its_depth_and_colour() {
+    // The wall begins at z = 0 in the world, 3 units in front of the camera.
+    let field = uniform(8.0, |[_, _, z]| z >= 16);
+    let view = render_view(&field, &camera(), &with_normals());
     for pixel in 0..view.alpha.len() {
         assert!(view.alpha[pixel] > 0.9999);
         assert!((view.color[pixel] - 0.5).abs() < 1e-4);
-        // A step of 0.005 along the ray, and its middle.
+        // Within a step of 0.005 along the ray and its midpoint.
         assert!((view.depth[pixel] - 3.0).abs() < 0.006, "{}", view.depth[pixel]);
         assert!(
             (view.median_depth[pixel] - 3.0).abs() < 0.006,
@@ -133,17 +133,17 @@ fn an_opaque_wall_gives_its_depth_and_colour() {
     for i in 0..n {
         assert!(points.positions[i][2].abs() < 0.006 && points.opacities[i] > 0.999);
         assert!((points.colors[i][0] - 0.5).abs() < 1e-3);
-        // The camera sees 1.53 x 1.15 units of the wall; 500 cells of it are 0.06 wide at least.
+        // The camera sees 1.53 x 1.15 units of the wall; 500 cells of it are at least 0.06 wide.
         assert!((0.02..0.1).contains(&points.sizes[i]), "{}", points.sizes[i]);
     }
 }
 
 #[test]
 fn an_empty_ray_is_transparent() {
-    let field = even(8.0, |[x, _, _]| x == 31);
+    let field = uniform(8.0, |[x, _, _]| x == 31);
     let options = RenderOptions {
         background: [0.2, 0.4, 0.6],
-        ..with_black()
+        ..with_normals()
     };
     let view = render_view(&field, &camera(), &options);
     let (middle, pixels) = (16 * 6 + 8, 16 * 12);
@@ -154,32 +154,32 @@ fn an_empty_ray_is_transparent() {
 }
 
 #[test]
-fn transmittance_never_rises_and_weights_add_up_to_alpha() {
+fn weights_are_non_negative_and_sum_to_alpha() {
     let mut rng = irradia_scene::Rng::new(1, 1);
     for round in 0..50 {
         let through: Vec<f64> = (0..40).map(|_| f64::from(rng.uniform()).powi(round % 4)).collect();
         let mut w = vec![0.0; 40];
-        let (counted, behind) = weights(&through, &mut w);
+        let (counted, remaining) = weights(&through, &mut w);
         let mut transmittance = 1.0;
         for weight in &w {
             assert!(*weight >= 0.0);
             transmittance -= weight;
         }
-        assert!((transmittance - behind).abs() < 1e-12 && behind >= 0.0);
+        assert!((transmittance - remaining).abs() < 1e-12 && remaining >= 0.0);
         assert!(w[counted..].iter().all(|w| *w == 0.0));
     }
 }
 
 #[test]
-fn discrete_compositing_of_two_intervals() {
-    // Each lets a half through: 1/2 and 1/4 of the values, and 1/4 goes on.
+fn two_intervals_composite_exactly() {
+    // Each transmits a half: weights of 1/2 and 1/4, and a transmittance of 1/4.
     let (value, alpha) = composite(&[2f64.ln(); 2], &[1.0; 2], &[10.0, 20.0]);
     assert!((value - 10.0).abs() < 1e-12 && (alpha - 0.75).abs() < 1e-12);
     assert_eq!(composite(&[], &[], &[]), (0.0, 0.0));
 }
 
 #[test]
-fn skipping_finds_every_occupied_cell_and_keeps_the_samples_places() {
+fn skipping_keeps_every_occupied_sample_in_place() {
     let space = Space::cube([0.0; 3], 1.0);
     let steps = Steps {
         shortest: 0.01,
@@ -194,7 +194,7 @@ fn skipping_finds_every_occupied_cell_and_keeps_the_samples_places() {
     for _ in 0..100 {
         let direction = Vec3::new(0.2 * rng.normal(), 0.2 * rng.normal(), 2.0).normalize();
         let ray = space.ray([0.3 * rng.normal(), 0.3 * rng.normal(), -3.0], direction.to_array());
-        // In stretches of any length, too.
+        // Also in stretches of a few steps.
         let on = |grid, most| {
             let march = March {
                 space: &space,
@@ -204,7 +204,7 @@ fn skipping_finds_every_occupied_cell_and_keeps_the_samples_places() {
             let (mut middles, mut lengths) = (Vec::new(), Vec::new());
             let mut t = march.first(&ray, 0.3);
             while t < ray.far {
-                t = march.go(&ray, t, most, &mut middles, &mut lengths);
+                t = march.advance(&ray, t, most, &mut middles, &mut lengths);
             }
             (middles, lengths)
         };
@@ -213,11 +213,11 @@ fn skipping_finds_every_occupied_cell_and_keeps_the_samples_places() {
         let occupied = |t: &&f32| grid.at(space.unit(ray.at(**t))) == irradia_field::sample::occupancy::Cell::Occupied;
         let want = all.0.iter().filter(occupied).count();
         found += want;
-        // Rounding may move a sample over a face it lies on.
-        assert!(some.0.len().abs_diff(want) <= 1, "{} and not {want}", some.0.len());
+        // Rounding may move a sample across a face it lies on.
+        assert!(some.0.len().abs_diff(want) <= 1, "{}, expected {want}", some.0.len());
         for t in &some.0 {
             assert!(all.0.iter().any(|a| (a - t).abs() < 1e-4), "a sample at {t} has moved");
         }
     }
-    assert!(found > 50, "the test met {found} samples");
+    assert!(found > 50, "only {found} samples tested");
 }

@@ -1,4 +1,4 @@
-//! The way from the world to the unit cube and back.
+//! Mappings between the world and the unit cube.
 
 use glam::{Quat, Vec3};
 use irradia_field::{Outside, Space};
@@ -17,7 +17,7 @@ fn forward_facing() -> Vec<Camera> {
 }
 
 #[test]
-fn normalised_device_coordinates_are_straight_and_go_back() {
+fn normalised_device_coordinates_keep_rays_straight_and_invert() {
     let cameras = forward_facing();
     let space = Space::ndc(&cameras, 2.0).unwrap();
     let mut rng = Rng::new(1, 1);
@@ -42,14 +42,14 @@ fn normalised_device_coordinates_are_straight_and_go_back() {
         }
     }
     assert!(space.from_world([0.0, 0.0, -1.0]).is_none(), "behind the cameras");
-    // The normal of a plane across the view is along the view wherever it is looked at.
+    // The normal of a plane across the view is along the view at every point.
     let p = space.from_world([0.3, 0.2, 5.0]).unwrap();
     let n = Vec3::from(space.world_gradient(p, [0.0, 0.0, 1.0])).normalize();
     assert!(n.z > 0.999, "{n}");
 }
 
 #[test]
-fn slopes_in_normalised_device_coordinates_are_the_worlds() {
+fn ndc_gradients_match_finite_differences_in_the_world() {
     let space = Space::ndc(&forward_facing(), 2.0).unwrap();
     let (world, v) = ([0.3f32, -0.4, 5.0], [0.3f32, -0.7, 0.5]);
     let value = |w: [f32; 3]| {
@@ -71,14 +71,14 @@ fn slopes_in_normalised_device_coordinates_are_the_worlds() {
 }
 
 #[test]
-fn contracted_space_holds_everything() {
+fn contracted_space_maps_the_world_into_the_unit_cube() {
     let space = Space::contracted([1.0, 2.0, 3.0], 2.0);
     for point in [[1.0, 2.0, 3.0], [1.5, 1.0, 4.0], [30.0, -50.0, 7.0], [1e3, 0.0, 0.0]] {
         let p = space.from_world(point).unwrap();
         let u = space.unit(p);
         assert!(u.iter().all(|v| (0.0..=1.0).contains(v)));
         let back = space.to_world(space.from_unit(u));
-        // Near the rim a unit in the last place of `u` is far in the world.
+        // Near the boundary a unit in the last place of `u` is a long way in the world.
         (0..3).for_each(|c| assert!((back[c] - point[c]).abs() < 1e-3 * point[c].abs().max(1.0), "{back:?}"));
     }
     for t in [0.1, 0.9, 1.0, 3.0, 150.0] {
@@ -87,7 +87,7 @@ fn contracted_space_holds_everything() {
 }
 
 #[test]
-fn spaces_are_found_from_cameras() {
+fn spaces_are_derived_from_cameras() {
     let looking_in: Vec<Camera> = (0..6)
         .map(|i| {
             let rotation = Quat::from_rotation_y(i as f32);
@@ -104,10 +104,7 @@ fn spaces_are_found_from_cameras() {
     assert!((1.0 / space.scale - 4.2 * 0.25f32.tan()).abs() < 1e-3);
     assert_eq!(Space::around(&looking_in, true).unwrap().outside, Outside::Contracted);
     assert!(Space::around(&looking_in[..1], false).is_none());
-    assert!(
-        Space::around(&[looking_in[0]; 3], false).is_none(),
-        "all look along one line"
-    );
+    assert!(Space::around(&[looking_in[0]; 3], false).is_none(), "all axes coincide");
     assert!(Space::ndc(&[], 1.0).is_none());
     assert!(Space::ndc(&looking_in, 1.0).is_none(), "they do not face one way");
 }

@@ -1,4 +1,4 @@
-//! Small fields learn a small scene, every sampler; the same bits whatever the threads; a resumed run is the unbroken one.
+//! Small fields learn a small scene with every sampler, with the same bits for any number of threads and after resuming.
 
 use glam::{Quat, Vec3};
 use irradia_field::encoding::{Frequency, HashGrid, PositionEncoding};
@@ -11,7 +11,7 @@ use irradia_scene::{Camera, Intrinsics, Pose, Rng};
 
 const SIDE: u32 = 24;
 
-/// Cameras on a ring about the middle, three units away.
+/// Cameras on a ring around the centre, three units away.
 fn cameras(n: usize) -> Vec<Camera> {
     (0..n)
         .map(|i| {
@@ -25,7 +25,7 @@ fn cameras(n: usize) -> Vec<Camera> {
         .collect()
 }
 
-/// A ball of radius 0.6, its halves red and blue, over white, with its alpha and depth.
+/// An image of a ball of radius 0.6 with a red and a blue half over white, with alpha and depth.
 struct Ball {
     rgb: Vec<u8>,
     alpha: Vec<u8>,
@@ -126,7 +126,7 @@ fn start(config: &FieldConfig) -> FieldState {
     FieldState::new(Field::new(config.clone(), Space::cube([0.0; 3], 1.0), 3).unwrap())
 }
 
-/// Every number of a state, as bits.
+/// All tensors of a state, as bits.
 fn bits(state: &FieldState) -> Vec<u32> {
     state
         .tensors()
@@ -158,13 +158,13 @@ fn every_sampler_learns_a_ball() {
             .map(|i| f64::from(out.color[i % 3 * pixels + i / 3] - f32::from(balls[7].rgb[i]) / 255.0).powi(2))
             .sum();
         let psnr = -10.0 * (squares / (3 * pixels) as f64).log10();
-        eprintln!("{name}: loss {first:.4} at first, {psnr:.1} dB from a new side");
+        eprintln!("{name}: loss {first:.4} in the first step, {psnr:.1} dB in a held-out view");
         assert!(psnr > 18.0, "{name}: {psnr} dB");
     }
 }
 
 #[test]
-fn threads_change_no_bit() {
+fn results_do_not_depend_on_the_number_of_threads() {
     let cameras = cameras(3);
     let balls: Vec<Ball> = cameras.iter().map(ball).collect();
     let views = views(&cameras, &balls, true);
@@ -182,7 +182,7 @@ fn threads_change_no_bit() {
 }
 
 #[test]
-fn a_resumed_run_is_the_unbroken_one() {
+fn a_resumed_run_matches_an_uninterrupted_one() {
     let cameras = cameras(3);
     let balls: Vec<Ball> = cameras.iter().map(ball).collect();
     let mut views = views(&cameras, &balls, true);
@@ -197,9 +197,9 @@ fn a_resumed_run_is_the_unbroken_one() {
         }
         config.images = 3;
         config.background_degree = Some(1);
-        let mut unbroken = start(&config);
-        run(&mut unbroken, &views, &options(), 20);
-        let saved = unbroken.clone();
+        let mut uninterrupted = start(&config);
+        run(&mut uninterrupted, &views, &options(), 20);
+        let saved = uninterrupted.clone();
         let get = |name: &str| {
             let tensors = saved.tensors();
             let (_, shape, values) = tensors.iter().find(|(n, ..)| n == name)?;
@@ -208,23 +208,23 @@ fn a_resumed_run_is_the_unbroken_one() {
         };
         let space = saved.field.space;
         let mut resumed = FieldState::from_tensors(config.clone(), space, saved.step, saved.rays, get).unwrap();
-        let losses = [&mut unbroken, &mut resumed].map(|state| run(state, &views, &options(), 20));
+        let losses = [&mut uninterrupted, &mut resumed].map(|state| run(state, &views, &options(), 20));
         assert_eq!(losses[0], losses[1], "{name}");
-        assert!(bits(&unbroken) == bits(&resumed), "{name}");
+        assert!(bits(&uninterrupted) == bits(&resumed), "{name}");
         assert!(
-            unbroken.field.codes.iter().any(|c| *c != 0.0),
+            uninterrupted.field.codes.iter().any(|c| *c != 0.0),
             "{name}: codes are trained"
         );
         assert!(
-            unbroken.field.background.iter().all(|c| *c != 0.0),
-            "{name}: what lies behind the photograph without alpha is learnt"
+            uninterrupted.field.background.iter().all(|c| *c != 0.0),
+            "{name}: the background of the photograph without alpha is learnt"
         );
         let field = Field::from_tensors(config.clone(), space, get).unwrap();
         assert!(
             render_view(&field, &cameras[0], &RenderOptions::default())
                 == render_view(&saved.field, &cameras[0], &RenderOptions::default())
         );
-        // A tensor too many is not looked at; one too few or of another size is an error that names it.
+        // A surplus tensor is ignored; a missing one or one of another size is an error that names it.
         let error = FieldState::from_tensors(config.clone(), space, 0, 1, |name| {
             get(name).filter(|_| name != "second.net0.density")
         });
@@ -244,9 +244,9 @@ fn a_resumed_run_is_the_unbroken_one() {
 }
 
 #[test]
-fn known_depth_at_some_pixels_pulls_the_surface_there_between_them() {
+fn sparse_depth_supervision_also_improves_depth_between_known_pixels() {
     let cameras = cameras(1);
-    // Grey everywhere: one photograph of that tells nothing of depth. One pixel in nine is known, as points would be.
+    // Grey everywhere: a single photograph carries no depth. One pixel in nine is known, as for sparse points.
     let is_known = |pixel: u32| (pixel % SIDE) % 3 == 1 && (pixel / SIDE) % 3 == 1;
     let known = (0..SIDE * SIDE).filter(|pixel| is_known(*pixel));
     let grey = Ball {
@@ -255,8 +255,8 @@ fn known_depth_at_some_pixels_pulls_the_surface_there_between_them() {
         depths: known.map(|pixel| KnownDepth { pixel, depth: 3.3 }).collect(),
     };
     let balls = [grey];
-    // In the cube distances are compared as they are; in the contracted world the wall lies in the far part, at 1.65 units, and so
-    // few steps bring it nearer without getting it there.
+    // In the cube distances are compared directly; in the contracted world the wall lies in the far part, at 1.65 units, and so
+    // few steps move it closer without reaching it.
     let cube = |(_, config)| (config, Space::cube([0.0; 3], 1.0), 0.25);
     let far = (configs().remove(1).1, Space::contracted([0.0, 0.0, -3.0], 2.0), 3.0);
     for (config, space, at_most) in configs().into_iter().map(cube).chain([far]) {
@@ -270,7 +270,7 @@ fn known_depth_at_some_pixels_pulls_the_surface_there_between_them() {
             };
             run(&mut state, &views(&cameras, &balls, with_depth), &options, 150);
             let out = render_view(&state.field, &cameras[0], &RenderOptions::default());
-            // The median: the mean of a contracted ray is that of whatever little lies hundreds of units away.
+            // The median: the mean along a contracted ray is dominated by faint density hundreds of units away.
             let held_out = (0u32..).zip(&out.median_depth).filter(|(pixel, _)| !is_known(*pixel));
             let errors: Vec<f32> = held_out.map(|(_, d)| (d - 3.3).abs()).collect();
             errors.iter().sum::<f32>() / errors.len() as f32
@@ -282,10 +282,9 @@ fn known_depth_at_some_pixels_pulls_the_surface_there_between_them() {
 }
 
 #[test]
-fn a_sky_is_learnt_as_a_background() {
+fn a_learnt_background_represents_the_sky() {
     let cameras = cameras(6);
-    // The ball before a sky whose blue grows from below upwards (+Y points down): not to be told from walls that stand far away,
-    // which the cube has no room for.
+    // The ball in front of a sky whose blue increases upwards (+Y points down), which acts like distant walls outside the cube.
     let blue = |d: Vec3| 0.5 - 0.8 * d.y;
     let mut balls: Vec<Ball> = cameras.iter().map(ball).collect();
     for (camera, ball) in cameras.iter().zip(&mut balls) {
@@ -310,15 +309,15 @@ fn a_sky_is_learnt_as_a_background() {
         (0..3 * pixels).map(squares).sum::<f32>() / (3 * pixels) as f32
     };
     let (with, without) = (error(Some(1)), error(None));
-    eprintln!("squared error from a new side {with:.5} with a learnt background, {without:.5} without");
+    eprintln!("squared error in a held-out view {with:.5} with a learnt background, {without:.5} without");
     assert!(2.0 * with < without, "{with} and {without}");
 }
 
 #[test]
-fn gradients_of_a_whole_step_follow_the_loss() {
-    // One step of plain descent along Adam's first direction, the gradient's sign, must lower the loss of the same batch by
-    // about the sum of the gradients' magnitudes: with rates so small that the loss is linear, twice the rate is twice the
-    // fall. Samples do not move: the seed of a step is its number.
+fn a_step_lowers_the_loss_in_proportion_to_the_rate() {
+    // A step along Adam's first direction, the sign of the gradient, must lower the loss of the same batch by the rate times the
+    // sum of the gradients' magnitudes: at rates so small that the loss is linear, twice the rate doubles the decrease. Samples
+    // stay in place, since the random numbers of a step follow from its number.
     let cameras = cameras(2);
     let balls: Vec<Ball> = cameras.iter().map(ball).collect();
     let mut views = views(&cameras, &balls, true);
@@ -354,11 +353,11 @@ fn gradients_of_a_whole_step_follow_the_loss() {
 }
 
 #[test]
-fn hostile_input_is_answered() {
+fn hostile_input_is_rejected_without_panics() {
     let space = Space::cube([0.0; 3], 1.0);
     let mut state = start(&configs()[0].1);
     let before = bits(&state);
-    // No photographs, and one whose pixels are fewer than its camera says and all masked.
+    // No photographs, and a fully masked one with fewer pixels than its camera's image.
     assert_eq!(train_views(&mut state, &[], &options()).rays, 0);
     let camera = cameras(1)[0];
     let view = TrainView {
@@ -374,7 +373,7 @@ fn hostile_input_is_answered() {
         image: 77,
     };
     assert_eq!(train_views(&mut state, &[view], &options()).rays, 0);
-    assert!(before == bits(&state), "no rays change nothing");
+    assert!(before == bits(&state), "an empty batch changes nothing");
     let rejected = |change: &dyn Fn(&mut FieldConfig)| {
         let mut config = FieldConfig::hash_grid();
         change(&mut config);

@@ -1,7 +1,7 @@
-//! How long the loss and the metrics take: `cargo run --release -p irradia-measure --example loss_speed [WEIGHTS]`,
-//! with the LPIPS weights' path where LPIPS is to be timed. `IRRADIA_SIMD=avx2` or `portable` asks for less.
+//! Timings of the loss and the metrics: `cargo run --release -p irradia-measure --example loss_speed [WEIGHTS]`,
+//! with the path of LPIPS weights to time LPIPS, too. `IRRADIA_SIMD=avx2` or `portable` selects narrower instructions.
 //!
-//! One thread's wall time is the processor time; each figure is the median of many runs.
+//! On one thread wall time is CPU time; each figure is the median of many runs.
 
 use irradia_compute::Level;
 use irradia_measure::{
@@ -31,7 +31,7 @@ fn with_threads<T: Send>(threads: usize, work: impl FnOnce() -> T + Send) -> T {
     pool.expect("a pool of threads").install(work)
 }
 
-/// The loss alone, in milliseconds: on one thread, and on two.
+/// The photometric loss, in milliseconds: on one thread, and on two.
 fn loss_times(width: usize, height: usize, weights: &LossWeights, eight_bits: bool, mask: Option<&[u8]>) -> [f64; 2] {
     let mut rng = Rng::new(1, 0);
     let count = 3 * width * height;
@@ -59,7 +59,7 @@ fn loss_times(width: usize, height: usize, weights: &LossWeights, eight_bits: bo
     })
 }
 
-/// The losses beside the photometric one, on one thread.
+/// The losses other than the photometric one, on one thread.
 fn curriculum_times(width: usize, height: usize, net: Option<&Lpips>) {
     let mut rng = Rng::new(3, 0);
     let pixels = width * height;
@@ -81,33 +81,33 @@ fn curriculum_times(width: usize, height: usize, net: Option<&Lpips>) {
         mask: None,
     };
     let (mut v, mut v_depth, mut v_alpha) = (vec![0.0; 3 * pixels], vec![0.0; pixels], vec![0.0; pixels]);
-    let said = |name: &str, seconds: f64| println!("{width}x{height} {name:<30} {:7.3} ms of CPU", 1e3 * seconds);
+    let print = |name: &str, seconds: f64| println!("{width}x{height} {name:<30} {:7.3} ms of CPU", 1e3 * seconds);
     for factor in [2, 8] {
         let mut loss = CoarseLoss::default();
         let time = seconds(100, || {
             _ = black_box(loss.evaluate(&render, &target, factor, 1.0, &mut v))
         });
-        said(&format!("coarse, cells of {factor}"), time);
+        print(&format!("coarse, cells of {factor}"), time);
     }
     let mut loss = DepthLoss::default();
     let kind = DepthKind::Relative;
     let time = seconds(100, || {
         _ = black_box(loss.evaluate(&depth, &alpha, &samples, kind, 1.0, &mut v_depth, &mut v_alpha));
     });
-    said("depth, 2000 samples", time);
+    print("depth, 2000 samples", time);
     let mut loss = SmoothLoss::default();
     let of = Smoothed::Disparity;
     let time = seconds(100, || {
         _ = black_box(loss.evaluate(&depth, &alpha, &target, of, 10.0, 1.0, &mut v_depth, &mut v_alpha));
     });
-    said("smoothness", time);
+    print("smoothness", time);
     let Some(net) = net else { return };
     for side in [64, 128, usize::MAX] {
         let crop = Crop::random(width, height, side, &mut rng);
         let time = seconds(10, || {
             _ = black_box(perceptual(net, &render, &target, crop, 1.0, &mut v));
         });
-        said(&format!("LPIPS of {}x{}", crop.width, crop.height), time);
+        print(&format!("LPIPS of {}x{}", crop.width, crop.height), time);
     }
 }
 
@@ -125,7 +125,7 @@ fn main() {
         ] {
             let [one, two] = loss_times(width, height, &weights, eight_bits, mask);
             println!(
-                "{width}x{height} {name:<30} {one:7.3} ms of CPU, {:6.2} ns a pixel; {two:7.3} ms with 2 threads",
+                "{width}x{height} {name:<30} {one:7.3} ms of CPU, {:6.2} ns per pixel; {two:7.3} ms with 2 threads",
                 1e6 * one / pixels as f64
             );
         }

@@ -1,8 +1,8 @@
-//! How good a picture is: losses with gradients for training ([`loss`]) and metrics for reports ([`metric`]).
+//! Image quality: losses with gradients for training ([`loss`]) and metrics for reports ([`metric`]).
 //!
-//! Symbols: render is the picture under judgement, truth the photograph; H, W are rows and columns; colour is
-//! sRGB-encoded in \[0, 1\]. The two have separate code on purpose: the loss is fast and in single precision, the metric
-//! plain and in double, and each is a check of the other.
+//! Symbols: render is the image being assessed, truth the photograph; H, W are rows and columns; colour is sRGB-encoded in
+//! \[0, 1\]. Losses and metrics are separate code on purpose: losses are fast and in single precision, metrics simple and in
+//! double precision, and each verifies the other.
 #![forbid(unsafe_code)]
 
 pub mod loss;

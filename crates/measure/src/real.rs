@@ -1,5 +1,5 @@
-//! Floats that plain loops are generic over: single precision trains, double precision is for finite differences, and
-//! both run the same code.
+//! The float types that scalar loops are generic over: `f32` for training and `f64` for finite differences, in the same
+//! code.
 
 use irradia_compute::simd::Scalar;
 use ndarray::NdFloat;
@@ -10,7 +10,7 @@ pub(crate) trait Real: Scalar + NdFloat {}
 impl Real for f32 {}
 impl Real for f64 {}
 
-/// The sum of `f(0) .. f(n)` in eight interleaved parts, which the compiler makes vectors of.
+/// The sum of `f(0) .. f(n)` in eight interleaved parts, which the compiler vectorises.
 #[inline(always)]
 pub(crate) fn sum_over<T: Real>(n: usize, f: impl Fn(usize) -> T) -> T {
     const PARTS: usize = 8;

@@ -2,7 +2,7 @@
 
 /// Taps of the window along one axis.
 pub(crate) const TAPS: usize = 11;
-/// Taps on either side of the middle.
+/// Taps on either side of the centre.
 pub(crate) const RADIUS: usize = TAPS / 2;
 /// Standard deviation, pixels.
 const SIGMA: f64 = 1.5;
@@ -11,7 +11,7 @@ pub(crate) const C1: f64 = 0.01 * 0.01;
 /// `(K2 L)^2` with K2 = 0.03.
 pub(crate) const C2: f64 = 0.03 * 0.03;
 
-/// Weights at distances 0 to [`RADIUS`] from the middle; the whole window sums to 1.
+/// Weights at distances 0 to [`RADIUS`] from the centre; the whole window sums to 1.
 pub(crate) fn half_window() -> [f64; RADIUS + 1] {
     let raw: [f64; RADIUS + 1] = std::array::from_fn(|k| (-((k * k) as f64) / (2.0 * SIGMA * SIGMA)).exp());
     let total = raw[0] + 2.0 * raw[1..].iter().sum::<f64>();
@@ -23,10 +23,10 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_window_sums_to_one_and_has_the_known_middle() {
+    fn the_window_sums_to_one_and_matches_published_weights() {
         let w = half_window();
         assert!((w[0] + 2.0 * w[1..].iter().sum::<f64>() - 1.0).abs() < 1e-15);
-        // 0.2660 in the table of every SSIM implementation.
+        // 0.2660 in other implementations of SSIM.
         assert!((w[0] - 0.266_011_7).abs() < 1e-6, "{}", w[0]);
         assert!((w[5] - 0.001_028_38).abs() < 1e-7, "{}", w[5]);
     }

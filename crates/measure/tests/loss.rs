@@ -1,4 +1,4 @@
-//! The loss through its public face: golden gradients, 8-bit truths, padded planes.
+//! The public API of the loss: golden gradients, 8-bit truths, padded planes.
 
 mod tensors;
 
@@ -8,7 +8,7 @@ use irradia_testkit::shared;
 use safetensors::SafeTensors;
 use tensors::{tensor_f64, tensor_image};
 
-/// `[3, stride]` of an `[H, W, 3]` image, with not-a-number in the padding, which must not be read.
+/// `[3, stride]` of an `[H, W, 3]` image, with NaN in the padding, which must not be read.
 fn planar(image: &Image, stride: usize) -> Vec<f32> {
     let mut planes = vec![f32::NAN; 3 * stride];
     for (i, value) in image.data.iter().enumerate() {
@@ -18,7 +18,7 @@ fn planar(image: &Image, stride: usize) -> Vec<f32> {
 }
 
 #[test]
-fn ssim_and_its_gradient_have_the_golden_values() {
+fn ssim_and_its_gradient_match_golden_values() {
     let Some(path) = shared("golden/metrics/metrics.safetensors") else {
         return;
     };
@@ -47,8 +47,8 @@ fn ssim_and_its_gradient_have_the_golden_values() {
         );
         let mean = map.iter().sum::<f64>() / map.len() as f64;
         let ssim = values.ssim.unwrap();
-        // Single precision cancels to 1e-4 of a similarity where a window is flat; the golden's own float version is 4e-6 off.
-        assert!((ssim - mean).abs() < 1e-5, "{case}: {ssim} and not {mean}");
+        // In flat windows single precision cancels to 1e-4 of a similarity; the golden implementation in floats is 4e-6 off.
+        assert!((ssim - mean).abs() < 1e-5, "{case}: {ssim}, expected {mean}");
         let largest = want.iter().fold(0.0f64, |m, v| m.max(v.abs()));
         let mut worst = 0.0f64;
         for (i, want) in want.iter().enumerate() {
@@ -68,7 +68,7 @@ fn ssim_and_its_gradient_have_the_golden_values() {
 }
 
 #[test]
-fn an_8_bit_truth_is_the_planar_one() {
+fn eight_bit_and_planar_truths_agree() {
     let (width, height) = (37, 21);
     let mut rng = Rng::new(3, 0);
     let bytes: Vec<u8> = (0..3 * width * height).map(|_| rng.below(256) as u8).collect();
@@ -90,7 +90,7 @@ fn an_8_bit_truth_is_the_planar_one() {
 }
 
 #[test]
-fn an_image_without_pixels_is_no_loss() {
+fn an_empty_image_has_zero_loss() {
     let target = Target {
         width: 0,
         height: 7,

@@ -13,7 +13,7 @@ use tensors::{read_image, tensor_image};
 const WEIGHTS: &str = "data/lpips/lpips_squeeze.safetensors";
 
 #[test]
-fn psnr_and_ssim_have_the_golden_values() {
+fn psnr_and_ssim_match_golden_values() {
     let (Some(values), Some(tensors)) = (
         shared("golden/metrics/metrics.json"),
         shared("golden/metrics/metrics.safetensors"),
@@ -32,13 +32,13 @@ fn psnr_and_ssim_have_the_golden_values() {
             ("ssim_inria_same", ssim(&render, &truth)),
         ] {
             let want = expected[name].as_f64().unwrap();
-            assert!((got - want).abs() < 1e-9, "{case} {name}: {got} and not {want}");
+            assert!((got - want).abs() < 1e-9, "{case} {name}: {got}, expected {want}");
         }
     }
 }
 
 #[test]
-fn lpips_has_the_published_check_values() {
+fn lpips_matches_the_published_check_values() {
     for (which, far, near) in [(LpipsNet::Squeeze, 0.7110, 0.1479), (LpipsNet::Alex, 0.7219, 0.1376)] {
         let Some(weights) = shared(&format!("data/lpips/{}", which.file_name())) else {
             return;
@@ -49,11 +49,11 @@ fn lpips_has_the_published_check_values() {
             let path = shared(&format!("data/lpips/ex_{name}.png")).unwrap();
             read_image(path)
         });
-        // Known to four digits.
+        // The published values have four digits.
         for (other, want) in [(&p0, far), (&p1, near)] {
             let got = net.distance(&reference, other).unwrap();
             println!("LPIPS {which} {got:.6}, published {want}");
-            assert!((got - want).abs() < 6e-5, "{which}: {got} and not {want}");
+            assert!((got - want).abs() < 6e-5, "{which}: {got}, expected {want}");
         }
         assert_eq!(net.distance(&p0, &p0).unwrap(), 0.0);
         let back = net.distance(&p0, &reference).unwrap();
@@ -62,7 +62,7 @@ fn lpips_has_the_published_check_values() {
 }
 
 #[test]
-fn lpips_takes_images_down_to_its_smallest_and_refuses_smaller_ones() {
+fn lpips_rejects_images_below_the_minimum_size() {
     let Some(weights) = shared(WEIGHTS) else { return };
     let net = Lpips::load(weights).unwrap();
     let side = net.net().min_side();
@@ -82,7 +82,7 @@ fn lpips_takes_images_down_to_its_smallest_and_refuses_smaller_ones() {
 }
 
 #[test]
-fn the_real_pair_is_evaluated_whole() {
+fn evaluating_a_real_pair_matches_golden_values() {
     let (Some(render), Some(truth), Some(weights)) = (
         shared("golden/metrics/real_render.png"),
         shared("golden/metrics/real_gt.png"),
@@ -94,12 +94,12 @@ fn the_real_pair_is_evaluated_whole() {
     let net = Lpips::load(weights).unwrap();
     let values = evaluate(&render, &truth, None, Some(&net));
     println!("{values:?}");
-    // metrics.json, real_fox_pair: the tensors there are these files.
+    // real_fox_pair of metrics.json was computed from these files.
     assert!((values.psnr - 24.646_030).abs() < 1e-3, "{values:?}");
     assert!((values.ssim - 0.753_807_5).abs() < 1e-4, "{values:?}");
     assert!(values.lpips.is_some_and(|v| (0.05..0.5).contains(&v)), "{values:?}");
 
-    // Where the mask is 0 the render does not matter at all.
+    // Where the mask is 0 the render has no effect.
     let mut mask = vec![255u8; render.width as usize * render.height as usize];
     let mut poisoned = render.clone();
     for i in 0..mask.len() / 2 {
@@ -108,17 +108,17 @@ fn the_real_pair_is_evaluated_whole() {
     }
     let masked = evaluate(&render, &truth, Some(&mask), Some(&net));
     assert_eq!(evaluate(&poisoned, &truth, Some(&mask), Some(&net)), masked);
-    // The upper half is now the truth's own.
+    // The upper half now equals the truth.
     assert!(masked.lpips < values.lpips.map(|v| 0.7 * v), "{masked:?}");
 }
 
 #[test]
-fn weights_that_are_broken_are_refused_in_one_line() {
+fn broken_weights_are_rejected_in_one_line() {
     let folder = tempfile::tempdir().unwrap();
     let refused = |bytes: &[u8], part: &str| {
         let path = folder.path().join("broken.safetensors");
         fs::write(&path, bytes).unwrap();
-        let error = Lpips::load(&path).err().expect("must be refused");
+        let error = Lpips::load(&path).err().expect("must be rejected");
         let line = error.to_string();
         assert!(matches!(error, LpipsError::Weights { .. }), "{line}");
         assert!(
@@ -126,9 +126,9 @@ fn weights_that_are_broken_are_refused_in_one_line() {
             "{line}"
         );
     };
-    refused(b"", "no whole safetensors file");
-    refused(b"not a file of tensors at all", "no whole safetensors file");
-    refused(&u64::MAX.to_le_bytes(), "no whole safetensors file");
+    refused(b"", "not a complete safetensors file");
+    refused(b"not a file of tensors at all", "not a complete safetensors file");
+    refused(&u64::MAX.to_le_bytes(), "not a complete safetensors file");
     let bias = [0u8; 256];
     let whole = |tensors: &[(&str, Vec<usize>, &[u8])]| {
         let view = |shape: &Vec<usize>, data| TensorView::new(safetensors::Dtype::F32, shape.clone(), data).unwrap();
@@ -140,7 +140,7 @@ fn weights_that_are_broken_are_refused_in_one_line() {
     refused(&whole(std::slice::from_ref(&mark)), "features.0.weight is missing");
     refused(
         &whole(&[mark.clone(), ("features.0.weight", vec![64], &bias)]),
-        "[64] and not F32 [64, 3, 3, 3]",
+        "[64], expected F32 [64, 3, 3, 3]",
     );
     let nan = f32::NAN.to_le_bytes().repeat(64 * 27);
     let poison = ("features.0.weight", vec![64, 3, 3, 3], &nan[..]);
@@ -153,5 +153,5 @@ fn weights_that_are_broken_are_refused_in_one_line() {
 
     let Some(weights) = shared(WEIGHTS) else { return };
     let bytes = fs::read(weights).unwrap();
-    refused(&bytes[..bytes.len() / 2], "no whole safetensors file");
+    refused(&bytes[..bytes.len() / 2], "not a complete safetensors file");
 }

@@ -230,7 +230,7 @@ mod tests {
     fn senseless_options_are_refused_in_one_line() {
         for options in [SynthOptions { views: 0, ..SMALL }, SynthOptions { width: 0, ..SMALL }] {
             let error = write_synth_dataset("never-made", &options).expect_err("refused");
-            assert!(error.to_string().contains("give between"), "{error}");
+            assert!(error.to_string().contains("must be"), "{error}");
         }
         assert!(!Path::new("never-made").exists());
     }

@@ -1,7 +1,7 @@
 use crate::{Lens, Pose};
 use glam::{Vec2, Vec3};
 
-/// What a camera projects with, in pixels.
+/// Intrinsic parameters of a camera, in pixels.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Intrinsics {
     /// Image width in pixels.
@@ -16,12 +16,12 @@ pub struct Intrinsics {
     pub cx: f32,
     /// Principal point y, pixels; the image's top edge is 0.
     pub cy: f32,
-    /// Distortion; the renderers take [`Lens::Pinhole`] alone, readers undistort photographs.
+    /// Distortion; renderers accept only [`Lens::Pinhole`], readers undistort photographs.
     pub lens: Lens,
 }
 
 impl Intrinsics {
-    /// A pinhole with square pixels, the principal point in the middle and a horizontal field of view in radians.
+    /// A pinhole camera with square pixels, a centred principal point and a horizontal field of view in radians.
     pub fn from_fov_x(width: u32, height: u32, fov_x: f32) -> Self {
         let focal = 0.5 * width as f32 / (0.5 * fov_x).tan();
         Self {
@@ -35,9 +35,9 @@ impl Intrinsics {
         }
     }
 
-    /// The same camera with an image of `factor` times the size (rounded to whole pixels, at least 1): the only resizer.
+    /// The same camera with the image size scaled by `factor` (rounded to whole pixels, at least 1).
     ///
-    /// Focal lengths and the principal point scale by the ratio of the *rounded* sizes, so that the field of view stays.
+    /// Focal lengths and the principal point scale by the ratio of the *rounded* sizes, which preserves the field of view.
     pub fn scaled(&self, factor: f32) -> Self {
         let width = ((self.width as f32 * factor).round() as u32).max(1);
         let height = ((self.height as f32 * factor).round() as u32).max(1);
@@ -71,11 +71,11 @@ impl Intrinsics {
 /// A posed camera.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Camera {
-    /// Where it stands.
+    /// Extrinsic parameters.
     pub pose: Pose,
-    /// What it projects with.
+    /// Intrinsic parameters.
     pub intrinsics: Intrinsics,
-    /// Nothing nearer than this along +Z is drawn, world units.
+    /// Near plane: nothing closer than this along +Z is drawn, world units.
     pub near: f32,
 }
 
@@ -92,14 +92,14 @@ impl Camera {
         }
     }
 
-    /// The pixel of a world point and its depth along +Z, lens ignored; `None` behind the near plane.
+    /// Pixel coordinates of a world point and its depth along +Z, ignoring the lens; `None` in front of the near plane.
     pub fn project(&self, world: Vec3) -> Option<(Vec2, f32)> {
         let p = self.pose.camera_from_world(world);
         let k = &self.intrinsics;
         (p.z > self.near).then(|| (Vec2::new(k.fx * p.x / p.z + k.cx, k.fy * p.y / p.z + k.cy), p.z))
     }
 
-    /// Unit direction in the world of the ray through pixel coordinates `(x, y)`, lens ignored.
+    /// Unit direction in the world of the ray through pixel coordinates `(x, y)`, ignoring the lens.
     pub fn ray_direction(&self, pixel: Vec2) -> Vec3 {
         let k = &self.intrinsics;
         let camera = Vec3::new((pixel.x - k.cx) / k.fx, (pixel.y - k.cy) / k.fy, 1.0);
@@ -112,7 +112,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn scaling_keeps_the_field_of_view_with_odd_sizes() {
+    fn scaling_odd_sizes_preserves_the_field_of_view() {
         let k = Intrinsics::from_fov_x(541, 333, 1.0);
         let half = k.scaled(0.5);
         assert_eq!((half.width, half.height), (271, 167));

@@ -1,6 +1,6 @@
 use crate::sh;
 
-/// 3D Gaussians on the host, as files hold them. All columns have the same N.
+/// 3D Gaussians on the host, in the parameterisation of splat files. All columns have the same N.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct GaussianCloud {
     /// Centres, `[N, 3]` world.
@@ -15,22 +15,22 @@ pub struct GaussianCloud {
     pub sh: Vec<f32>,
     /// Degree of `sh`, 0 to 4.
     pub sh_degree: u32,
-    /// Whether the scene was trained with the Mip-Splatting filters and must be rendered with them.
+    /// Whether the scene was trained with the Mip-Splatting filters, which rendering must then apply.
     pub antialiased: bool,
 }
 
 impl GaussianCloud {
-    /// How many Gaussians.
+    /// Number of Gaussians.
     pub fn len(&self) -> usize {
         self.means.len()
     }
 
-    /// Whether there are none.
+    /// Whether there are no Gaussians.
     pub fn is_empty(&self) -> bool {
         self.means.is_empty()
     }
 
-    /// Coefficients a Gaussian holds for each colour channel: `(degree + 1)^2`.
+    /// Coefficients per Gaussian and colour channel: `(degree + 1)^2`.
     pub fn sh_coefficients(&self) -> usize {
         sh::coefficients(self.sh_degree)
     }

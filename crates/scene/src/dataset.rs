@@ -1,12 +1,12 @@
 use crate::{Camera, PointCloud, resize_area};
 use std::sync::Arc;
 
-/// Why a photograph could not be loaded: one line that says what, where and what to do.
+/// Why a photograph could not be loaded, in one line: what, where and what to do.
 #[derive(Debug, thiserror::Error)]
 #[error("{0}")]
 pub struct LoadError(pub String);
 
-/// A photograph as 8-bit pixels, undistorted, at the size its view's camera has.
+/// An undistorted photograph as 8-bit pixels, at the size of its view's camera.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Photo {
     /// Width in pixels.
@@ -17,17 +17,17 @@ pub struct Photo {
     pub channels: u32,
     /// `[H, W, channels]`.
     pub data: Vec<u8>,
-    /// `[H, W]`, 0 where the pixel must not be trained on, 255 where it may.
+    /// `[H, W]`, 0 for pixels excluded from training, 255 for the others.
     pub mask: Option<Vec<u8>>,
 }
 
 impl Photo {
-    /// Bytes held.
+    /// Memory used, bytes.
     pub fn bytes(&self) -> usize {
         self.data.len() + self.mask.as_ref().map_or(0, Vec::len)
     }
 
-    /// The same photograph at `width` x `height`, averaged over area; a mask counts a pixel that is kept by half or more.
+    /// The same photograph resized to `width` x `height` by area; a mask pixel is kept where at least half of its area is.
     pub fn resized(&self, width: u32, height: u32) -> Self {
         if (width, height) == (self.width, self.height) {
             return self.clone();
@@ -45,7 +45,7 @@ impl Photo {
         }
     }
 
-    /// `[H, W, 3]` laid over `background` (sRGB in \[0, 1\]), as 8 bits.
+    /// `[H, W, 3]` composited over `background` (sRGB in \[0, 1\]), as 8 bits.
     pub fn over(&self, background: [f32; 3]) -> Vec<u8> {
         if self.channels == 3 {
             return self.data.clone();
@@ -57,18 +57,18 @@ impl Photo {
         self.data.chunks_exact(4).flat_map(pixel).collect()
     }
 
-    /// `[H, W]`, where there is an alpha channel.
+    /// The alpha channel `[H, W]`, if any.
     pub fn alpha(&self) -> Option<Vec<u8>> {
         (self.channels == 4).then(|| self.data.iter().skip(3).step_by(4).copied().collect())
     }
 }
 
-/// Something that can produce a view's photograph again and again: a file, or pixels in memory.
+/// A source of a view's photograph that can be loaded repeatedly: a file, or pixels in memory.
 pub trait PhotoSource: Send + Sync {
     /// Decodes, undistorts, crops and resizes. Called from several threads.
     ///
     /// # Errors
-    /// One line that names the file and says what to do.
+    /// One line that names the file and the remedy.
     fn load(&self) -> Result<Photo, LoadError>;
 }
 
@@ -83,16 +83,16 @@ impl PhotoSource for Photo {
 pub struct View {
     /// Name within the dataset, relative and with forward slashes, such as `images/0001.jpg`.
     pub name: String,
-    /// The undistorted camera at the size [`PhotoSource::load`] returns.
+    /// The undistorted camera, at the image size that [`PhotoSource::load`] returns.
     pub camera: Camera,
-    /// The pixels, loaded when needed.
+    /// The pixels, loaded on demand.
     pub photo: Arc<dyn PhotoSource>,
-    /// How near and how far this view's scene lies along +Z, world units, where the source says so.
+    /// Nearest and farthest depth of the scene in this view along +Z, world units, if the source provides them.
     pub depth_bounds: Option<[f32; 2]>,
-    /// When it was taken, in the source's own unit (0 to 1 over the capture where transforms.json follows D-NeRF); `None`
-    /// where the source does not say.
+    /// Capture time, in the source's own unit (0 to 1 over the capture where transforms.json follows D-NeRF); `None` if the
+    /// source has none.
     pub time: Option<f32>,
-    /// Indices into [`Dataset::points`] of the points this view is known to see; empty where the source does not say.
+    /// Indices into [`Dataset::points`] of the points visible in this view; empty if the source does not list them.
     pub points_seen: Vec<u32>,
 }
 
@@ -105,15 +105,15 @@ pub struct Dataset {
     pub train: Vec<usize>,
     /// Indices of the held-out views.
     pub test: Vec<usize>,
-    /// Points to start from, where the dataset has some.
+    /// Initial points, if the dataset has any.
     pub points: Option<PointCloud>,
-    /// What kind of dataset it is, for people: `COLMAP (text)`, `Blender`, ..
+    /// Human-readable kind of dataset: `COLMAP (text)`, `Blender`, ..
     pub kind: String,
-    /// One line each about what was left out or assumed; the reader does not print.
+    /// One line for each omission or assumption; the reader does not print.
     pub warnings: Vec<String>,
 }
 
-/// The held-out rule of the field: of `count` views in name order every 8th is held out (`index % 8 == 0`).
+/// The usual train/test split: of `count` views in name order every 8th is held out (`index % 8 == 0`).
 ///
 /// Returns `(train, test)`.
 pub fn every_eighth(count: usize) -> (Vec<usize>, Vec<usize>) {

@@ -5,7 +5,7 @@ pub struct Image {
     pub width: u32,
     /// Height in pixels.
     pub height: u32,
-    /// Channels a pixel.
+    /// Channels per pixel.
     pub channels: u32,
     /// Values, `[H, W, C]`; colour is sRGB-encoded in \[0, 1\].
     pub data: Vec<f32>,
@@ -25,7 +25,7 @@ impl Image {
     /// Wraps `data [H, W, C]`.
     ///
     /// # Panics
-    /// When the length does not match: that is a bug of the caller.
+    /// When the length does not match: a bug in the caller.
     pub fn new(width: u32, height: u32, channels: u32, data: Vec<f32>) -> Self {
         assert_eq!(
             data.len(),
@@ -47,7 +47,7 @@ impl Image {
         &self.data[at..at + c]
     }
 
-    /// The same, to be written.
+    /// Mutable access to the channels of the pixel in column `x`, row `y`.
     pub fn pixel_mut(&mut self, x: u32, y: u32) -> &mut [f32] {
         let c = self.channels as usize;
         let at = (y as usize * self.width as usize + x as usize) * c;

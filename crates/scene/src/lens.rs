@@ -1,16 +1,16 @@
 use glam::DVec2;
 
-/// How a ray bends on its way to the sensor, in COLMAP's and OpenCV's parameters.
+/// Lens distortion, in COLMAP's and OpenCV's parameters.
 ///
-/// Both directions work on the normalised image plane: `(x, y) = (X / Z, Y / Z)` of the OpenCV camera.
+/// Both directions map the normalised image plane: `(x, y) = (X / Z, Y / Z)` of the OpenCV camera.
 #[derive(Clone, Copy, Debug, PartialEq, Default)]
 pub enum Lens {
     /// No distortion.
     #[default]
     Pinhole,
-    /// OpenCV's rational model (COLMAP `FULL_OPENCV`; `OPENCV`, `RADIAL` and `SIMPLE_RADIAL` with zeros).
+    /// OpenCV's rational model (COLMAP `FULL_OPENCV`; `OPENCV`, `RADIAL` and `SIMPLE_RADIAL` by setting the rest to zero).
     Opencv {
-        /// Radial coefficients k1..k6; k4..k6 are the denominator.
+        /// Radial coefficients k1..k6; k4..k6 form the denominator.
         k: [f64; 6],
         /// Tangential coefficients p1, p2.
         p: [f64; 2],
@@ -23,7 +23,7 @@ pub enum Lens {
 }
 
 impl Lens {
-    /// Where the undistorted plane point `p` appears on the distorted plane.
+    /// Maps the undistorted plane point `p` to the distorted plane.
     pub fn distort(&self, p: DVec2) -> DVec2 {
         match self {
             Lens::Pinhole => p,
@@ -57,7 +57,7 @@ impl Lens {
             return Some(distorted);
         }
         let mut p = match self {
-            // A fisheye's radius is an angle: its tangent is a far better start than the angle itself.
+            // A fisheye radius is an angle: its tangent is a far better initial guess than the angle itself.
             Lens::Fisheye { .. } => {
                 let theta = distorted.length().min(1.5);
                 distorted * (theta.tan() / theta.max(1e-12))
@@ -110,7 +110,7 @@ mod tests {
     }
 
     #[test]
-    fn a_fold_in_the_model_is_reported_not_looped_on() {
+    fn a_folded_model_returns_none() {
         let folded = Lens::Opencv {
             k: [-1.0, 0.0, 0.0, 0.0, 0.0, 0.0],
             p: [0.0; 2],

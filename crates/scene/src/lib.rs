@@ -1,6 +1,6 @@
-//! What a scene *is*: cameras, images, points, Gaussians and datasets as plain types.
+//! The data model: cameras, images, points, Gaussians and datasets as plain types.
 //!
-//! Nothing here reads a file or runs a kernel. Conventions, kept by every other crate:
+//! Nothing here reads a file or runs a kernel. Every other crate follows these conventions:
 //!
 //! - World: right-handed, in the dataset's own units. Cameras: OpenCV axes, +X right, +Y down, +Z forward.
 //! - Transforms are named target-from-source: [`Pose::world_from_camera`].

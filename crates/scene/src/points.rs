@@ -1,6 +1,6 @@
 use glam::Vec3;
 
-/// Coloured points, as structure from motion leaves them.
+/// Coloured points, such as structure from motion produces.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct PointCloud {
     /// `[N]` world.
@@ -10,12 +10,12 @@ pub struct PointCloud {
 }
 
 impl PointCloud {
-    /// How many points.
+    /// Number of points.
     pub fn len(&self) -> usize {
         self.positions.len()
     }
 
-    /// Whether there are none.
+    /// Whether there are no points.
     pub fn is_empty(&self) -> bool {
         self.positions.is_empty()
     }

@@ -1,6 +1,6 @@
 use glam::{Mat3, Quat, Vec3};
 
-/// Where a camera stands and how it is turned.
+/// Position and orientation of a camera.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Pose {
     /// Rotation of camera axes (OpenCV: x right, y down, z forward) into the world.
@@ -10,9 +10,9 @@ pub struct Pose {
 }
 
 impl Pose {
-    /// A camera at `eye` that looks at `target`; `up` is the world's up and need not be orthogonal to the view.
+    /// A camera at `eye` looking at `target`; `up` is the world's up and need not be orthogonal to the view direction.
     ///
-    /// When `up` is parallel to the view direction any perpendicular up is taken.
+    /// When `up` is parallel to the view direction, any perpendicular up is used.
     pub fn look_at(eye: Vec3, target: Vec3, up: Vec3) -> Self {
         let forward = (target - eye).normalize_or(Vec3::Z);
         let right = forward.cross(up).normalize_or(forward.any_orthonormal_vector());
@@ -32,12 +32,12 @@ impl Pose {
         }
     }
 
-    /// A point in camera space, taken to the world.
+    /// Transforms a point from camera space to world space.
     pub fn world_from_camera(&self, point: Vec3) -> Vec3 {
         self.rotation * point + self.position
     }
 
-    /// A point in the world, taken to camera space.
+    /// Transforms a point from world space to camera space.
     pub fn camera_from_world(&self, point: Vec3) -> Vec3 {
         self.rotation.inverse() * (point - self.position)
     }
@@ -59,7 +59,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn look_at_puts_the_target_on_the_optical_axis_and_up_up() {
+    fn look_at_centres_the_target_and_keeps_up() {
         let pose = Pose::look_at(Vec3::new(3.0, -2.0, 1.0), Vec3::ZERO, Vec3::Z);
         let target = pose.camera_from_world(Vec3::ZERO);
         assert!(target.x.abs() < 1e-5 && target.y.abs() < 1e-5);
@@ -70,7 +70,7 @@ mod tests {
     }
 
     #[test]
-    fn both_directions_are_inverse() {
+    fn world_and_camera_transforms_are_inverse() {
         let pose = Pose::from_camera_from_world(Quat::from_xyzw(0.1, 0.5, -0.3, 0.8), Vec3::new(1.0, 2.0, 3.0));
         let p = Vec3::new(0.3, -0.7, 2.0);
         assert!((pose.world_from_camera(pose.camera_from_world(p)) - p).length() < 1e-5);
@@ -80,7 +80,7 @@ mod tests {
     }
 
     #[test]
-    fn looking_straight_down_the_up_axis_still_gives_a_rotation() {
+    fn look_at_along_the_up_axis_is_a_valid_rotation() {
         let pose = Pose::look_at(Vec3::Z, Vec3::ZERO, Vec3::Z);
         assert!(pose.is_valid() && (pose.rotation.length() - 1.0).abs() < 1e-5);
     }

@@ -1,7 +1,7 @@
 /// Resamples 8-bit pixels `from [height, width, channels]`, `size` being `[width, height]`, to exactly `to` by area: an output
-/// pixel is the mean of what it covers, parts of pixels counted in part. Values are averaged as they are stored (sRGB),
-/// colour weighted by alpha where there is one (4 channels), so that the colour of transparent pixels does not bleed into
-/// edges. Sizes may also grow: then it repeats pixels.
+/// pixel is the mean of the input it covers, partly covered pixels weighted by their fraction. Values are averaged as stored
+/// (sRGB); with 4 channels colour is weighted by alpha, so that transparent pixels do not bleed into edges. Enlarging
+/// repeats pixels.
 ///
 /// # Panics
 /// When the length does not match, a size is zero, or the channels are not 1, 3 or 4.
@@ -10,9 +10,9 @@ pub fn resize_area(from: &[u8], channels: u32, size: [u32; 2], to: [u32; 2]) -> 
     assert_eq!(
         from.len(),
         size[0] as usize * size[1] as usize * channels,
-        "pixels of the given size"
+        "pixel data matches the size"
     );
-    assert!(!size.contains(&0) && !to.contains(&0), "no size is zero");
+    assert!(!size.contains(&0) && !to.contains(&0), "sizes are positive");
     let across = spans(size[0], to[0]);
     let down = spans(size[1], to[1]);
     let stride = size[0] as usize * channels;
@@ -44,19 +44,19 @@ pub fn resize_area(from: &[u8], channels: u32, size: [u32; 2], to: [u32; 2]) -> 
     data
 }
 
-/// Adds a row, averaged across and times `weight`; with 4 channels colour is multiplied by alpha / 255 on the way.
+/// Adds a row, averaged horizontally and scaled by `weight`; with 4 channels colour is premultiplied by alpha / 255.
 fn add_row<const C: usize>(sums: &mut [f32], row: &[u8], across: &[Span], weight: f32) {
     for (sum, span) in sums.chunks_exact_mut(C).zip(across) {
-        for (x, share) in span.weights() {
+        for (x, fraction) in span.weights() {
             let pixel: &[u8; C] = row[x * C..(x + 1) * C].try_into().expect("C values");
-            let share = share * weight;
-            let color_share = if C == 4 {
-                share * f32::from(pixel[3]) * (1.0 / 255.0)
+            let fraction = fraction * weight;
+            let color_fraction = if C == 4 {
+                fraction * f32::from(pixel[3]) * (1.0 / 255.0)
             } else {
-                share
+                fraction
             };
             for c in 0..C {
-                sum[c] += f32::from(pixel[c]) * if c < 3 { color_share } else { share };
+                sum[c] += f32::from(pixel[c]) * if c < 3 { color_fraction } else { fraction };
             }
         }
     }
@@ -92,18 +92,18 @@ fn spans(from: u32, to: u32) -> Vec<Span> {
         .map(|i| {
             let (start, end) = (f64::from(i) * scale, f64::from(i + 1) * scale);
             let first = (start as usize).min(from as usize - 1);
-            // The end belongs to the next pixel when it falls on a border, give or take rounding.
+            // An end on a pixel border, up to rounding, belongs to the previous pixel.
             let last = ((end - 1e-6).max(start) as usize).clamp(first, from as usize - 1);
-            let share = |pixel: usize| {
+            let fraction = |pixel: usize| {
                 let overlap = end.min(pixel as f64 + 1.0) - start.max(pixel as f64);
                 (overlap / scale) as f32
             };
             Span {
                 first,
                 last,
-                first_weight: if first == last { 1.0 } else { share(first) },
+                first_weight: if first == last { 1.0 } else { fraction(first) },
                 inner_weight: (1.0 / scale) as f32,
-                last_weight: share(last),
+                last_weight: fraction(last),
             }
         })
         .collect()
@@ -114,7 +114,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn means_over_whole_and_partial_pixels() {
+    fn averages_whole_and_partial_pixels() {
         assert_eq!(
             resize_area(&[0, 100, 40, 40, 100, 200, 40, 80], 1, [4, 2], [2, 1]),
             [100, 50]
@@ -130,7 +130,7 @@ mod tests {
     }
 
     #[test]
-    fn transparent_pixels_lend_no_colour() {
+    fn transparent_pixels_contribute_no_colour() {
         let two = [200, 100, 50, 255, 0, 255, 0, 0];
         assert_eq!(resize_area(&two, 4, [2, 1], [1, 1]), [200, 100, 50, 128]);
     }

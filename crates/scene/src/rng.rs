@@ -1,4 +1,4 @@
-//! The one random generator: small, seedable, and its whole state is two words, so that a checkpoint can hold it.
+//! The project's random number generator: small, seedable, and its state is two words, which a checkpoint can store.
 
 /// PCG-XSH-RR 64/32 (O'Neill 2014).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -10,7 +10,7 @@ pub struct Rng {
 }
 
 impl Rng {
-    /// The generator of `seed`, on stream `stream`: equal seeds on unequal streams are independent.
+    /// A generator from `seed` on `stream`; streams of the same seed are independent.
     pub fn new(seed: u64, stream: u64) -> Self {
         let mut rng = Self {
             state: 0,
@@ -51,14 +51,14 @@ impl Rng {
         }
     }
 
-    /// Standard normal (Box and Muller 1958).
+    /// Standard normal variate (Box and Muller 1958).
     pub fn normal(&mut self) -> f32 {
         let u = (f64::from(self.next_u32()) + 1.0) / 4_294_967_297.0;
         let v = f64::from(self.next_u32()) / 4_294_967_296.0;
         ((-2.0 * u.ln()).sqrt() * (std::f64::consts::TAU * v).cos()) as f32
     }
 
-    /// Shuffles in place (Fisher and Yates).
+    /// Shuffles `items` in place (Fisher-Yates).
     pub fn shuffle<T>(&mut self, items: &mut [T]) {
         for i in (1..items.len()).rev() {
             items.swap(i, self.below(i as u32 + 1) as usize);
@@ -71,7 +71,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn streams_differ_and_moments_are_right() {
+    fn streams_differ_and_normal_moments_match() {
         let (mut a, mut b) = (Rng::new(7, 0), Rng::new(7, 1));
         assert_ne!(a.next_u32(), b.next_u32());
         let n = 100_000;

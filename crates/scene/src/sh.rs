@@ -1,9 +1,9 @@
-//! Constants of the real spherical harmonics, in the basis and signs of the Inria 3DGS code.
+//! Constants of the real spherical harmonics, with the basis and signs of the Inria 3DGS code.
 
 /// Highest degree that is trained and rendered.
 pub const MAX_DEGREE: u32 = 3;
 
-/// Number of coefficients of all bands up to `degree`.
+/// Number of coefficients in all bands up to `degree`.
 pub const fn coefficients(degree: u32) -> usize {
     ((degree + 1) * (degree + 1)) as usize
 }
@@ -31,12 +31,12 @@ pub const C3: [f64; 7] = [
     -0.590_043_589_926_643_5,
 ];
 
-/// The DC coefficient that shows `color` from everywhere.
+/// The DC coefficient for `color` in every direction.
 pub fn dc_from_color(color: f32) -> f32 {
     (color - 0.5) / C0 as f32
 }
 
-/// The colour that the DC coefficient shows, before clamping.
+/// The colour of a DC coefficient, before clamping.
 pub fn color_from_dc(dc: f32) -> f32 {
     dc * C0 as f32 + 0.5
 }

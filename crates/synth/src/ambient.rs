@@ -1,5 +1,5 @@
-//! The light of the whole sky on a surface, without rays: the hemisphere's mean colour for the normal, less what each
-//! solid nearby covers of it. Solids stand in as balls and discs, whose form factors have closed forms.
+//! Analytic ambient light: the mean sky colour over the hemisphere of the normal, less the fraction that nearby solids occlude.
+//! Solids are approximated by balls and discs, whose form factors have closed forms.
 //!
 //! Symbols: `n` the surface's normal, `w` the unit direction to a solid at distance `d`.
 
@@ -8,14 +8,14 @@ use crate::shape::Shape;
 use crate::texture::smooth;
 use glam::Vec3;
 
-/// Light of the upper half of the sky on a surface that faces up, linear RGB.
+/// Sky light on a surface that faces up, linear RGB.
 const SKY: Vec3 = Vec3::new(0.44, 0.56, 0.78);
-/// Light that the sunlit table and ground send up, linear RGB.
+/// Light reflected upwards by the sunlit table and ground, linear RGB.
 const BOUNCE: Vec3 = Vec3::new(0.40, 0.30, 0.22);
 
-/// Irradiance over pi of everything but the sun, linear RGB, with nothing in its way.
+/// Irradiance over pi of everything but the sun, linear RGB, without occlusion.
 pub fn open(hit: &Hit) -> Vec3 {
-    // Near its top the table lies in the shadow of what stands there, and sends up less.
+    // Close to the table top, shadows of the objects on it reduce the reflected light.
     let bounce = if hit.point.z > 0.0 {
         0.35 + 0.65 * smooth(0.0, 0.45, hit.point.z)
     } else {
@@ -24,7 +24,7 @@ pub fn open(hit: &Hit) -> Vec3 {
     (BOUNCE * bounce).lerp(SKY, 0.5 + 0.5 * hit.normal.z)
 }
 
-/// The same, less what the other objects cover.
+/// As [`open`], less occlusion by the other objects.
 pub fn shaded(scene: &SynthScene, hit: &Hit) -> Vec3 {
     let mut uncovered = 1.0;
     for (object, _) in scene.clusters.iter().flat_map(|cluster| &cluster.objects) {
@@ -35,10 +35,10 @@ pub fn shaded(scene: &SynthScene, hit: &Hit) -> Vec3 {
     uncovered * open(hit)
 }
 
-/// The part of the hemisphere over `n`, weighted by the cosine, that a solid hides: 0 to 1.
+/// The cosine-weighted fraction of the hemisphere over `n` that a solid occludes, 0 to 1.
 fn covered(shape: &Shape, point: Vec3, n: Vec3) -> f32 {
     match *shape {
-        // Thin parts hide next to nothing; what surrounds the scene is the light itself.
+        // Thin parts occlude almost nothing; the surroundings are the light itself.
         Shape::Ground { .. } | Shape::Backdrop { .. } | Shape::Rod { .. } | Shape::Ring { .. } => 0.0,
         Shape::Sphere { center, radius } => covered_by_ball(center - point, radius, n),
         Shape::Block { center, half, .. } => covered_by_ball(center - point, 1.2 * half.element_sum() / 3.0, n),
@@ -51,7 +51,7 @@ fn covered(shape: &Shape, point: Vec3, n: Vec3) -> f32 {
     }
 }
 
-/// A ball wholly above the horizon hides `cos (r / d)^2` (exact); the same falls to 0 smoothly while it sets.
+/// A ball entirely above the horizon occludes `cos (r / d)^2` (exact); the fraction falls smoothly to 0 as the ball sets.
 fn covered_by_ball(to_center: Vec3, radius: f32, n: Vec3) -> f32 {
     let d = to_center.length();
     let size = (radius / d).min(1.0);
@@ -63,7 +63,7 @@ fn covered_by_ball(to_center: Vec3, radius: f32, n: Vec3) -> f32 {
     }
 }
 
-/// A level disc seen from below: `A cos cos / (pi d^2 + A)`, exact on its axis.
+/// A horizontal disc seen from below: `A cos cos / (pi d^2 + A)`, exact on its axis.
 fn covered_by_disc_above(to_center: Vec3, radius: f32, n: Vec3) -> f32 {
     if to_center.z <= 0.0 {
         return 0.0;
@@ -78,11 +78,11 @@ mod tests {
     use super::*;
     use irradia_scene::Rng;
 
-    /// The share of cosine-distributed directions that meet the shape.
+    /// The fraction of cosine-distributed directions that hit the shape.
     fn sampled(shape: Shape, point: Vec3) -> f32 {
         let mut rng = Rng::new(5, 0);
         let count = 40_000;
-        let mut met = 0;
+        let mut hits = 0;
         for _ in 0..count {
             let (r2, angle) = (rng.uniform(), rng.range(0.0, std::f32::consts::TAU));
             let flat = glam::Vec2::from_angle(angle) * r2.sqrt();
@@ -90,13 +90,13 @@ mod tests {
                 origin: point,
                 direction: flat.extend((1.0 - r2).sqrt()),
             };
-            met += usize::from(shape.intersect(&ray, 1e-4, 100.0).is_some());
+            hits += usize::from(shape.intersect(&ray, 1e-4, 100.0).is_some());
         }
-        met as f32 / count as f32
+        hits as f32 / count as f32
     }
 
     #[test]
-    fn closed_forms_agree_with_sampling() {
+    fn closed_forms_match_sampling() {
         let ball = |x: f32, z: f32| Shape::Sphere {
             center: Vec3::new(x, 0.0, z),
             radius: 0.5,
@@ -106,7 +106,7 @@ mod tests {
             radius: 1.0,
             height: 0.01,
         };
-        // Standard error of 40,000 samples: 0.0025. A ball that half sets is an approximation: 0.02.
+        // Standard error of 40,000 samples: 0.0025. The formula for a partly set ball is approximate: 0.02.
         for (shape, tolerance) in [
             (ball(0.0, 1.0), 0.01),
             (ball(0.6, 0.8), 0.01),

@@ -1,4 +1,4 @@
-//! Where the views of the demo dataset are taken from: all about the table, near and far, low and high.
+//! The cameras of the demo dataset: all around the table, near and far, low and high.
 
 use glam::Vec3;
 use irradia_scene::{Camera, Intrinsics, Pose, Rng};
@@ -6,29 +6,29 @@ use std::f32::consts::TAU;
 
 /// Horizontal field of view, radians.
 pub const FOV_X: f32 = 0.84;
-/// From the middle of the table to the lens, world units. The table's edge is at 2.
+/// Distance from the table's centre to the camera, world units. The table's edge is at 2.
 const DISTANCE: [f32; 2] = [3.6, 4.4];
-/// Of the lens above the level it looks at, radians.
+/// Elevation of the camera above its target, radians.
 const ELEVATION: [f32; 2] = [0.20, 0.80];
-/// What the cameras look at, give or take.
+/// The cameras' approximate target.
 const TARGET: Vec3 = Vec3::new(0.0, 0.0, 0.36);
 
-/// What the pictures are for.
+/// The part of the dataset that a view belongs to.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Part {
-    /// To learn from.
+    /// Training.
     Train,
-    /// To tune on.
+    /// Validation.
     Val,
     /// Held out.
     Test,
 }
 
 impl Part {
-    /// In the order of tracing.
+    /// All parts, in the order of tracing.
     pub const ALL: [Part; 3] = [Part::Train, Part::Val, Part::Test];
 
-    /// As the files are named.
+    /// Name used in file names.
     pub fn name(self) -> &'static str {
         match self {
             Part::Train => "train",
@@ -38,8 +38,8 @@ impl Part {
     }
 }
 
-/// `count` cameras. Those of [`Part::Val`] and [`Part::Test`] stay well within the heights and distances of
-/// [`Part::Train`] and stand between its azimuths.
+/// Places `count` cameras. Those of [`Part::Val`] and [`Part::Test`] are well within the elevations and distances of
+/// [`Part::Train`], and between its azimuths.
 pub fn cameras(part: Part, count: u32, width: u32, height: u32, seed: u64) -> Vec<Camera> {
     let (stream, inset, turn) = match part {
         Part::Train => (0, 0.0, 0.0),
@@ -50,8 +50,8 @@ pub fn cameras(part: Part, count: u32, width: u32, height: u32, seed: u64) -> Ve
     (0..count)
         .map(|number| {
             let azimuth = TAU * (number as f32 + turn) / count as f32;
-            // The golden ratio's multiples fill an interval evenly whatever the count; a second irrational keeps
-            // distance apart from height.
+            // Multiples of the golden ratio fill an interval evenly for any count; a second irrational decorrelates
+            // distance from elevation.
             let within = |[low, high]: [f32; 2], irrational: f32| {
                 let t = (number as f32 * irrational + 0.5).fract();
                 low + (high - low) * (inset + (1.0 - 2.0 * inset) * t)
@@ -85,7 +85,7 @@ mod tests {
     }
 
     #[test]
-    fn held_out_cameras_stay_within_the_span_of_the_others() {
+    fn held_out_cameras_are_within_the_span_of_the_training_cameras() {
         let (distance, elevation) = spans(Part::Train, 40);
         for part in [Part::Val, Part::Test] {
             let (d, e) = spans(part, 5);
@@ -95,7 +95,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_is_close_to_a_lens() {
+    fn no_surface_is_close_to_a_camera() {
         let scene = crate::demo_scene();
         for camera in cameras(Part::Train, 40, 8, 8, 3) {
             let frame = scene.trace(&camera, 1, 0);

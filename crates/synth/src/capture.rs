@@ -1,4 +1,4 @@
-//! The views of the demo scene: cameras, frames, and points as structure from motion would leave them.
+//! The views of the demo scene: cameras, frames, and points such as structure from motion produces.
 
 use crate::cameras::{Part, cameras};
 use crate::scene::{SynthScene, demo_scene};
@@ -7,23 +7,23 @@ use glam::{Vec2, Vec3};
 use irradia_scene::{Camera, Dataset, Photo, PointCloud, Rng, View};
 use std::sync::Arc;
 
-/// Most samples a pixel.
+/// Most samples per pixel.
 const SAMPLES: u32 = 16;
-/// Points, over all training views.
+/// Number of points over all training views.
 const POINTS: u32 = 6000;
-/// Standard deviation of a point's error, as a fraction of its distance: what structure from motion reaches on good photos.
+/// Standard deviation of a point's error as a fraction of its distance, as for structure from motion on good photographs.
 const POINT_ERROR: f32 = 0.001;
 
-/// What to make.
+/// Options of the demo dataset.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct SynthOptions {
     /// Training views, 3 to 1000; one more in eight is held out, one more in twenty is for validation.
     pub views: u32,
-    /// Pixels, 8 to 4096.
+    /// Size along this axis in pixels, 8 to 4096.
     pub width: u32,
-    /// Pixels, 8 to 4096.
+    /// Size along this axis in pixels, 8 to 4096.
     pub height: u32,
-    /// Seed of cameras, samples and points: equal seeds make equal views.
+    /// Random seed of cameras, samples and points: equal seeds give equal views.
     pub seed: u64,
 }
 
@@ -39,27 +39,27 @@ impl Default for SynthOptions {
     }
 }
 
-/// Options that make no dataset: one line.
+/// Invalid options, in one line.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum SynthError {
     /// Too few or too many views.
-    #[error("{0} views: give between 3 and 1000")]
+    #[error("{0} views: must be 3 to 1000")]
     Views(u32),
     /// Too small or too large.
-    #[error("size {0}x{1}: give between 8 and 4096 pixels a side")]
+    #[error("size {0}x{1}: each side must be 8 to 4096 pixels")]
     Size(u32, u32),
 }
 
-/// One view to be traced.
+/// A view to trace.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Shot {
-    /// What it is for.
+    /// Part of the dataset.
     pub part: Part,
-    /// Among the views of its part.
+    /// Index among the views of its part.
     pub number: u32,
-    /// From where.
+    /// The camera.
     pub camera: Camera,
-    /// Seed of the samples. It differs from view to view, or the samples' noise would look like texture on the lens.
+    /// Seed of the samples. It differs between views, lest the noise form a pattern fixed to the image.
     seed: u64,
 }
 
@@ -70,7 +70,7 @@ impl Shot {
     }
 }
 
-/// The demo scene with the cameras that look at it.
+/// The demo scene with its cameras.
 #[derive(Clone, Debug)]
 pub struct Capture {
     scene: SynthScene,
@@ -124,7 +124,7 @@ impl Capture {
         }
     }
 
-    /// As given.
+    /// The options it was made with.
     pub fn options(&self) -> &SynthOptions {
         &self.options
     }
@@ -134,12 +134,12 @@ impl Capture {
         &self.shots
     }
 
-    /// The picture of one view, with its depth and normals.
+    /// Traces one view, with its depth and normals.
     pub fn trace(&self, shot: &Shot) -> SynthFrame {
         self.scene.trace(&shot.camera, SAMPLES, shot.seed)
     }
 
-    /// Points that structure from motion would find in the `frame` of a training view; none in other views.
+    /// Simulated structure-from-motion points of the `frame` of a training view; none for other views.
     pub fn points(&self, shot: &Shot, frame: &SynthFrame) -> PointCloud {
         let mut points = PointCloud::default();
         if shot.part == Part::Train {
@@ -151,7 +151,7 @@ impl Capture {
     }
 }
 
-/// The training and held-out views in memory, traced now; the same dataset as its files are read as.
+/// Traces the training and held-out views in memory: the same dataset as the one read from its files.
 ///
 /// # Errors
 /// When a count or a size of `options` is out of its range.
@@ -191,7 +191,7 @@ pub fn dataset(options: &SynthOptions) -> Result<Dataset, SynthError> {
     Ok(dataset)
 }
 
-/// The surface under a random pixel, a little off.
+/// Adds the surface point under a random pixel, with noise.
 fn add_point(points: &mut PointCloud, camera: &Camera, frame: &SynthFrame, rng: &mut Rng) {
     let (x, y) = (rng.below(frame.color.width), rng.below(frame.color.height));
     let direction = camera.ray_direction(Vec2::new(x as f32 + 0.5, y as f32 + 0.5));
@@ -217,7 +217,7 @@ mod tests {
     };
 
     #[test]
-    fn points_lie_on_what_a_ray_to_them_meets() {
+    fn points_lie_on_visible_surfaces() {
         let capture = Capture::new(&SMALL).expect("options");
         let shot = capture.shots()[0];
         let frame = capture.trace(&shot);
@@ -226,13 +226,13 @@ mod tests {
         for point in points.positions.iter().take(50) {
             let (pixel, depth) = shot.camera.project(*point).expect("in front");
             let seen = frame.depth.pixel((pixel.x as u32).min(31), (pixel.y as u32).min(31))[0];
-            // Five standard deviations, and room for those that slid over an edge to the neighbour pixel.
+            // Five standard deviations, with tolerance for points displaced across an edge to the neighbouring pixel.
             assert!((seen - depth).abs() < 5.0 * POINT_ERROR * depth + 0.5, "{seen} {depth}");
         }
     }
 
     #[test]
-    fn a_dataset_holds_each_part_once_and_equal_seeds_are_equal() {
+    fn a_dataset_has_each_part_once_and_depends_only_on_the_seed() {
         let [a, b] = [dataset(&SMALL).expect("options"), dataset(&SMALL).expect("options")];
         assert_eq!((a.views.len(), a.train.len(), a.test.len()), (6, 4, 2));
         assert!(a.train.iter().all(|i| a.views[*i].name.starts_with("train/")));
@@ -244,16 +244,16 @@ mod tests {
     }
 
     #[test]
-    fn options_out_of_range_are_refused_in_one_line() {
+    fn options_out_of_range_are_rejected_in_one_line() {
         let cases = [
-            (SynthOptions { views: 2, ..SMALL }, "2 views: give between 3 and 1000"),
+            (SynthOptions { views: 2, ..SMALL }, "2 views: must be 3 to 1000"),
             (
                 SynthOptions { width: 0, ..SMALL },
-                "size 0x32: give between 8 and 4096 pixels a side",
+                "size 0x32: each side must be 8 to 4096 pixels",
             ),
             (
                 SynthOptions { height: 5000, ..SMALL },
-                "size 32x5000: give between 8 and 4096 pixels a side",
+                "size 32x5000: each side must be 8 to 4096 pixels",
             ),
         ];
         for (options, line) in cases {

@@ -1,9 +1,9 @@
 //! A ray-traced scene with known cameras, depth, normals and points: a lit table-top with fine and coarse detail, a satin
-//! ball whose colour depends on the viewpoint, thin parts, and a background far away. It is the built-in data of
-//! `irradia demo`, and data for tests that need the truth.
+//! ball whose colour depends on the viewpoint, thin parts, and a distant background. It is the built-in data of
+//! `irradia demo`, and ground truth for tests.
 //!
-//! World: z up, the middle of the table's top at the origin. [`Capture`] places the cameras and traces them one by one;
-//! [`dataset`] does it all in memory. Writing the views as files is left to `irradia-runs`.
+//! World: z up, the centre of the table top at the origin. [`Capture`] places the cameras and traces them one by one;
+//! [`dataset`] traces them all in memory. `irradia-runs` writes the views as files.
 //!
 //! ```
 //! use irradia_synth::{Capture, SynthOptions, dataset};
@@ -12,7 +12,7 @@
 //! let dataset = dataset(&options)?;
 //! assert_eq!((dataset.train.len(), dataset.test.len()), (4, 2));
 //!
-//! // With the truth about depth, view by view:
+//! // With true depth, view by view:
 //! let capture = Capture::new(&options)?;
 //! let frame = capture.trace(&capture.shots()[0]);
 //! assert!(frame.depth.data.iter().all(|depth| *depth > 0.5));

@@ -3,14 +3,14 @@ use crate::texture::Texture;
 use glam::{Quat, Vec3};
 use std::f32::consts::FRAC_PI_2;
 
-/// How a surface answers light.
+/// The reflectance of a surface.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Material {
     /// Its colour; for metals the colour of the reflection.
     pub texture: Texture,
-    /// Reflectance looking straight at it (Schlick's F0) of the clear coat, 0 for none. Ignored for metals.
+    /// Reflectance of the clear coat at normal incidence (Schlick's F0), 0 for none. Ignored for metals.
     pub coat: f32,
-    /// Whether all light is reflected, in the texture's colour, and none scattered.
+    /// Whether light is only reflected, in the texture's colour, and not scattered.
     pub metal: bool,
     /// Spread of the reflection, tangent of the typical angle: 0 is a mirror.
     pub roughness: f32,
@@ -45,26 +45,26 @@ impl Material {
     }
 }
 
-/// A shape with what it is made of.
+/// A shape with its material.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Object {
-    /// Where it is.
+    /// The shape.
     pub shape: Shape,
-    /// What it is made of.
+    /// The material.
     pub material: Material,
 }
 
-/// Objects that stand together: a ray that passes their ball by is not tried on them.
+/// Objects close together: a ray that misses their bounding sphere skips them.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Cluster {
-    /// Centre and radius of a ball that holds them all, world.
+    /// Centre and radius of their bounding sphere, world.
     pub bound: (Vec3, f32),
-    /// Each with a ball of its own, world.
+    /// The objects, each with its own bounding sphere, world.
     pub objects: Vec<(Object, (Vec3, f32))>,
 }
 
 impl Cluster {
-    /// Objects with their bounds worked out; ground and backdrop, which have none, do not belong here and are left out.
+    /// Computes the bounds of `objects`; ground and backdrop, which have none, are skipped.
     pub fn new(objects: impl IntoIterator<Item = Object>) -> Self {
         let objects: Vec<_> = objects
             .into_iter()
@@ -81,30 +81,30 @@ impl Cluster {
     }
 }
 
-/// Everything there is to see. World: z up, the middle of the table's top at the origin, one unit about half a metre.
+/// A scene. World: z up, the centre of the table top at the origin, one unit about half a metre.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SynthScene {
-    /// What has no end: the ground and the backdrop. It throws no shadow.
+    /// The unbounded objects, ground and backdrop. They cast no shadow.
     pub surroundings: Vec<Object>,
     /// Everything else.
     pub clusters: Vec<Cluster>,
 }
 
-/// A point of a surface that a ray meets first.
+/// The first surface point along a ray.
 #[derive(Clone, Copy, Debug)]
 pub struct Hit<'a> {
     /// Distance along the ray, world units.
     pub t: f32,
-    /// Where, world.
+    /// Position, world.
     pub point: Vec3,
-    /// Unit normal, on the side the ray came from, world.
+    /// Unit normal, facing the ray's origin, world.
     pub normal: Vec3,
-    /// What.
+    /// The object.
     pub object: &'a Object,
 }
 
 impl SynthScene {
-    /// What the ray meets first beyond `near`.
+    /// The first hit beyond `near`.
     pub fn hit(&self, ray: &Ray, near: f32) -> Option<Hit<'_>> {
         let mut best = f32::INFINITY;
         let mut found: Option<(Vec3, &Object)> = None;
@@ -140,7 +140,7 @@ impl SynthScene {
         })
     }
 
-    /// Whether anything but the surroundings lies along the ray.
+    /// Whether anything but the surroundings is hit beyond `near`.
     pub fn is_blocked(&self, ray: &Ray, near: f32) -> bool {
         let reaches = |bound| !passes(ray, bound, f32::INFINITY);
         self.clusters
@@ -154,7 +154,7 @@ impl SynthScene {
     }
 }
 
-/// Whether the ray passes a bounding sphere by, has it behind, or reaches it beyond `far` only.
+/// Whether the ray misses a bounding sphere, starts past it, or reaches it only beyond `far`.
 fn passes(ray: &Ray, (center, radius): (Vec3, f32), far: f32) -> bool {
     let to_center = center - ray.origin;
     let middle = to_center.dot(ray.direction);
@@ -163,8 +163,8 @@ fn passes(ray: &Ray, (center, radius): (Vec3, f32), far: f32) -> bool {
     distance - middle * middle > square || (distance > square && middle < 0.0) || middle - radius > far
 }
 
-/// The demo scene: a round table on a terrace among hills, and on it a satin ball whose colour depends on where one
-/// stands, an armillary sphere and a lattice mast of thin parts, blocks and balls.
+/// The demo scene: a round table on a terrace among hills, and on it a satin ball whose colour depends on the viewpoint, an
+/// armillary sphere and a lattice mast of thin parts, blocks and balls.
 pub fn demo_scene() -> SynthScene {
     let object = |shape, material| Object { shape, material };
     SynthScene {
@@ -174,7 +174,7 @@ pub fn demo_scene() -> SynthScene {
         ],
         clusters: vec![
             Cluster::new(table()),
-            // The ball: copper under the sky, far from a mirror, so that low bands of colour can follow it.
+            // The ball: rough copper, whose reflection of the sky is smooth enough for low SH bands.
             Cluster::new([object(
                 ball(-0.42, -0.38, 0.46),
                 Material::metal(Vec3::new(0.86, 0.47, 0.32), 0.22),
@@ -343,17 +343,17 @@ mod tests {
     }
 
     #[test]
-    fn straight_down_are_the_table_the_ball_and_the_ground() {
+    fn vertical_rays_hit_the_table_the_ball_and_the_ground() {
         let scene = demo_scene();
         for (x, y, depth) in [(0.0, 0.0, 5.0), (-0.42, -0.38, 5.0 - 0.92), (3.0, 0.0, 6.45)] {
-            let hit = scene.hit(&down_at(x, y), 1e-4).expect("met");
+            let hit = scene.hit(&down_at(x, y), 1e-4).expect("a hit");
             assert!((hit.t - depth).abs() < 1e-4, "({x}, {y}): {} for {depth}", hit.t);
             assert!((hit.normal - Vec3::Z).length() < 1e-3);
         }
     }
 
     #[test]
-    fn every_ray_meets_something_and_the_bound_changes_nothing() {
+    fn every_ray_hits_and_bounds_do_not_change_hits() {
         let scene = demo_scene();
         let mut unbounded = scene.clone();
         for cluster in &mut unbounded.clusters {

@@ -1,4 +1,4 @@
-//! The solids of the demo scene and where a ray meets them.
+//! The solids of the demo scene and their intersection with rays.
 //!
 //! Symbols: a ray is `o + t d` with unit `d`; `t` is in world units.
 
@@ -20,15 +20,15 @@ impl Ray {
     }
 }
 
-/// What objects are made of, world units.
+/// A geometric primitive, world units.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Shape {
-    /// The plane `z = height`, without end.
+    /// The unbounded plane `z = height`.
     Ground {
         /// World z.
         height: f32,
     },
-    /// The inside of a sphere about the origin: everything else is within.
+    /// The inside of a sphere around the origin that contains everything else.
     Backdrop {
         /// World units.
         radius: f32,
@@ -62,9 +62,9 @@ pub enum Shape {
     Ring {
         /// Centre.
         center: Vec3,
-        /// Turns the local +Z, the ring's axis, into the world.
+        /// World-from-local rotation; the ring's axis is the local +Z.
         world_from_ring: Quat,
-        /// From the centre to the middle of the tube.
+        /// Radius of the tube's centre line.
         radius: f32,
         /// Radius of the tube.
         tube: f32,
@@ -73,15 +73,15 @@ pub enum Shape {
     Block {
         /// Centre.
         center: Vec3,
-        /// Half the edges along its own axes.
+        /// Half the edge lengths along the local axes.
         half: Vec3,
-        /// Turns its own axes into the world.
+        /// World-from-local rotation.
         world_from_block: Quat,
     },
 }
 
 impl Shape {
-    /// A sphere that holds the whole shape, `None` for the two that surround everything.
+    /// A sphere that contains the shape, `None` for the two unbounded shapes.
     pub fn bound(&self) -> Option<(Vec3, f32)> {
         match *self {
             Shape::Ground { .. } | Shape::Backdrop { .. } => None,
@@ -95,8 +95,8 @@ impl Shape {
         }
     }
 
-    /// The nearest `t` in `(near, far)` at which the ray meets the surface, and the unit normal there: outward, for
-    /// the backdrop inward.
+    /// The nearest `t` in `(near, far)` at which the ray hits the surface, and the unit normal there: outward, or inward for
+    /// the backdrop.
     pub fn intersect(&self, ray: &Ray, near: f32, far: f32) -> Option<(f32, Vec3)> {
         match *self {
             Shape::Ground { height } => {
@@ -144,7 +144,7 @@ impl Shape {
         }
     }
 
-    /// A world point in the shape's own frame, where its texture lives.
+    /// Transforms a world point to the shape's local frame, in which its texture is defined.
     pub fn local(&self, world: Vec3) -> Vec3 {
         match *self {
             Shape::Ground { .. } | Shape::Backdrop { .. } => world,
@@ -169,9 +169,9 @@ fn first_within(t0: f32, t1: f32, near: f32, far: f32) -> Option<f32> {
     [t0, t1].into_iter().find(|t| *t > near && *t < far)
 }
 
-/// Where the line enters and leaves a sphere.
+/// The interval of the line inside a sphere.
 ///
-/// The discriminant is taken from the perpendicular foot, which keeps its digits where the sphere is far away.
+/// The discriminant is computed from the foot of the perpendicular, which stays accurate for distant spheres.
 pub fn sphere_interval(ray: &Ray, center: Vec3, radius: f32) -> Option<(f32, f32)> {
     let to_center = center - ray.origin;
     let middle = to_center.dot(ray.direction);
@@ -183,7 +183,7 @@ pub fn sphere_interval(ray: &Ray, center: Vec3, radius: f32) -> Option<(f32, f32
     })
 }
 
-/// Where the line is within `low..high` along one axis.
+/// The interval of the line within `low..high` along one axis.
 fn slab_interval(origin: f32, direction: f32, low: f32, high: f32) -> Option<(f32, f32)> {
     if direction.abs() < 1e-9 {
         return (origin >= low && origin <= high).then_some((f32::NEG_INFINITY, f32::INFINITY));
@@ -235,7 +235,7 @@ fn rod(ray: &Ray, near: f32, far: f32, a: Vec3, b: Vec3, radius: f32) -> Option<
     if square > 1e-12 {
         let middle = -o_across.dot(d_across) / square;
         let inside = radius * radius - (o_across + d_across * middle).length_squared();
-        // The round ends lie within the endless cylinder too: a line that misses it misses them.
+        // The round ends lie within the infinite cylinder: a line that misses it misses them.
         if inside < 0.0 {
             return None;
         }
@@ -262,7 +262,7 @@ fn rod(ray: &Ray, near: f32, far: f32, a: Vec3, b: Vec3, radius: f32) -> Option<
     best
 }
 
-/// By sphere tracing (Hart 1996) on the exact distance to a torus, between the planes that touch the tube.
+/// Intersects a torus by sphere tracing (Hart 1996) with its exact distance, between the planes tangent to the tube.
 fn ring(ray: &Ray, near: f32, far: f32, radius: f32, tube: f32) -> Option<(f32, Vec3)> {
     const HIT: f32 = 2e-5;
     let (z0, z1) = slab_interval(ray.origin.z, ray.direction.z, -tube, tube)?;
@@ -319,7 +319,7 @@ mod tests {
     }
 
     #[test]
-    fn each_solid_is_met_where_one_can_say_it() {
+    fn rays_hit_every_solid_at_known_points() {
         let one = Vec3::new(1.0, 0.0, 0.0);
         let cases = [
             (
@@ -403,29 +403,29 @@ mod tests {
             ),
         ];
         for (shape, origin, direction, t, normal) in cases {
-            let (found, n) = shoot(shape, origin, direction).expect("met");
+            let (found, n) = shoot(shape, origin, direction).expect("a hit");
             assert!((found - t).abs() < 1e-5, "{shape:?}: {found} for {t}");
             assert!((n - normal).length() < 1e-5, "{shape:?}: {n} for {normal}");
         }
     }
 
     #[test]
-    fn a_ring_is_met_on_its_tube_and_missed_through_its_hole() {
+    fn rays_hit_a_ring_on_its_tube_and_pass_through_its_hole() {
         let standing = Shape::Ring {
             center: Vec3::Z,
             world_from_ring: Quat::from_rotation_x(std::f32::consts::FRAC_PI_2),
             radius: 0.5,
             tube: 0.05,
         };
-        let (t, n) = shoot(standing, Vec3::new(0.5, -2.0, 1.0), Vec3::Y).expect("met");
+        let (t, n) = shoot(standing, Vec3::new(0.5, -2.0, 1.0), Vec3::Y).expect("a hit");
         assert!((t - 1.95).abs() < 1e-4 && (n + Vec3::Y).length() < 1e-2, "{t} {n}");
         assert!(shoot(standing, Vec3::new(0.0, -2.0, 1.0), Vec3::Y).is_none());
-        let (t, n) = shoot(standing, Vec3::new(0.0, 0.0, 3.0), -Vec3::Z).expect("met");
+        let (t, n) = shoot(standing, Vec3::new(0.0, 0.0, 3.0), -Vec3::Z).expect("a hit");
         assert!((t - 1.45).abs() < 1e-4 && (n - Vec3::Z).length() < 1e-2, "{t} {n}");
     }
 
     #[test]
-    fn every_hit_lies_within_the_bound() {
+    fn every_hit_is_within_the_bound() {
         let shapes = [
             Shape::Drum {
                 base: Vec3::ZERO,

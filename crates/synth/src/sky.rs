@@ -1,11 +1,11 @@
-//! The light that comes from far away: a low sun, a clear sky with thin clouds, three ranges of hills.
+//! Distant light: a low sun, a clear sky with thin clouds, three ranges of hills.
 
 use crate::texture::{fbm, noise, smooth};
 use glam::{Vec2, Vec3};
 
-/// Towards the sun, unit: an afternoon, 36 degrees up.
+/// Unit direction to the afternoon sun, at an elevation of 36 degrees.
 pub const SUN: Vec3 = Vec3::new(-0.548, -0.591, 0.592);
-/// The sun's irradiance on a surface that faces it, linear RGB.
+/// Irradiance of the sun on a surface facing it, linear RGB.
 pub const SUN_LIGHT: Vec3 = Vec3::new(2.75, 2.25, 1.62);
 /// Tangent of the sun's angular radius. Four times the real one: a soft edge can be trained, a sharp one aliases.
 pub const SUN_SPREAD: f32 = 0.018;
@@ -20,11 +20,11 @@ fn clear(direction: Vec3) -> Vec3 {
     HORIZON.lerp(ZENITH, 1.0 - (1.0 - up).powi(3)) + Vec3::new(0.55, 0.38, 0.18) * (0.8 * toward_sun.powi(6))
 }
 
-/// Everything that is seen in a unit direction from the origin, linear RGB radiance.
+/// Radiance from a unit direction, seen from the origin, linear RGB.
 pub fn radiance(direction: Vec3) -> Vec3 {
     let mut color = clear(direction);
     if direction.z > 0.02 {
-        // Clouds lie on a plane above: they gather towards the horizon and fade in its haze.
+        // Clouds lie on a plane: they grow denser towards the horizon and fade into its haze.
         let above = direction.z + 0.22;
         let cover = smooth(0.47, 0.82, fbm(direction.truncate() / above * 1.15 + 4.0, 4));
         color = color.lerp(
@@ -32,7 +32,7 @@ pub fn radiance(direction: Vec3) -> Vec3 {
             0.85 * cover * smooth(0.02, 0.22, direction.z),
         );
     }
-    // From far to near: each range is lower, greener and less lost in the haze.
+    // From far to near: each range is lower, greener and less hazy.
     for (number, (base, swing, tint)) in [
         (0.115, 0.075, Vec3::new(0.36, 0.43, 0.55)),
         (0.045, 0.065, Vec3::new(0.20, 0.29, 0.30)),
@@ -56,7 +56,7 @@ pub fn radiance(direction: Vec3) -> Vec3 {
     color
 }
 
-/// Height of a range of hills in \[-1, 1\] about: whole numbers of waves, so that it closes.
+/// Height of a range of hills, about -1 to 1: whole numbers of waves, so that it is periodic.
 fn ridge_line(direction: Vec3, range: f32) -> f32 {
     let angle = direction.y.atan2(direction.x);
     let wave = |count: f32, phase: f32| (angle * count + phase * (range + 1.0)).sin();
@@ -68,7 +68,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_sun_is_a_unit_vector_above_and_the_panorama_closes() {
+    fn the_sun_is_above_the_horizon_and_the_panorama_is_periodic() {
         assert!((SUN.length() - 1.0).abs() < 1e-3 && SUN.z > 0.0);
         for z in [0.02f32, 0.15, 0.4, 0.9] {
             let r = (1.0 - z * z).sqrt();

@@ -1,22 +1,22 @@
-//! Procedural colour, linear RGB. Detail is kept to a few pixels of the default views: what is finer than a pixel would
-//! be noise that no scene can hold.
+//! Procedural textures, linear RGB. Detail is a few pixels wide in the default views: anything finer than a pixel would be
+//! noise that no scene can represent.
 
 use glam::{Vec2, Vec3};
 use std::f32::consts::{FRAC_PI_4, TAU};
 
-/// What colours a surface.
+/// The colour of a surface.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Texture {
     /// One colour.
     Plain(Vec3),
-    /// Squares of a given size along the object's own axes.
+    /// Squares of a given size along the object's local axes.
     Checker {
         /// The two colours.
         colors: [Vec3; 2],
         /// Edge of a square, world units.
         size: f32,
     },
-    /// Bands along the object's upright.
+    /// Bands along the object's local vertical axis.
     Stripes {
         /// The two colours.
         colors: [Vec3; 2],
@@ -28,21 +28,21 @@ pub enum Texture {
         /// Radius of the top, world units.
         radius: f32,
     },
-    /// Wood with its grain along the object's upright.
+    /// Wood with its grain along the object's local vertical axis.
     Wood(Vec3),
-    /// Flagstones about the table, then meadow.
+    /// Flagstones around the table, then meadow.
     Meadow,
-    /// Sky, clouds and hills on the backdrop; gives off its own light.
+    /// Sky, clouds and hills on the backdrop; emissive.
     Sky,
 }
 
 impl Texture {
-    /// Albedo (for [`Texture::Sky`] radiance) at a point of the object's own frame.
+    /// Albedo (radiance for [`Texture::Sky`]) at a point in the object's local frame.
     pub fn color(&self, local: Vec3) -> Vec3 {
         match *self {
             Texture::Plain(color) => color,
             Texture::Checker { colors, size } => {
-                // A quarter of a square off: no edge of the pattern may coincide with a face, where rounding would choose.
+                // Offset by a quarter of a square: an edge of the pattern on a face would be decided by rounding.
                 let cell = (local / size + 0.25).floor();
                 colors[((cell.x + cell.y + cell.z) as i32).rem_euclid(2) as usize]
             }
@@ -101,7 +101,7 @@ fn table_top(p: Vec2, radius: f32) -> Vec3 {
     }
     let stave = (angle / TAU * 20.0).floor();
     let tone = 0.62 + 0.85 * lattice(stave as i32, 7);
-    // Grain runs outwards: fine across the stave, slow along it.
+    // Grain runs outwards: fine across the stave, coarse along it.
     let grain = fbm(Vec2::new(angle * 9.0 + 3.0 * stave, p.length() * 1.4), 3);
     let seam = (angle / TAU * 20.0).rem_euclid(1.0);
     let dark = if seam.min(1.0 - seam) * r < 0.012 { 0.45 } else { 1.0 };
@@ -120,13 +120,13 @@ fn meadow(p: Vec2) -> Vec3 {
     slab.lerp(grass * blades, smooth(3.5, 4.3, r + 0.9 * (patches - 0.5)))
 }
 
-/// 0 below `from`, 1 above `to`, smooth between.
+/// 0 below `from`, 1 above `to`, smooth in between.
 pub fn smooth(from: f32, to: f32, x: f32) -> f32 {
     let t = ((x - from) / (to - from)).clamp(0.0, 1.0);
     t * t * (3.0 - 2.0 * t)
 }
 
-/// A fixed random number in \[0, 1) for each point of the integer lattice.
+/// A hash in \[0, 1) of a point of the integer lattice.
 pub fn lattice(x: i32, y: i32) -> f32 {
     let mut h = (x as u32).wrapping_mul(0x9e37_79b1) ^ (y as u32).wrapping_mul(0x85eb_ca77);
     h = (h ^ (h >> 15)).wrapping_mul(0x2c1b_3c6d);
@@ -134,7 +134,7 @@ pub fn lattice(x: i32, y: i32) -> f32 {
     ((h ^ (h >> 15)) >> 8) as f32 / 16_777_216.0
 }
 
-/// Value noise: lattice values, smoothly joined, in \[0, 1\].
+/// Value noise: smoothly interpolated lattice values, in \[0, 1\].
 pub fn noise(p: Vec2) -> f32 {
     let cell = p.floor();
     let f = p - cell;
@@ -145,14 +145,14 @@ pub fn noise(p: Vec2) -> f32 {
     low + (high - low) * f.y
 }
 
-/// Octaves of [`noise`], each twice as fine and half as strong, in \[0, 1\].
+/// Sum of octaves of [`noise`], each twice as fine and half as strong, in \[0, 1\].
 pub fn fbm(p: Vec2, octaves: u32) -> f32 {
     let (mut sum, mut total, mut weight, mut q) = (0.0, 0.0, 1.0, p);
     for _ in 0..octaves {
         sum += weight * noise(q);
         total += weight;
         weight *= 0.5;
-        // Turned a little, so that the octaves' lattices do not line up.
+        // Rotated, so that the lattices of octaves do not align.
         q = Vec2::new(1.6 * q.x - 1.2 * q.y, 1.2 * q.x + 1.6 * q.y) + 17.3;
     }
     sum / total
@@ -163,7 +163,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn noise_stays_in_range_and_is_continuous_over_cell_borders() {
+    fn noise_is_bounded_and_continuous_across_cells() {
         for i in 0..1000 {
             let p = Vec2::new(0.37 * i as f32 - 150.0, -0.11 * i as f32);
             assert!((0.0..=1.0).contains(&noise(p)) && (0.0..=1.0).contains(&fbm(p, 4)));

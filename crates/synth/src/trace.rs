@@ -1,5 +1,5 @@
-//! From a camera to a picture: a ray a sample, a ray to the sun, and one in the mirror's direction where the surface
-//! shines. The light of the sky is worked out without rays (`ambient`): sampled, it would be the noise of the picture.
+//! Ray tracing of a view: per sample a primary ray, a shadow ray to the sun, and a reflected ray for glossy surfaces. Sky light
+//! is analytic (`ambient`), since sampling it would dominate the noise.
 
 use crate::ambient;
 use crate::scene::{Hit, SynthScene};
@@ -11,16 +11,16 @@ use irradia_scene::{Camera, Image, Rng};
 use rayon::prelude::*;
 use std::f32::consts::TAU;
 
-/// How far a secondary ray starts off the surface, world units.
+/// Offset of secondary rays from the surface, world units.
 const LIFT: f32 = 1e-3;
-/// Brightest linear value a sample may have: a highlight must not turn one sample into a white pixel.
+/// Clamp of linear sample values, so that one highlight sample does not whiten a pixel.
 const BRIGHTEST: f32 = 4.0;
-/// Samples of a pixel that lie this close together in sRGB show one plain surface.
+/// Samples of a pixel within this distance in sRGB are considered uniform.
 const PLAIN: f32 = 0.05;
 /// Half the width of the pixel's tent-shaped filter, pixels. Its variance, 0.24, is about that of a lens with its sensor,
-/// and of the low-pass filter that splats are rendered with (0.3): edges of one pixel would be beyond them.
+/// and of the low-pass filter that splats are rendered with (0.3): splats cannot represent sharper edges.
 const FILTER: f32 = 1.2;
-/// Linear value to film: chosen so that sunlit stone stays below white.
+/// Exposure, chosen so that sunlit stone stays below white.
 const EXPOSURE: f32 = 0.46;
 
 /// One traced view.
@@ -28,14 +28,14 @@ const EXPOSURE: f32 = 0.46;
 pub struct SynthFrame {
     /// `[H, W, 3]` sRGB in \[0, 1\].
     pub color: Image,
-    /// `[H, W]` distance along the camera's +Z of what the ray through the pixel's centre meets, world units.
+    /// Depth along the camera's +Z of the first hit through each pixel centre, `[H, W]`, world units.
     pub depth: Image,
-    /// `[H, W, 3]` world, unit, towards the camera, at the same point.
+    /// Unit normals at the same points, facing the camera, `[H, W, 3]` world.
     pub normals: Image,
 }
 
 impl SynthFrame {
-    /// The picture as 8 bits, `[H, W, 4]`, opaque.
+    /// The image as 8 bits, `[H, W, 4]`, opaque.
     pub fn rgba(&self) -> Vec<u8> {
         let rgb = self.color.to_u8();
         rgb.chunks_exact(3).flat_map(|p| [p[0], p[1], p[2], 255]).collect()
@@ -43,12 +43,14 @@ impl SynthFrame {
 }
 
 impl SynthScene {
-    /// Traces the scene with up to `samples` samples a pixel (rounded up to a square number), placed by `seed`.
+    /// Traces the scene with up to `samples` samples per pixel (rounded up to a square number) and random seed `seed`.
     ///
-    /// The same scene, camera, number and seed give the same bits on any number of threads.
+    /// The result does not depend on the number of threads.
     pub fn trace(&self, camera: &Camera, samples: u32, seed: u64) -> SynthFrame {
         let (width, height) = (camera.intrinsics.width, camera.intrinsics.height);
-        let side = (1..).find(|n| n * n >= samples).expect("some square is large enough");
+        let side = (1..)
+            .find(|n| n * n >= samples)
+            .expect("some square is at least `samples`");
         let mut frame = SynthFrame {
             color: Image::zeros(width, height, 3),
             depth: Image::zeros(width, height, 1),
@@ -78,9 +80,9 @@ impl SynthScene {
         frame
     }
 
-    /// sRGB colour of the pixel whose upper left corner is given, from at most `side^2` samples.
+    /// sRGB colour of the pixel with upper left `corner`, from at most `side^2` samples.
     fn pixel(&self, camera: &Camera, corner: Vec2, side: u32, rng: &mut Rng) -> Vec3 {
-        // Most pixels are plain: four samples that agree are enough, and the time goes where there is an edge.
+        // Adaptive sampling: four samples that agree suffice for most pixels.
         if side > 3 {
             let (mean, spread) = self.sampled(camera, corner, 3, rng);
             if spread < PLAIN {
@@ -90,11 +92,11 @@ impl SynthScene {
         self.sampled(camera, corner, side, rng).0
     }
 
-    /// sRGB colour from `side^2` samples, and how far apart they lie.
+    /// sRGB colour from `side^2` samples, and their spread.
     fn sampled(&self, camera: &Camera, corner: Vec2, side: u32, rng: &mut Rng) -> (Vec3, f32) {
         let count = side * side;
-        // Each of the three planes a sample draws from (pixel, sun, mirror) is stratified alike; strata of different
-        // planes are paired at random.
+        // Each of the three domains of a sample (pixel, sun, mirror) is stratified; strata of different domains are paired
+        // at random.
         let mut strata: [Vec<u32>; 2] = std::array::from_fn(|_| (0..count).collect());
         strata.iter_mut().for_each(|order| rng.shuffle(order));
         let (mut sum, mut low, mut high) = (Vec3::ZERO, Vec3::INFINITY, Vec3::NEG_INFINITY);
@@ -150,17 +152,17 @@ impl SynthScene {
         };
         if reflectance.max_element() > 0.0 {
             let cosine = (-ray.direction.dot(hit.normal)).clamp(0.0, 1.0);
-            // Schlick's approximation (1994); a rough surface gains less towards grazing.
+            // Schlick's approximation (1994); rough surfaces gain less at grazing angles.
             let grazing = (1.0 - cosine).powi(5) * (1.0 - 2.0 * material.roughness).max(0.0);
             let fresnel = reflectance + (Vec3::ONE - reflectance) * grazing;
             let exact = ray.direction - 2.0 * ray.direction.dot(hit.normal) * hit.normal;
-            // All that a metal shows is its reflection: four rays a quarter turn apart, for the sake of noise.
+            // A metal shows only its reflection: four rays a quarter turn apart reduce noise.
             let rays = if material.metal { 4 } else { 1 };
             let mut reflected = Vec3::ZERO;
             for turn in 0..rays {
                 let lobe = disc(mirror + Vec2::Y * (turn as f32 / rays as f32)) * material.roughness;
                 let mut direction = around(exact, lobe);
-                // A rough lobe may dip below the surface at the edge: lift it back.
+                // A rough lobe may extend below the surface: mirror it back.
                 let below = direction.dot(hit.normal);
                 if below < 0.02 {
                     direction = (direction + hit.normal * (0.02 - below)).normalize();
@@ -168,7 +170,7 @@ impl SynthScene {
                 reflected += self.incoming(start, direction) / rays as f32;
             }
             if lit {
-                // The sun's image, spread over the lobe: a Gaussian of the lobe's width about the mirror's direction.
+                // The sun's reflection: a Gaussian of the lobe's width around the mirror direction.
                 let off = 2.0 * (1.0 - exact.dot(sky::SUN)).max(0.0);
                 let width = 0.5 * material.roughness * material.roughness + sky::SUN_SPREAD * sky::SUN_SPREAD;
                 reflected += sky::SUN_LIGHT * ((-off / width).exp() * 0.05 / width);
@@ -178,7 +180,7 @@ impl SynthScene {
         radiance
     }
 
-    /// What arrives at a point from a direction: the sky, or a surface lit plainly.
+    /// Radiance arriving at a point from a direction: the sky, or a surface with simplified lighting.
     fn incoming(&self, origin: Vec3, direction: Vec3) -> Vec3 {
         let ray = Ray { origin, direction };
         let Some(hit) = self.hit(&ray, LIFT) else {
@@ -189,7 +191,7 @@ impl SynthScene {
         if texture == Texture::Sky {
             return color;
         }
-        // No ray to the sun from here: 0.7 stands for the part of surfaces that is not in shadow.
+        // Without a shadow ray: 0.7 is the assumed fraction of sunlit surfaces.
         let sunlit = 0.7 * hit.normal.dot(sky::SUN).max(0.0);
         color * (sky::SUN_LIGHT * sunlit + ambient::open(&hit))
     }
@@ -203,12 +205,12 @@ fn pixel_ray(camera: &Camera, pixel: Vec2) -> Ray {
     }
 }
 
-/// The unit square onto the unit disc, areas kept (Shirley and Chiu 1997 in spirit; polar, which is enough here).
+/// An area-preserving polar map from the unit square to the unit disc (cf. Shirley and Chiu 1997).
 fn disc(square: Vec2) -> Vec2 {
     Vec2::from_angle(TAU * square.y) * square.x.sqrt()
 }
 
-/// From a uniform number to one in \[-1, 1\] distributed as a tent.
+/// Maps a uniform number to \[-1, 1\] with a tent distribution.
 fn tent(u: f32) -> f32 {
     if u < 0.5 {
         (2.0 * u).sqrt() - 1.0
@@ -251,7 +253,7 @@ mod tests {
     }
 
     #[test]
-    fn looking_straight_down_the_table_is_at_its_depth() {
+    fn a_vertical_view_has_the_depth_of_the_table() {
         let camera = Camera::new(
             Pose::look_at(Vec3::new(0.1, 0.0, 4.0), Vec3::new(0.1, 0.0, 0.0), Vec3::Y),
             Intrinsics::from_fov_x(33, 33, 0.05),
@@ -262,7 +264,7 @@ mod tests {
     }
 
     #[test]
-    fn depth_unprojects_to_the_point_that_was_hit_and_normals_face_the_camera() {
+    fn depth_unprojects_to_the_hit_point_and_normals_face_the_camera() {
         let (scene, camera) = (demo_scene(), camera(48));
         let frame = scene.trace(&camera, 1, 0);
         for y in 0..48 {
@@ -290,7 +292,7 @@ mod tests {
     }
 
     #[test]
-    fn equal_seeds_give_equal_bits_on_any_number_of_threads_and_unequal_ones_do_not() {
+    fn frames_depend_on_the_seed_but_not_on_the_number_of_threads() {
         let scene = demo_scene();
         let one = rayon::ThreadPoolBuilder::new().num_threads(1).build().expect("pool");
         let first = one.install(|| scene.trace(&camera(24), 4, 0));
@@ -301,7 +303,7 @@ mod tests {
     }
 
     #[test]
-    fn the_ball_changes_its_colour_with_the_viewpoint_and_the_ground_does_not() {
+    fn only_the_ball_changes_colour_with_the_viewpoint() {
         let scene = demo_scene();
         let seen = |target: Vec3, offset: Vec3| {
             let pose = Pose::look_at(target + offset, target, Vec3::Z);
@@ -309,7 +311,7 @@ mod tests {
             Vec3::from_slice(frame.color.pixel(0, 0))
         };
         let difference = |target: Vec3| {
-            // From high up one sees the sky in the ball, from low down the hills.
+            // The ball reflects the sky to a high camera and the hills to a low one.
             let [high, low] =
                 [Vec3::new(-1.0, -1.6, 3.0), Vec3::new(-3.0, -1.5, 0.5)].map(|offset| seen(target, offset));
             (high - low).length()

@@ -1,13 +1,13 @@
-/// Where two arrays differ most.
+/// The largest difference of two arrays.
 #[derive(Clone, Copy, Debug)]
 pub struct Difference {
-    /// Largest difference, absolute or relative as the function says.
+    /// The difference, absolute or relative depending on the function.
     pub worst: f64,
-    /// Where it is.
+    /// Its index.
     pub index: usize,
-    /// Value there.
+    /// The value there.
     pub got: f64,
-    /// Expected value there.
+    /// The expected value there.
     pub want: f64,
 }
 
@@ -16,7 +16,7 @@ pub struct Difference {
 /// # Panics
 /// When lengths differ.
 pub fn max_abs_difference(got: &[f64], want: &[f64], counts: impl Fn(usize) -> bool) -> Difference {
-    assert_eq!(got.len(), want.len(), "as many values as expected");
+    assert_eq!(got.len(), want.len(), "lengths match");
     let mut worst = Difference {
         worst: 0.0,
         index: 0,
@@ -43,18 +43,19 @@ pub fn max_abs_difference(got: &[f64], want: &[f64], counts: impl Fn(usize) -> b
     worst
 }
 
-/// The largest `|got - want| / (|want| + floor max |want|)` for a `floor` above 0: relative element by element, and relative to `floor` of the
-/// array's largest where an element is smaller than that, since a sum of many rounded terms that cancel is no more exact.
+/// The largest `|got - want| / (|want| + floor max |want|)`: relative per element, and for small elements relative to the
+/// fraction `floor` of the array's largest, since sums of cancelling rounded terms are no more exact than that.
 ///
 /// # Panics
 /// When lengths differ.
 pub fn relative_difference(got: &[f64], want: &[f64], floor: f64) -> Difference {
-    let least = floor * want.iter().fold(1e-30f64, |m, v| m.max(v.abs()));
+    // Positive even without a floor, so that two zeros differ by zero.
+    let least = (floor * want.iter().fold(0.0f64, |m, v| m.max(v.abs()))).max(f64::MIN_POSITIVE);
     let scaled = |values: &[f64]| -> Vec<f64> {
         let pairs = values.iter().zip(want);
         pairs.map(|(value, want)| value / (want.abs() + least)).collect()
     };
-    assert_eq!(got.len(), want.len(), "as many values as expected");
+    assert_eq!(got.len(), want.len(), "lengths match");
     let difference = max_abs_difference(&scaled(got), &scaled(want), |_| true);
     Difference {
         got: got[difference.index],
@@ -68,11 +69,11 @@ mod tests {
     use super::*;
 
     #[test]
-    fn small_elements_count_by_their_own_size_down_to_the_floor() {
+    fn differences_are_relative_per_element_down_to_the_floor() {
         let want = [1000.0, 1.0, 0.0];
-        // Of 1 beside 1000: an error of a tenth is a tenth above the floor, and 0.1 / (1 + 100) with a floor of a tenth.
-        let d = relative_difference(&[1000.0, 1.1, 0.0], &want, 1e-9);
-        assert!((d.worst - 0.1).abs() < 1e-6 && d.index == 1 && d.got == 1.1);
+        // 1 beside 1000: an error of 0.1 is a relative 0.1 without a floor, and 0.1 / (1 + 100) with a floor of a tenth.
+        let d = relative_difference(&[1000.0, 1.1, 0.0], &want, 0.0);
+        assert!((d.worst - 0.1).abs() < 1e-12 && d.index == 1 && d.got == 1.1);
         assert!((relative_difference(&[1000.0, 1.1, 0.0], &want, 0.1).worst - 0.1 / 101.0).abs() < 1e-12);
         assert!((relative_difference(&[1000.0, 1.0, 2.0], &want, 0.01).worst - 0.2).abs() < 1e-12);
         assert!(

@@ -2,22 +2,22 @@
 
 use irradia_scene::Rng;
 
-/// How far apart two evaluations lie and how well a gradient must agree with their difference d:
+/// The step of central differences, and the tolerance of a gradient v compared with a difference d:
 /// `|v - d| <= relative |d| + of_largest max |v| + absolute`.
 #[derive(Clone, Copy, Debug)]
 pub struct Differences {
-    /// Distance to either side.
+    /// Step to either side.
     pub step: f64,
-    /// Of the difference.
+    /// Tolerance relative to the difference.
     pub relative: f64,
-    /// Of the gradient's largest coordinate.
+    /// Tolerance relative to the gradient's largest coordinate.
     pub of_largest: f64,
-    /// Whatever the gradient.
+    /// Absolute tolerance.
     pub absolute: f64,
 }
 
 impl Differences {
-    /// Agreement within `of_largest` of the largest coordinate.
+    /// A tolerance of `of_largest` of the largest coordinate.
     pub fn of_largest(step: f64, of_largest: f64) -> Self {
         Self {
             step,
@@ -27,11 +27,11 @@ impl Differences {
         }
     }
 
-    /// Holds the coordinates `which` of the gradient `v` of `value` at `at`; what lies behind the end of `v` may stay constant.
+    /// Checks the coordinates `which` of the gradient `v` of `value` at `at`; `at` may be longer than `v`.
     ///
     /// # Panics
-    /// When one does not agree.
-    pub fn hold(
+    /// When one is out of tolerance.
+    pub fn check(
         &self,
         what: &str,
         at: &[f64],
@@ -42,36 +42,36 @@ impl Differences {
         let largest = v.iter().fold(0.0f64, |m, v| m.max(v.abs()));
         let mut moved = at.to_vec();
         for i in which {
-            let mut beside = |by: f64| {
+            let mut value_at = |by: f64| {
                 moved[i] = at[i] + by;
                 let value = value(&moved);
                 moved[i] = at[i];
                 value
             };
-            let numeric = (beside(self.step) - beside(-self.step)) / (2.0 * self.step);
+            let numeric = (value_at(self.step) - value_at(-self.step)) / (2.0 * self.step);
             let allowed = self.relative * numeric.abs() + self.of_largest * largest + self.absolute;
-            // A gradient that is not a number must fail too.
+            // NaN gradients must fail, too.
             assert!(
                 (numeric - v[i]).abs() <= allowed,
-                "{what}, value {i}: gradient {} and difference {numeric}; the largest is {largest}",
+                "{what}, value {i}: gradient {}, finite difference {numeric}; the largest gradient is {largest}",
                 v[i]
             );
         }
     }
 }
 
-/// Some 200 of `n` coordinates, or all.
+/// About 200 of `n` coordinates, or all of them.
 pub fn some_of(n: usize) -> impl Iterator<Item = usize> {
     (0..n).step_by(1 + n / 200)
 }
 
-/// Holds the gradient `v` of `value` at `at` along eight random directions; `tolerance` is relative to the gradient's
-/// length, the steps are `step` in every coordinate.
+/// Checks the gradient `v` of `value` at `at` along eight random directions; `tolerance` is relative to the gradient's length,
+/// and a step is `step` times a normal variate in each coordinate.
 ///
 /// # Panics
-/// When one does not agree.
+/// When one is out of tolerance.
 pub fn directional(at: &[f64], v: &[f64], value: impl Fn(&[f64]) -> f64, step: f64, tolerance: f64) {
-    assert_eq!(at.len(), v.len(), "a gradient has as many values as what it is of");
+    assert_eq!(at.len(), v.len(), "the gradient matches the input's length");
     let length = v.iter().map(|v| v * v).sum::<f64>().sqrt();
     for seed in 0..8 {
         let mut rng = Rng::new(seed, 17);
@@ -81,7 +81,7 @@ pub fn directional(at: &[f64], v: &[f64], value: impl Fn(&[f64]) -> f64, step: f
         let analytic: f64 = v.iter().zip(&along).map(|(v, d)| v * d).sum();
         assert!(
             (numeric - analytic).abs() <= tolerance * length,
-            "direction {seed}: {analytic} and not {numeric}, of a gradient {length} long"
+            "direction {seed}: gradient {analytic}, finite difference {numeric}; the gradient's length is {length}"
         );
     }
 }
@@ -99,20 +99,20 @@ mod tests {
     const GRADIENT: [f64; 2] = [1.0, 6.0];
 
     #[test]
-    fn a_right_gradient_holds() {
-        Differences::of_largest(1e-5, 1e-9).hold("it", &AT, &GRADIENT, 0..2, value);
+    fn a_correct_gradient_passes() {
+        Differences::of_largest(1e-5, 1e-9).check("it", &AT, &GRADIENT, 0..2, value);
         directional(&AT, &GRADIENT, value, 1e-5, 1e-9);
     }
 
     #[test]
     #[should_panic(expected = "it, value 0: gradient 1.1")]
-    fn a_wrong_coordinate_does_not() {
-        Differences::of_largest(1e-5, 1e-3).hold("it", &AT, &[1.1, 6.0], 0..2, value);
+    fn a_wrong_coordinate_fails() {
+        Differences::of_largest(1e-5, 1e-3).check("it", &AT, &[1.1, 6.0], 0..2, value);
     }
 
     #[test]
     #[should_panic(expected = "direction 0")]
-    fn nor_a_gradient_that_is_not_a_number() {
+    fn a_nan_gradient_fails() {
         directional(&AT, &[f64::NAN, 6.0], value, 1e-5, 1e-3);
     }
 }

@@ -40,7 +40,7 @@ impl Golden {
                         .map(|b| f64::from(i32::from_le_bytes(*b)))
                         .collect(),
                     Dtype::U8 | Dtype::BOOL => data.iter().map(|b| f64::from(*b)).collect(),
-                    other => panic!("{name}: {other:?} is not read here"),
+                    other => panic!("{name}: {other:?} is not supported"),
                 };
                 (name.to_owned(), values)
             })
@@ -51,12 +51,12 @@ impl Golden {
     /// The array `name`.
     ///
     /// # Panics
-    /// When there is none.
+    /// When there is no such array.
     pub fn get(&self, name: &str) -> &[f64] {
         self.arrays.get(name).unwrap_or_else(|| panic!("no array {name}"))
     }
 
-    /// The same in single precision.
+    /// The array `name` in single precision.
     pub fn get_f32(&self, name: &str) -> Vec<f32> {
         self.get(name).iter().map(|v| *v as f32).collect()
     }

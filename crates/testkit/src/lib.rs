@@ -1,4 +1,4 @@
-//! Development only: where the shared data lies, the golden files, finite differences, and comparisons that say what differs.
+//! Development only: paths to the shared data, golden files, finite differences, comparisons of arrays, and PyTorch files.
 #![forbid(unsafe_code)]
 
 mod compare;

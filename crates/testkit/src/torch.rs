@@ -1,4 +1,4 @@
-//! PyTorch's files, written as `torch.save` would write a state dict of these tensors: pickle protocol 2, opcode by opcode.
+//! Writes PyTorch files as `torch.save` would for a state dict: pickle protocol 2, opcode by opcode.
 
 /// Name, shape and values.
 pub type NamedTensor<'a> = (&'a str, &'a [usize], &'a [f32]);
@@ -24,7 +24,7 @@ fn call(module: &str, name: &str, arguments: &[u8]) -> Vec<u8> {
     [format!("c{module}\n{name}\n").as_bytes(), b"(", arguments, b"tR"].concat()
 }
 
-/// A tensor in storage `key`, whose shape is remembered and recalled, as pickles do.
+/// A tensor in storage `key`; its shape is memoised, as in real pickles.
 fn tensor(key: usize, shape: &[usize], count: usize) -> Vec<u8> {
     let strides: Vec<usize> = (0..shape.len()).map(|i| shape[i + 1..].iter().product()).collect();
     let storage = [
@@ -50,7 +50,7 @@ fn tensor(key: usize, shape: &[usize], count: usize) -> Vec<u8> {
     call("torch._utils", "_rebuild_tensor_v2", &arguments)
 }
 
-/// The pickle of the state dict, with the attribute that torch gives it.
+/// The pickle of the state dict, with the `_metadata` attribute that torch adds.
 fn state_dict(tensors: &[NamedTensor]) -> Vec<u8> {
     let mut out = b"\x80\x02".to_vec();
     out.extend(call("collections", "OrderedDict", b""));
@@ -70,7 +70,7 @@ fn bytes(values: &[f32]) -> Vec<u8> {
     values.iter().flat_map(|v| v.to_le_bytes()).collect()
 }
 
-/// As PyTorch writes since 1.6: a zip archive.
+/// The format since PyTorch 1.6: a zip archive.
 pub fn archive(tensors: &[NamedTensor]) -> Vec<u8> {
     let mut files = vec![("net/data.pkl".to_owned(), state_dict(tensors))];
     files.push(("net/byteorder".to_owned(), b"little".to_vec()));
@@ -80,13 +80,13 @@ pub fn archive(tensors: &[NamedTensor]) -> Vec<u8> {
     zip(&files)
 }
 
-/// A zip archive of stored files, padded as PyTorch aligns them.
+/// A zip archive of uncompressed files, with padding as PyTorch adds for alignment.
 pub fn zip(files: &[(String, Vec<u8>)]) -> Vec<u8> {
     let (mut out, mut directory) = (Vec::new(), Vec::new());
     for (name, content) in files {
         let at = out.len() as u32;
         let size = (content.len() as u32).to_le_bytes();
-        // Version, flags, method, time and checksum, which are not looked at; sizes; length of the name.
+        // Version, flags, method, time and checksum, which readers ignore; sizes; length of the name.
         let common = [
             &[20, 0, 0, 0, 0, 0][..],
             &[0; 8],
@@ -134,7 +134,7 @@ pub fn zip(files: &[(String, Vec<u8>)]) -> Vec<u8> {
     out
 }
 
-/// As PyTorch wrote before: a stream of pickles, then the storages.
+/// The format before PyTorch 1.6: a stream of pickles, then the storages.
 pub fn stream(tensors: &[NamedTensor]) -> Vec<u8> {
     let mut out = b"\x80\x02\x8a\x0a\x6c\xfc\x9c\x46\xf9\x20\x6a\xa8\x50\x19.".to_vec();
     out.extend(b"\x80\x02M\xe9\x03.");

@@ -120,7 +120,7 @@ impl Trainer {
                 Background::Fixed(self.recipe.render.background)
             },
             samples: knobs.samples,
-            look: plan.update_occupancy,
+            update_occupancy: plan.update_occupancy,
             seed: self.options.seed,
         };
         let state = self.field.as_mut().expect("a stage of field has one");

@@ -1,10 +1,10 @@
-//! Who may import whom: the table of ARCHITECTURE.md, held.
+//! Checks imports between crates against the table of ARCHITECTURE.md.
 
 use serde_json::Value;
 
-/// What a crate may import of the others.
+/// Which other crates a crate may import.
 enum May {
-    /// These and no more.
+    /// Only these.
     Import(&'static [&'static str]),
     /// Everything.
     ImportAll,
@@ -12,7 +12,7 @@ enum May {
 
 use May::{Import, ImportAll};
 
-/// Each crate's folder with what it may import. A crate that is not here breaks the rule by being there.
+/// Each crate's folder and its allowed imports. A crate missing here is a violation.
 const TABLE: &[(&str, May)] = &[
     ("scene", Import(&[])),
     ("compute", Import(&[])),
@@ -40,11 +40,11 @@ const TABLE: &[(&str, May)] = &[
     ("xtask", Import(&[])),
 ];
 
-/// For development only: imported by tests, never by the program.
+/// Crates for development only, which tests may import but the program may not.
 const DEVELOPMENT: [&str; 2] = ["testkit", "xtask"];
 
-/// One line for each import that the table does not allow, from what `cargo metadata` prints.
-pub fn broken(metadata: &Value) -> Vec<String> {
+/// One line per import that the table does not allow, given the output of `cargo metadata`.
+pub fn violations(metadata: &Value) -> Vec<String> {
     let packages = || metadata["packages"].as_array().into_iter().flatten();
     let ours: Vec<&str> = packages().filter_map(|package| package["name"].as_str()).collect();
     let mut lines = Vec::new();
@@ -62,7 +62,7 @@ pub fn broken(metadata: &Value) -> Vec<String> {
                 continue;
             }
             let imported = crate_of(full);
-            // Tests may use what is for development; everything else obeys the table, in tests too.
+            // Tests may import development crates; other imports follow the table, also in tests.
             let in_tests = dependency["kind"] == "dev";
             let allowed = if DEVELOPMENT.contains(&imported) {
                 in_tests && imported != "xtask"
@@ -114,23 +114,23 @@ mod tests {
     }
 
     #[test]
-    fn what_the_table_allows_passes() {
+    fn allowed_imports_pass() {
         let splat = [
             ("irradia-scene", None),
             ("rayon", None),
             ("irradia-testkit", Some("dev")),
         ];
-        assert!(broken(&workspace("irradia-splat", &splat)).is_empty());
+        assert!(violations(&workspace("irradia-splat", &splat)).is_empty());
         let all = [
             ("irradia-scene", None),
             ("irradia-formats", None),
             ("irradia-splat", None),
         ];
-        assert!(broken(&workspace("irradia", &all)).is_empty());
+        assert!(violations(&workspace("irradia", &all)).is_empty());
     }
 
     #[test]
-    fn each_broken_rule_is_one_line_that_names_both() {
+    fn each_violation_is_one_line_naming_both_crates() {
         for (name, dependency, line) in [
             (
                 "irradia-train",
@@ -150,13 +150,13 @@ mod tests {
                 "splat must not import testkit",
             ),
         ] {
-            assert_eq!(broken(&workspace(name, &[dependency])), [line]);
+            assert_eq!(violations(&workspace(name, &[dependency])), [line]);
         }
     }
 
     #[test]
-    fn a_crate_the_table_does_not_know_is_reported() {
-        let lines = broken(&workspace("irradia-stranger", &[]));
+    fn unknown_crates_are_reported() {
+        let lines = violations(&workspace("irradia-stranger", &[]));
         assert!(
             lines.len() == 1 && lines[0].starts_with("stranger: not in the table"),
             "{lines:?}"

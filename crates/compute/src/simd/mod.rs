@@ -1,12 +1,12 @@
 //! SIMD written once: code generic over [`Simd`] runs on AVX-512, AVX2, portable four-lane arrays (which compilers turn
 //! into NEON, SSE2 or WebAssembly SIMD) and, for tests in double precision, on plain `f64`.
 //!
-//! A value of a [`Simd`] type is the proof that the processor has it, and only [`Level`] makes one, so everything here
-//! is safe to call. A [`Kernel`] is run by [`Level::run`]; every function between the kernel and a lane operation must be
+//! A value of a [`Simd`] type proves that the processor supports it, and only [`Level`] creates one, so everything here
+//! is safe to call. [`Level::run`] runs a [`Kernel`]; every function between the kernel and a lane operation must be
 //! `#[inline(always)]`, or it is compiled without the wide instructions.
 //!
-//! A crate such as `fearless_simd` has the same safety story; what it lacks is double precision through the same source,
-//! and that is how finite differences check the very code that trains.
+//! Crates such as `fearless_simd` offer the same safety, but not double precision from the same source, which lets finite
+//! differences check the very code that trains.
 
 mod portable;
 #[cfg(target_arch = "x86_64")]
@@ -19,22 +19,22 @@ pub use portable::{Double, Portable};
 #[cfg(target_arch = "x86_64")]
 pub use x86::{Avx2, Avx512};
 
-/// A set of vector instructions; the value proves that this processor has them.
+/// A vector instruction set; a value proves that this processor supports it.
 pub trait Simd: Copy + Send + Sync + 'static {
-    /// The vector of floats.
+    /// A vector of floats.
     type F: Lanes<Simd = Self>;
-    /// Floats in a vector.
+    /// Floats per vector.
     const LANES: usize;
-    /// All lanes the constant `value`.
+    /// Sets all lanes to the constant `value`.
     fn splat(self, value: f64) -> Self::F;
-    /// All lanes `value`.
+    /// Sets all lanes to `value`.
     fn set(self, value: <Self::F as Lanes>::Scalar) -> Self::F;
-    /// The first `LANES` of `from`.
+    /// Loads the first `LANES` values of `from`.
     ///
     /// # Panics
     /// When `from` is shorter.
     fn load(self, from: &[<Self::F as Lanes>::Scalar]) -> Self::F;
-    /// Lane `i` is `f(i)`.
+    /// Sets lane `i` to `f(i)`.
     #[inline(always)]
     fn lanes(self, f: impl Fn(usize) -> <Self::F as Lanes>::Scalar) -> Self::F {
         let mut values = [<Self::F as Lanes>::Scalar::default(); 16];
@@ -43,7 +43,7 @@ pub trait Simd: Copy + Send + Sync + 'static {
         }
         self.load(&values)
     }
-    /// A square of `LANES` by `LANES` turned over: `to[j * to_stride + i] = from[i * stride + j]`.
+    /// Transposes a square of `LANES` by `LANES`: `to[j * to_stride + i] = from[i * stride + j]`.
     ///
     /// # Panics
     /// When a row does not fit.
@@ -63,7 +63,7 @@ pub trait Simd: Copy + Send + Sync + 'static {
     }
 }
 
-/// The scalar in a lane.
+/// The scalar type of a lane.
 pub trait Scalar:
     Copy
     + Default
@@ -81,7 +81,7 @@ pub trait Scalar:
     fn from_f64(value: f64) -> Self;
     /// To double precision.
     fn to_f64(self) -> f64;
-    /// Of a whole number from 0 to 2^22: no test and no saturation, so that loops over arrays become vectors.
+    /// Converts an integer from 0 to 2^22, without checks or saturation, so that loops over arrays vectorise.
     fn to_u32(self) -> u32;
 }
 
@@ -96,7 +96,7 @@ impl Scalar for f32 {
     }
     #[inline(always)]
     fn to_u32(self) -> u32 {
-        // Adding 2^23 leaves the whole number in the mantissa.
+        // Adding 2^23 leaves the integer in the mantissa.
         (self + 8_388_608.0).to_bits() & 0x7f_ffff
     }
 }
@@ -129,25 +129,25 @@ pub trait Lanes:
     + SubAssign
     + MulAssign
 {
-    /// What a lane holds.
+    /// The type of a lane.
     type Scalar: Scalar;
-    /// One truth value a lane.
+    /// One boolean per lane.
     type Mask: Mask;
     /// The instruction set.
     type Simd: Simd<F = Self>;
-    /// The token; a vector proves what it was made with.
+    /// The token of the vector's instruction set.
     fn simd(self) -> Self::Simd;
-    /// All lanes the constant `value`; `self` serves only as the proof.
+    /// Sets all lanes to the constant `value`; `self` serves only as proof.
     #[inline(always)]
     fn splat(self, value: f64) -> Self {
         self.simd().splat(value)
     }
-    /// Writes the lanes to the front of `to`.
+    /// Stores the lanes at the front of `to`.
     ///
     /// # Panics
     /// When `to` is shorter than a vector.
     fn store(self, to: &mut [Self::Scalar]);
-    /// `self * b + c`, fused where the processor does so.
+    /// `self * b + c`, fused where the processor supports it.
     fn mul_add(self, b: Self, c: Self) -> Self;
     /// Square root.
     fn sqrt(self) -> Self;
@@ -157,22 +157,22 @@ pub trait Lanes:
     fn max(self, other: Self) -> Self;
     /// Absolute value.
     fn abs(self) -> Self;
-    /// Towards minus infinity.
+    /// Rounds towards minus infinity.
     fn floor(self) -> Self;
     /// `self < other`.
     fn lt(self, other: Self) -> Self::Mask;
     /// `self <= other`.
     fn le(self, other: Self) -> Self::Mask;
-    /// Where `mask` is set `self`, elsewhere `other`.
-    fn or_where_not(self, mask: Self::Mask, other: Self) -> Self;
-    /// `2^self`. Relative error below 2.5e-7 for `self >= -126`; less is taken as -126. Not for `self > 127`.
+    /// `self` in the lanes where `mask` is set, `other` elsewhere.
+    fn select(self, mask: Self::Mask, other: Self) -> Self;
+    /// `2^self`. Relative error below 2.5e-7 for `self >= -126`; lower values are clamped to -126. Not valid for `self > 127`.
     #[inline(always)]
     fn exp2(self) -> Self {
         self.max(self.splat(-126.0)).exp2_in_range()
     }
-    /// As [`Lanes::exp2`], unspecified below -126: one instruction less where such lanes are masked anyway.
+    /// As [`Lanes::exp2`], but unspecified below -126: saves an instruction where such lanes are masked anyway.
     fn exp2_in_range(self) -> Self;
-    /// `e^self` through `2^x`; finite for any finite `self`, so that results above 2^126 and below 2^-126 are taken as these.
+    /// `e^self` as a power of two; results are clamped to 2^-126 and 2^126, hence finite for any finite `self`.
     #[inline(always)]
     fn exp(self) -> Self {
         (self * self.splat(std::f64::consts::LOG2_E))
@@ -183,14 +183,14 @@ pub trait Lanes:
     fn recip(self) -> Self;
     /// Sum of the lanes, in a fixed order.
     fn sum(self) -> Self::Scalar;
-    /// Writes the sums of several vectors; N must be a multiple of four.
+    /// Writes the lane sums of several vectors; N must be a multiple of four.
     #[inline(always)]
     fn sums<const N: usize>(vectors: &[Self; N], to: &mut [Self::Scalar; N]) {
         for i in 0..N {
             to[i] = vectors[i].sum();
         }
     }
-    /// `f` of every lane, one at a time: for functions that are not worth a vector version.
+    /// Applies `f` to each lane in turn: for functions that do not merit a vector version.
     #[inline(always)]
     fn map(self, f: impl Fn(Self::Scalar) -> Self::Scalar) -> Self {
         let mut values = [Self::Scalar::default(); 16];
@@ -200,18 +200,18 @@ pub trait Lanes:
         }
         self.simd().load(&values)
     }
-    /// Zero where `mask` is not set.
+    /// `self` in the lanes where `mask` is set, zero elsewhere.
     #[inline(always)]
-    fn zero_where_not(self, mask: Self::Mask) -> Self {
-        self.or_where_not(mask, self.splat(0.0))
+    fn masked(self, mask: Self::Mask) -> Self {
+        self.select(mask, self.splat(0.0))
     }
 }
 
-/// One truth value a lane.
+/// One boolean per lane.
 pub trait Mask: Copy + Debug {
-    /// Both.
+    /// Lanes set in both.
     fn and(self, other: Self) -> Self;
-    /// Either.
+    /// Lanes set in either.
     fn or(self, other: Self) -> Self;
     /// Lanes set here and not in `other`.
     fn and_not(self, other: Self) -> Self;
@@ -224,49 +224,49 @@ pub trait Mask: Copy + Debug {
     }
 }
 
-/// `[f(0), f(1), ..]` written out: `each!(i in 3 => a[i] + b[i])`.
+/// Unrolls `[f(0), f(1), ..]`: `unroll!(i in 3 => a[i] + b[i])`.
 ///
-/// A closure, as `array::from_fn` and `map` take, is a function of its own and does not inherit the wide instructions of
-/// the function it stands in; where the compiler does not inline it, every lane operation becomes a call.
+/// The closures that `array::from_fn` and `map` take are separate functions and do not inherit the target features of the
+/// enclosing function; unless the compiler inlines them, every lane operation becomes a call.
 #[macro_export]
-macro_rules! each {
+macro_rules! unroll {
     ($i:ident in 2 => $value:expr) => {
-        $crate::each!(@ $i, $value, 0, 1)
+        $crate::unroll!(@ $i, $value, 0, 1)
     };
     ($i:ident in 3 => $value:expr) => {
-        $crate::each!(@ $i, $value, 0, 1, 2)
+        $crate::unroll!(@ $i, $value, 0, 1, 2)
     };
     ($i:ident in 4 => $value:expr) => {
-        $crate::each!(@ $i, $value, 0, 1, 2, 3)
+        $crate::unroll!(@ $i, $value, 0, 1, 2, 3)
     };
     ($i:ident in 5 => $value:expr) => {
-        $crate::each!(@ $i, $value, 0, 1, 2, 3, 4)
+        $crate::unroll!(@ $i, $value, 0, 1, 2, 3, 4)
     };
     ($i:ident in 7 => $value:expr) => {
-        $crate::each!(@ $i, $value, 0, 1, 2, 3, 4, 5, 6)
+        $crate::unroll!(@ $i, $value, 0, 1, 2, 3, 4, 5, 6)
     };
     ($i:ident in 10 => $value:expr) => {
-        $crate::each!(@ $i, $value, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9)
+        $crate::unroll!(@ $i, $value, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9)
     };
     ($i:ident in 9 => $value:expr) => {
-        $crate::each!(@ $i, $value, 0, 1, 2, 3, 4, 5, 6, 7, 8)
+        $crate::unroll!(@ $i, $value, 0, 1, 2, 3, 4, 5, 6, 7, 8)
     };
     (@ $i:ident, $value:expr, $($at:literal),*) => {
         [$({ let $i: usize = $at; $value }),*]
     };
 }
 
-/// Work that is generic over the instruction set.
+/// A computation that is generic over the instruction set.
 pub trait Kernel {
-    /// What it returns.
+    /// The result.
     type Output;
-    /// Does it; must be `#[inline(always)]`.
+    /// Runs the kernel; must be `#[inline(always)]`.
     fn run<S: Simd>(self, simd: S) -> Self::Output
     where
         S::F: Lanes<Scalar = f32>;
 }
 
-/// The widest instruction set to use, found at run time.
+/// The instruction set to use, chosen at run time.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Level {
     /// AVX-512 F, DQ, BW and VL: 16 lanes.
@@ -275,12 +275,12 @@ pub enum Level {
     /// AVX2 and FMA: 8 lanes.
     #[cfg(target_arch = "x86_64")]
     Avx2(Avx2),
-    /// Arrays of four: NEON, SSE2 or whatever the compiler makes of them.
+    /// Arrays of four, which compilers turn into NEON or SSE2.
     Portable(Portable),
 }
 
 impl Level {
-    /// The best that this processor has; `IRRADIA_SIMD=avx2` or `portable` asks for less (for tests and benchmarks).
+    /// The widest level this processor supports; `IRRADIA_SIMD=avx2` or `portable` selects a narrower one (tests, benchmarks).
     pub fn detect() -> Self {
         static LEVEL: std::sync::OnceLock<Level> = std::sync::OnceLock::new();
         *LEVEL.get_or_init(|| {
@@ -292,7 +292,7 @@ impl Level {
         })
     }
 
-    /// Every level that this processor has, widest first.
+    /// Every level this processor supports, widest first.
     pub fn all() -> Vec<Self> {
         let mut levels = Vec::new();
         #[cfg(target_arch = "x86_64")]
@@ -328,7 +328,7 @@ impl Level {
     }
 }
 
-/// The coefficients of the polynomial for `2^f`, f in \[-0.5, 0.5\], from degree 0 up. Minimax in relative error
+/// Coefficients of the polynomial for `2^f`, f in \[-0.5, 0.5\], from degree 0 up. Minimax in relative error
 /// (Remez exchange): 7.5e-8, half a unit in the last place of `f32`. Degree 4 would have 2.6e-6, visible in the golden files.
 pub(crate) const EXP2: [f32; 6] = [
     1.000_000_1,
@@ -360,7 +360,7 @@ mod tests {
                     let w = want(i as f32 - 3.5);
                     assert!(
                         (out[i] - w).abs() <= 2e-7 * w.abs(),
-                        "{what} lane {i}: {} and not {w}",
+                        "{what} lane {i}: {}, expected {w}",
                         out[i]
                     );
                 }
@@ -377,7 +377,7 @@ mod tests {
             check(a.floor(), &f32::floor, "floor");
             check((a + b + b).recip(), &|x| 1.0 / (x + 4.0), "recip");
             check(a.exp2(), &f32::exp2, "exp2");
-            check(a.or_where_not(a.lt(b), b), &|x| x.min(2.0), "lt, select");
+            check(a.select(a.lt(b), b), &|x| x.min(2.0), "lt, select");
             check(a.map(|x| x + 1.0), &|x| x + 1.0, "map");
             let expected: u32 = (0..S::LANES).filter(|i| *i as f32 - 3.5 <= 2.0).map(|i| 1 << i).sum();
             assert_eq!(a.le(b).bits(), expected);
@@ -390,10 +390,10 @@ mod tests {
             S::F::sums(&many, &mut sums);
             assert_eq!(sums, many.map(S::F::sum));
             let square: Vec<f32> = (0..20 * 16).map(|i| i as f32).collect();
-            let mut turned = [f32::NAN; 18 * 16];
-            simd.transpose(&square, 20, &mut turned, 18);
+            let mut transposed = [f32::NAN; 18 * 16];
+            simd.transpose(&square, 20, &mut transposed, 18);
             for (i, j) in (0..S::LANES).flat_map(|i| (0..S::LANES).map(move |j| (i, j))) {
-                assert_eq!(turned[j * 18 + i], square[i * 20 + j], "row {i}, column {j}");
+                assert_eq!(transposed[j * 18 + i], square[i * 20 + j], "row {i}, column {j}");
             }
             let nan = simd.splat(f64::NAN);
             assert!(nan.lt(b).none() && nan.le(b).none());
@@ -402,7 +402,7 @@ mod tests {
     }
 
     #[test]
-    fn every_level_computes_what_scalars_do() {
+    fn every_level_matches_scalar_arithmetic() {
         for level in Level::all() {
             level.run(Everything);
         }
@@ -430,7 +430,7 @@ mod tests {
         }
         for level in Level::all() {
             let worst = level.run(Sweep);
-            // 7.5e-8 of the polynomial and a unit in the last place (1.2e-7) of rounding.
+            // 7.5e-8 from the polynomial and one unit in the last place (1.2e-7) from rounding.
             assert!(worst < 2.5e-7, "{}: {worst}", level.name());
         }
     }

@@ -7,7 +7,7 @@ use std::ops::{Add, AddAssign, Div, Mul, MulAssign, Neg, Sub, SubAssign};
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Portable;
 
-/// One `f64` at a time: for tests, where double precision makes finite differences sharp.
+/// One `f64` at a time: for tests, where double precision makes finite differences accurate.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Double;
 
@@ -18,7 +18,7 @@ const N: usize = 4;
 #[repr(align(16))]
 pub struct Four([f32; N]);
 
-/// Four truth values.
+/// Four booleans.
 #[derive(Clone, Copy, Debug)]
 pub struct FourMask([bool; N]);
 
@@ -83,7 +83,7 @@ impl Lanes for Four {
     }
     #[inline(always)]
     fn mul_add(self, b: Self, c: Self) -> Self {
-        // Without the instruction `f32::mul_add` is a library call, fifty times slower than a product and a sum.
+        // Without an FMA instruction `f32::mul_add` is a library call, fifty times slower than a product and a sum.
         if cfg!(any(target_feature = "fma", target_arch = "aarch64")) {
             Four(std::array::from_fn(|i| self.0[i].mul_add(b.0[i], c.0[i])))
         } else {
@@ -119,12 +119,12 @@ impl Lanes for Four {
         FourMask(std::array::from_fn(|i| self.0[i] <= other.0[i]))
     }
     #[inline(always)]
-    fn or_where_not(self, mask: FourMask, other: Self) -> Self {
+    fn select(self, mask: FourMask, other: Self) -> Self {
         Four(std::array::from_fn(|i| if mask.0[i] { self.0[i] } else { other.0[i] }))
     }
     #[inline(always)]
     fn exp2_in_range(self) -> Self {
-        // Adding and taking away 1.5 * 2^23 rounds to the nearest whole number without a library call.
+        // Adding and subtracting 1.5 * 2^23 rounds to the nearest integer without a library call.
         const MAGIC: f32 = 12_582_912.0;
         let n = self.each(|v| (v + MAGIC) - MAGIC);
         let f = self - n;
@@ -227,7 +227,7 @@ impl Lanes for f64 {
         self <= other
     }
     #[inline(always)]
-    fn or_where_not(self, mask: bool, other: Self) -> Self {
+    fn select(self, mask: bool, other: Self) -> Self {
         if mask { self } else { other }
     }
     #[inline(always)]

@@ -1,5 +1,5 @@
-//! AVX2 and AVX-512 lanes. The only `unsafe` of the project's arithmetic: every block below calls an intrinsic whose
-//! instructions are there because the token that every value descends from is made by `detect` alone.
+//! AVX2 and AVX-512 lanes. The only `unsafe` arithmetic of the project: every block below calls an intrinsic whose
+//! instructions are available because every value derives from a token that only `detect` creates.
 
 use super::{EXP2, Kernel, Lanes, Mask, Simd};
 use std::arch::x86_64::*;
@@ -24,11 +24,11 @@ pub struct F32x16(__m512);
 #[repr(transparent)]
 pub struct F32x8(__m256);
 
-/// Sixteen truth values in a mask register.
+/// Sixteen booleans in a mask register.
 #[derive(Clone, Copy, Debug)]
 pub struct Mask16(__mmask16);
 
-/// Eight truth values, all bits of a lane set or clear.
+/// Eight booleans, all bits of a lane set or clear.
 #[derive(Clone, Copy)]
 pub struct Mask8(__m256);
 
@@ -49,7 +49,7 @@ impl Avx512 {
         fn with_features<K: Kernel>(simd: Avx512, kernel: K) -> K::Output {
             kernel.run(simd)
         }
-        // SAFETY: `self` exists only where `detect` saw these features.
+        // SAFETY: `self` exists only where `detect` found these features.
         unsafe { with_features(self, kernel) }
     }
 }
@@ -65,12 +65,12 @@ impl Avx2 {
         fn with_features<K: Kernel>(simd: Avx2, kernel: K) -> K::Output {
             kernel.run(simd)
         }
-        // SAFETY: `self` exists only where `detect` saw these features.
+        // SAFETY: `self` exists only where `detect` found these features.
         unsafe { with_features(self, kernel) }
     }
 }
 
-/// Implements what both widths have under the same names, given the intrinsics.
+/// Implements the lane traits for one width from its intrinsics.
 macro_rules! float_lanes {
     ($simd:ident, $vector:ident, $mask:ident, $lanes:literal,
      $set1:ident, $loadu:ident, $storeu:ident, $add:ident, $sub:ident, $mul:ident, $div:ident,
@@ -78,7 +78,7 @@ macro_rules! float_lanes {
      abs: |$abs_v:ident| $abs:expr, neg: |$neg_v:ident| $neg:expr, floor: |$floor_v:ident| $floor:expr,
      lt: |$lt_a:ident, $lt_b:ident| $lt:expr, le: |$le_a:ident, $le_b:ident| $le:expr,
      select: |$sel_m:ident, $sel_a:ident, $sel_b:ident| $select:expr,
-     exp2: |$exp_v:ident| $exp2:expr, recip: |$recip_v:ident| $recip:expr, sum: |$sum_v:ident| $sum:expr, sums: $sums:ident, turn: $turn:ident) => {
+     exp2: |$exp_v:ident| $exp2:expr, recip: |$recip_v:ident| $recip:expr, sum: |$sum_v:ident| $sum:expr, sums: $sums:ident, transpose: $transpose:ident) => {
         impl Simd for $simd {
             type F = $vector;
             const LANES: usize = $lanes;
@@ -103,9 +103,9 @@ macro_rules! float_lanes {
                 for i in 0..$lanes {
                     square[i] = self.load(&from[i * stride..]);
                 }
-                let turned = $turn(square);
+                let transposed = $transpose(square);
                 for j in 0..$lanes {
-                    turned[j].store(&mut to[j * to_stride..]);
+                    transposed[j].store(&mut to[j * to_stride..]);
                 }
             }
         }
@@ -162,7 +162,7 @@ macro_rules! float_lanes {
                 $mask(unsafe { $le })
             }
             #[inline(always)]
-            fn or_where_not(self, mask: $mask, other: Self) -> Self {
+            fn select(self, mask: $mask, other: Self) -> Self {
                 let ($sel_m, $sel_a, $sel_b) = (mask.0, self.0, other.0);
                 $vector(unsafe { $select })
             }
@@ -255,7 +255,7 @@ float_lanes!(
         sum_of_8(half)
     },
     sums: sums_of_16,
-    turn: turn_16
+    transpose: transpose_16
 );
 
 float_lanes!(
@@ -272,7 +272,7 @@ float_lanes!(
     recip: |v| _mm256_rcp_ps(v),
     sum: |v| sum_of_8(v),
     sums: sums_of_8,
-    turn: turn_8
+    transpose: transpose_8
 );
 
 #[inline(always)]
@@ -303,10 +303,10 @@ fn exp2_8(v: F32x8) -> F32x8 {
     }
 }
 
-/// ((0+4)+(2+6)) + ((1+5)+(3+7)): the order in which [`sums_of_8`] adds, too.
+/// ((0+4)+(2+6)) + ((1+5)+(3+7)): also the summation order of [`sums_of_8`].
 #[inline(always)]
 unsafe fn sum_of_8(v: __m256) -> f32 {
-    // SAFETY: called where AVX2 is proved.
+    // SAFETY: called only where AVX2 is available.
     unsafe {
         let four = _mm_add_ps(_mm256_castps256_ps128(v), _mm256_extractf128_ps::<1>(v));
         let two = _mm_add_ps(four, _mm_movehl_ps(four, four));
@@ -314,7 +314,7 @@ unsafe fn sum_of_8(v: __m256) -> f32 {
     }
 }
 
-/// Four vectors' sums by transposing within 128-bit lanes: 3 adds and 6 shuffles for four, where one at a time takes 12 and 12.
+/// Sums of four vectors by transposing within 128-bit lanes: 3 adds and 6 shuffles instead of 12 and 12 one at a time.
 #[inline(always)]
 unsafe fn sums_of_four_quads(a: __m128, b: __m128, c: __m128, d: __m128) -> __m128 {
     // SAFETY: SSE is part of x86-64.
@@ -328,7 +328,7 @@ unsafe fn sums_of_four_quads(a: __m128, b: __m128, c: __m128, d: __m128) -> __m1
     }
 }
 
-/// A macro and not a function with a closure, which would not inherit the instruction set (see `each!`).
+/// A macro, since a function taking a closure would not inherit the instruction set (see `unroll!`).
 macro_rules! sums_in_fours {
     ($vectors:ident, $to:ident, |$v:ident| $quad:expr) => {{
         let (chunks, rest) = $to.as_chunks_mut::<4>();
@@ -336,7 +336,7 @@ macro_rules! sums_in_fours {
         for (i, to) in chunks.iter_mut().enumerate() {
             // SAFETY: a vector proves the instruction set; `to` is as long as the store.
             unsafe {
-                let [a, b, c, d] = $crate::each!(k in 4 => {
+                let [a, b, c, d] = $crate::unroll!(k in 4 => {
                     let $v = $vectors[4 * i + k].0;
                     $quad
                 });
@@ -362,9 +362,9 @@ fn sums_of_16<const N: usize>(vectors: &[F32x16; N], to: &mut [f32; N]) {
     });
 }
 
-/// Rows and columns exchanged: within squares of four by four, then the squares.
+/// Transposes within blocks of four by four, then transposes the blocks.
 #[inline(always)]
-fn turn_16(mut rows: [F32x16; 16]) -> [F32x16; 16] {
+fn transpose_16(mut rows: [F32x16; 16]) -> [F32x16; 16] {
     // SAFETY: a vector proves the instruction set.
     unsafe {
         for r in (0..16).step_by(4) {
@@ -390,9 +390,9 @@ fn turn_16(mut rows: [F32x16; 16]) -> [F32x16; 16] {
     rows
 }
 
-/// As [`turn_16`].
+/// As [`transpose_16`].
 #[inline(always)]
-fn turn_8(mut rows: [F32x8; 8]) -> [F32x8; 8] {
+fn transpose_8(mut rows: [F32x8; 8]) -> [F32x8; 8] {
     // SAFETY: a vector proves the instruction set.
     unsafe {
         for r in (0..8).step_by(4) {

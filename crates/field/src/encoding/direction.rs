@@ -3,8 +3,8 @@
 use super::Frequency;
 use crate::Num;
 use crate::mlp::PANEL;
-use irradia_compute::each;
 use irradia_compute::simd::{Lanes, Simd};
+use irradia_compute::unroll;
 use irradia_scene::sh::{C0, C1, C2, C3};
 use serde::{Deserialize, Serialize};
 
@@ -19,7 +19,7 @@ pub enum DirectionEncoding {
 }
 
 impl DirectionEncoding {
-    /// Features of a direction.
+    /// Number of features.
     pub fn features(&self) -> usize {
         match self {
             Self::Harmonics => 16,
@@ -27,13 +27,13 @@ impl DirectionEncoding {
         }
     }
 
-    /// Features of a panel of unit directions, `[3, 32]` to the first rows of `to [rows, 32]`.
+    /// Encodes a panel of unit directions `[3, 32]` to the first rows of `to [rows, 32]`.
     #[inline(always)]
     pub fn encode<S: Simd>(&self, simd: S, directions: &[Num<S>], to: &mut [Num<S>]) {
         match self {
             Self::Harmonics => {
                 for s in (0..PANEL).step_by(S::LANES) {
-                    let b = harmonics(each!(c in 3 => simd.load(&directions[c * PANEL + s..])));
+                    let b = harmonics(unroll!(c in 3 => simd.load(&directions[c * PANEL + s..])));
                     for k in 0..16 {
                         b[k].store(&mut to[k * PANEL + s..]);
                     }
@@ -70,15 +70,15 @@ pub fn harmonics<F: Lanes>([x, y, z]: [F; 3]) -> [F; 16] {
     ]
 }
 
-/// The gradient of `[x, y, z]` through [`harmonics`]; the sphere is left freely, as the polynomials are.
+/// The VJP of [`harmonics`], of the polynomials without the constraint to the unit sphere.
 #[inline(always)]
 pub fn harmonics_vjp<F: Lanes>([x, y, z]: [F; 3], v: &[F; 16]) -> [F; 3] {
     let k = x.simd();
     let (xx, yy, zz) = (x * x, y * y, z * z);
     let (xy, yz, xz) = (x * y, y * z, x * z);
     let (two, three, four, six) = (k.splat(2.0), k.splat(3.0), k.splat(4.0), k.splat(6.0));
-    let a: [F; 5] = each!(i in 5 => k.splat(C2[i]) * v[4 + i]);
-    let b: [F; 7] = each!(i in 7 => k.splat(C3[i]) * v[9 + i]);
+    let a: [F; 5] = unroll!(i in 5 => k.splat(C2[i]) * v[4 + i]);
+    let b: [F; 7] = unroll!(i in 7 => k.splat(C3[i]) * v[9 + i]);
     let c1 = k.splat(C1);
     [
         -c1 * v[3]

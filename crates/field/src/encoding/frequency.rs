@@ -1,12 +1,12 @@
-//! gamma(p): sines and cosines of 2^k pi p (Mildenhall et al. 2020, equation 4), with p itself in front as in the
-//! authors' code.
+//! gamma(p): sines and cosines of 2^k pi p (Mildenhall et al. 2020, equation 4), preceded by p itself as in the authors'
+//! code.
 
 use crate::Num;
 use crate::mlp::PANEL;
 use irradia_compute::simd::{Lanes, Scalar, Simd};
 use serde::{Deserialize, Serialize};
 
-/// The encoding's one size.
+/// Size of the encoding.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Frequency {
@@ -15,15 +15,15 @@ pub struct Frequency {
 }
 
 impl Frequency {
-    /// Features of a point: 3 + 6 L.
+    /// Number of features: 3 + 6 L.
     pub fn features(&self) -> usize {
         3 + 6 * self.octaves
     }
 
     /// Writes the features of one panel: `points [3, 32]` to the first rows of `to [rows, 32]`.
     ///
-    /// Row 3 + 6 k + c is sin, row 6 + 6 k + c is cos of 2^k pi p_c. Octaves follow from the one below by the formulas of the
-    /// double angle; the error doubles an octave and is 6e-5 at the tenth in single precision.
+    /// Row 3 + 6 k + c is sin, row 6 + 6 k + c is cos of 2^k pi p_c. Each octave follows from the previous one by the double-angle
+    /// formulas; the error doubles per octave and is 6e-5 at the tenth in single precision.
     #[inline(always)]
     pub fn encode<S: Simd>(&self, simd: S, points: &[Num<S>], to: &mut [Num<S>]) {
         let two = simd.splat(2.0);

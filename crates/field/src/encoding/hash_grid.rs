@@ -1,43 +1,43 @@
 //! Multi-resolution hash tables with trilinear interpolation (Mueller et al. 2022, section 3).
 //!
-//! A level of N cells a side has its features at the (N + 1)^3 corners: where they fit the table they lie there directly,
-//! else the corner's hash says where (equation 4). All features of a corner lie together, so that a corner is one access.
+//! A level of N cells per side has its features at the (N + 1)^3 corners: stored directly if they fit the table, else indexed by
+//! the corner's hash (equation 4). The features of a corner are contiguous, so that a corner is one access.
 
 use crate::Num;
 use crate::mlp::PANEL;
-use irradia_compute::each;
 use irradia_compute::simd::{Lanes, Scalar, Simd};
+use irradia_compute::unroll;
 use serde::{Deserialize, Serialize};
 
-/// Most features a level can have.
+/// Most features per level.
 pub const MAX_FEATURES: usize = 8;
 
-/// The encoding's sizes.
+/// Sizes of the encoding.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct HashGrid {
-    /// L, resolutions.
+    /// L, number of resolutions.
     pub levels: usize,
-    /// F, features of a corner: 1, 2, 4 or 8.
+    /// F, features per corner: 1, 2, 4 or 8.
     pub features: usize,
-    /// log2 of T, the most corners a level stores.
+    /// log2 of T, the most entries per level.
     pub log2_table: u32,
-    /// N_min, cells a side of the coarsest level.
+    /// N_min, cells per side of the coarsest level.
     pub coarsest: u32,
-    /// N_max, cells a side of the finest level.
+    /// N_max, cells per side of the finest level.
     pub finest: u32,
 }
 
-/// One level: where it lies and how corners find their entry.
+/// One level: its part of the table and how corners index it.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct GridLevel {
-    /// Cells a side.
+    /// Cells per side.
     pub cells: u32,
-    /// Entries stored.
+    /// Number of entries.
     pub entries: usize,
-    /// Number of the first entry in the whole table.
+    /// Index of the first entry in the whole table.
     pub first: usize,
-    /// Corners lie directly, x fastest.
+    /// Whether corners are stored directly, x fastest, without hashing.
     pub dense: bool,
 }
 
@@ -48,7 +48,7 @@ impl HashGrid {
         let growth = ((f64::from(self.finest).ln() - f64::from(self.coarsest).ln()) / steps).exp();
         let mut levels: Vec<GridLevel> = Vec::new();
         for l in 0..self.levels {
-            // A hair more than the product, which should give `finest` itself at the last level.
+            // The epsilon makes the last level exactly `finest` despite rounding.
             let cells = (f64::from(self.coarsest) * growth.powi(l as i32) + 1e-6).floor() as u32;
             let corners = (u64::from(cells) + 1).pow(3);
             let dense = corners <= 1 << self.log2_table;
@@ -62,19 +62,19 @@ impl HashGrid {
         levels
     }
 
-    /// Numbers in all tables.
+    /// Number of parameters in all tables.
     pub fn parameters(&self) -> usize {
         self.level_table().last().map_or(0, |l| l.first + l.entries) * self.features
     }
 }
 
-/// The eight corners around each sample of a panel: entry numbers and weights.
+/// The eight corners around each sample of a panel: entry indices and weights.
 struct Corners<T> {
     index: [[u32; PANEL]; 8],
     weight: [[T; PANEL]; 8],
 }
 
-/// Primes of equation 4; x is left as it is, so that neighbours along x are neighbours in memory.
+/// Primes of equation 4; x is not multiplied, so that neighbours along x are neighbours in memory.
 const PRIMES: [u32; 2] = [2_654_435_761, 805_459_861];
 
 #[inline(always)]
@@ -140,7 +140,7 @@ impl<T: Scalar> Corners<T> {
     }
 }
 
-/// Features of one level for panels of points: `points [panels, 3, 32]` in \[0, 1\] (clamped) to rows `row..row + F` of
+/// Encodes panels of points at one level: `points [panels, 3, 32]` in \[0, 1\] (clamped) to rows `row..row + F` of
 /// `to [panels, rows, 32]`.
 #[inline(always)]
 pub fn encode_level<S: Simd>(
@@ -192,9 +192,9 @@ fn encode_features<S: Simd, const F: usize>(
     }
 }
 
-/// Adds to the gradient of one level's `grads [entries, F]`, sample after sample, so that the order is the samples' own.
+/// The VJP of [`encode_level`] in the table: adds to one level's `grads [entries, F]`, in sample order.
 ///
-/// `v [panels, F, 32]` holds this level's rows only. A sample whose gradient is zero costs one test.
+/// `v [panels, rows, 32]` holds this level in rows `row..row + F`. A sample whose gradient is zero costs one test.
 #[inline(always)]
 pub fn encode_level_vjp<S: Simd>(
     simd: S,
@@ -248,7 +248,7 @@ fn features_vjp<S: Simd, const F: usize>(
     }
 }
 
-/// Adds the gradient of the points, `v_points [panels, 3, 32]`, through one level (for normals).
+/// The VJP of [`encode_level`] in the points, for normals: adds to `v_points [panels, 3, 32]`.
 #[inline(always)]
 pub fn encode_level_point_vjp<S: Simd>(
     simd: S,
@@ -270,13 +270,13 @@ pub fn encode_level_point_vjp<S: Simd>(
     let panels = points.chunks_exact(3 * PANEL).zip(v.chunks_exact(rows * PANEL));
     for ((points, v), v_points) in panels.zip(v_points.chunks_exact_mut(3 * PANEL)) {
         corners(simd, level, points, &mut at);
-        // What each corner's weight is worth to the loss.
-        let mut worth = [[Num::<S>::default(); PANEL]; 8];
+        // The gradient of each corner's weight.
+        let mut v_weight = [[Num::<S>::default(); PANEL]; 8];
         for k in 0..8 {
             for s in 0..PANEL {
                 let entry = &table[at.index[k][s] as usize * features..][..features];
                 for f in 0..features {
-                    worth[k][s] = worth[k][s] + entry[f] * v[(row + f) * PANEL + s];
+                    v_weight[k][s] = v_weight[k][s] + entry[f] * v[(row + f) * PANEL + s];
                 }
             }
         }
@@ -285,12 +285,12 @@ pub fn encode_level_point_vjp<S: Simd>(
             let mut inside = [zero; 3];
             for c in 0..3 {
                 let p = simd.load(&points[c * PANEL + s..]);
-                inside[c] = cells.zero_where_not(mask_between(zero, p, one));
+                inside[c] = cells.masked(mask_between(zero, p, one));
                 let p = p.max(zero).min(one) * cells;
                 fraction[c] = p - p.floor().min(last);
             }
             let high = fraction;
-            let low = each!(c in 3 => one - high[c]);
+            let low = unroll!(c in 3 => one - high[c]);
             for c in 0..3 {
                 let (d, e) = ((c + 1) % 3, (c + 2) % 3);
                 let mut slope = zero;
@@ -298,7 +298,7 @@ pub fn encode_level_point_vjp<S: Simd>(
                     let side = |axis: usize| (k >> axis) & 1 == 1;
                     let w_d = if side(d) { high[d] } else { low[d] };
                     let w_e = if side(e) { high[e] } else { low[e] };
-                    let term = w_d * w_e * simd.load(&worth[k][s..]);
+                    let term = w_d * w_e * simd.load(&v_weight[k][s..]);
                     slope = if side(c) { slope + term } else { slope - term };
                 }
                 let to = &mut v_points[c * PANEL + s..];

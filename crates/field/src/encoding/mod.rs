@@ -1,4 +1,4 @@
-//! What turns a position or a direction into features that a small network can use.
+//! Encodings of positions and directions as features for a small network.
 
 use serde::{Deserialize, Serialize};
 
@@ -21,7 +21,7 @@ pub enum PositionEncoding {
 }
 
 impl PositionEncoding {
-    /// Rows of features, unpadded.
+    /// Number of features, unpadded.
     pub fn features(&self) -> usize {
         match self {
             Self::Frequency(f) => f.features(),
@@ -29,7 +29,7 @@ impl PositionEncoding {
         }
     }
 
-    /// Numbers that are trained.
+    /// Number of trained parameters.
     pub fn parameters(&self) -> usize {
         match self {
             Self::Frequency(_) => 0,

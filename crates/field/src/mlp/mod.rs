@@ -1,9 +1,9 @@
 //! Fully connected ReLU networks over panels of samples, and their vector-Jacobian product.
 //!
 //! Activations are feature-major within a panel of 32 samples, `[panel, feature, 32]`: a layer is then
-//! `y[o][s] += w[i][o] x[i][s]` with the sample in the lane. Weights are packed into tiles of eight
-//! outputs: forward layer by layer, and once a step for the way back.
-//! Every width is padded to a multiple of eight; what is padding is zero and stays zero.
+//! `y[o][s] += w[i][o] x[i][s]` with the sample in the lane. Weights are packed into tiles of eight outputs: layer by layer
+//! in the forward pass, and once per step for the backward pass.
+//! Every width is padded to a multiple of eight; padding is zero and stays zero.
 
 mod outer;
 mod product;
@@ -14,9 +14,9 @@ use irradia_scene::Rng;
 use outer::outer;
 use product::{Begin, Finish, pack, product};
 
-/// Samples of a panel.
+/// Samples per panel.
 pub const PANEL: usize = 32;
-/// Widths are padded to this.
+/// Widths are padded to a multiple of this.
 pub const ROWS: usize = 8;
 
 /// The sizes of a network.
@@ -26,19 +26,19 @@ pub struct MlpShape {
     pub inputs: usize,
     /// Output features (linear).
     pub outputs: usize,
-    /// Features of a hidden layer.
+    /// Width of a hidden layer.
     pub width: usize,
     /// Hidden layers (ReLU).
     pub depth: usize,
-    /// The hidden layer (from 0) that sees the input again; NeRF: 5 of 8.
+    /// The hidden layer (from 0) that takes the network's input as an additional input; NeRF: 5 of 8.
     pub skip: Option<usize>,
 }
 
-/// Where one layer's numbers lie in the flat list of parameters: weights `[inputs + again, outputs]`, then the bias.
+/// Position of a layer in the flat list of parameters: weights `[inputs + again, outputs]`, then the bias.
 #[derive(Clone, Copy, Debug)]
 struct Layer {
     inputs: usize,
-    /// Rows of the network's input that come in again (0 or all of it).
+    /// Rows of the network's input taken as additional input (0 or all of it).
     again: usize,
     outputs: usize,
     at: usize,
@@ -56,10 +56,10 @@ impl Layer {
     }
 }
 
-/// A network: its sizes and where its parameters lie. The parameters themselves are a flat list that others hold.
+/// The layout of a network; its parameters are a flat list owned by the caller.
 #[derive(Clone, Debug)]
 pub struct Mlp {
-    /// The sizes asked for.
+    /// The requested sizes.
     pub shape: MlpShape,
     layers: Vec<Layer>,
 }
@@ -67,33 +67,33 @@ pub struct Mlp {
 /// Activations and gradients of a block of samples; buffers are reused.
 #[derive(Clone, Debug, Default)]
 pub struct MlpTape<T> {
-    /// What each layer gives out, `[panels, outputs, 32]`.
+    /// Output of each layer, `[panels, outputs, 32]`.
     outputs: Vec<Rows<T>>,
-    /// The gradient of the same before the ReLU.
+    /// Gradient of each layer's output before the ReLU.
     gradients: Vec<Rows<T>>,
-    /// One layer's weights or gradients, laid out for the product at hand.
+    /// One layer's weights or gradients, packed for the current product.
     packed: Rows<T>,
 }
 
 impl<T: Scalar> MlpTape<T> {
-    /// What the network gives out, `[panels, padded outputs, 32]`.
+    /// Output of the network, `[panels, padded outputs, 32]`.
     pub fn output(&self) -> &[T] {
         self.outputs.last().map_or(&[], |rows| rows)
     }
 
-    /// To be filled with the gradient of [`Self::output`] before going back.
+    /// The gradient of [`Self::output`], to be filled before the backward pass.
     pub fn output_gradient(&mut self) -> &mut Rows<T> {
-        self.gradients.last_mut().expect("forward came first")
+        self.gradients.last_mut().expect("forward precedes backward")
     }
 
-    /// Everything kept a sample, layer by layer, with its number of rows: for throwing samples away.
+    /// The outputs of all layers, to drop samples from.
     pub(crate) fn outputs_mut(&mut self) -> &mut [Rows<T>] {
         &mut self.outputs
     }
 }
 
 impl Mlp {
-    /// Lays a network out.
+    /// Lays out a network.
     pub fn new(shape: MlpShape) -> Self {
         let pad = |n: usize| n.next_multiple_of(ROWS);
         let inputs = pad(shape.inputs);
@@ -113,33 +113,33 @@ impl Mlp {
         Self { shape, layers }
     }
 
-    /// Rows of the input, padded.
+    /// Input rows, padded.
     pub fn inputs(&self) -> usize {
         self.layers[0].inputs
     }
 
-    /// Rows of the output, padded.
+    /// Output rows, padded.
     pub fn outputs(&self) -> usize {
         self.layers[self.layers.len() - 1].outputs
     }
 
-    /// Numbers in the flat list.
+    /// Length of the flat list of parameters.
     pub fn parameters(&self) -> usize {
         self.layers[self.layers.len() - 1].end()
     }
 
-    /// Where the last layer's numbers lie in the flat list: all zero, the network gives out zeros and still learns.
+    /// Range of the last layer in the flat list: with all zeros there, the network outputs zeros and still learns.
     pub fn last_layer(&self) -> std::ops::Range<usize> {
         let last = &self.layers[self.layers.len() - 1];
         last.at..last.end()
     }
 
-    /// Multiplications of one sample forward; going back takes twice as many.
+    /// Multiplications per sample in the forward pass; the backward pass takes twice as many.
     pub fn products(&self) -> usize {
         self.layers.iter().map(Layer::weights).sum()
     }
 
-    /// Random weights (He et al. 2015, uniform), zero biases, zeros where there is padding.
+    /// Random weights (He et al. 2015, uniform), zero biases, zero padding.
     pub fn init(&self, rng: &mut Rng) -> Vec<f32> {
         let mut parameters = vec![0.0; self.parameters()];
         for (l, layer) in self.layers.iter().enumerate() {
@@ -162,30 +162,30 @@ impl Mlp {
         parameters
     }
 
-    /// The weights for going back, at the same places: going back is then going forward.
+    /// The transposed weights, at the same offsets: the backward pass then uses the products of the forward pass.
     ///
-    /// A layer's tiles, `[(inputs + again) / 8, outputs, 8]`, as the products want them.
+    /// Each layer is packed into tiles `[(inputs + again) / 8, outputs, 8]`.
     pub fn transposed<T: Scalar>(&self, parameters: &[T]) -> Vec<T> {
-        let mut turned = vec![T::default(); parameters.len()];
+        let mut transposed = vec![T::default(); parameters.len()];
         for layer in &self.layers {
             let weights = &parameters[layer.at..layer.bias()];
-            let tiles = turned[layer.at..layer.bias()].as_chunks_mut::<ROWS>().0;
+            let tiles = transposed[layer.at..layer.bias()].as_chunks_mut::<ROWS>().0;
             for (i, row) in weights.chunks_exact(layer.outputs).enumerate() {
                 for (o, w) in row.iter().enumerate() {
                     tiles[i / ROWS * layer.outputs + o][i % ROWS] = *w;
                 }
             }
         }
-        turned
+        transposed
     }
 
-    /// `tape.output()` of `x [panels, inputs, 32]`.
+    /// Computes `tape.output()` from `x [panels, inputs, 32]`.
     #[inline(always)]
     pub fn forward<S: Simd>(&self, simd: S, parameters: &[Num<S>], x: &[Num<S>], tape: &mut MlpTape<Num<S>>) {
         let panels = x.len() / (self.inputs() * PANEL);
         tape.outputs.resize_with(self.layers.len(), Rows::default);
         tape.gradients.resize_with(self.layers.len(), Rows::default);
-        // Layer after layer, so that a layer's weights stay in the cache for all panels.
+        // Layer by layer, so that a layer's weights stay in the cache for all panels.
         for (l, layer) in self.layers.iter().enumerate() {
             pack(&parameters[layer.at..layer.bias()], layer.outputs, &mut tape.packed);
             let (before, after) = tape.outputs.split_at_mut(l);
@@ -204,21 +204,21 @@ impl Mlp {
         }
     }
 
-    /// Goes back: adds to `grads` (flat, as the parameters) and writes the input's gradient to `v_x`, where it is wanted.
+    /// The VJP: adds to `grads` (flat, as the parameters) and writes the input's gradient to `v_x`, if requested.
     ///
-    /// `turned` is [`Self::transposed`]; `x` and `tape` are those of [`Self::forward`], with
+    /// `transposed` is [`Self::transposed`]; `x` and `tape` are those of [`Self::forward`], with
     /// [`MlpTape::output_gradient`] filled, zero in the padding rows.
     #[inline(always)]
     pub fn backward<S: Simd>(
         &self,
         simd: S,
-        turned: &[Num<S>],
+        transposed: &[Num<S>],
         x: &[Num<S>],
         tape: &mut MlpTape<Num<S>>,
         grads: &mut [Num<S>],
         v_x: Option<&mut Rows<Num<S>>>,
     ) {
-        self.pull_back(simd, turned, tape, v_x);
+        self.pull_back(simd, transposed, tape, v_x);
         for (l, layer) in self.layers.iter().enumerate() {
             let from = if l == 0 { x } else { &tape.outputs[l - 1] };
             let from = [(from, layer.inputs), (x, layer.again)];
@@ -227,12 +227,12 @@ impl Mlp {
         }
     }
 
-    /// The half of [`Self::backward`] that needs no parameters' gradients: the gradients of all activations, and of the input.
+    /// The part of [`Self::backward`] without parameter gradients: the gradients of all activations and of the input.
     #[inline(always)]
     pub fn pull_back<S: Simd>(
         &self,
         simd: S,
-        turned: &[Num<S>],
+        transposed: &[Num<S>],
         tape: &mut MlpTape<Num<S>>,
         mut v_x: Option<&mut Rows<Num<S>>>,
     ) {
@@ -244,8 +244,8 @@ impl Mlp {
         for (l, layer) in self.layers.iter().enumerate().rev() {
             let (before, after) = tape.gradients.split_at_mut(l);
             let v = |p| [panel(&after[0], layer.outputs, p), &[]];
-            let turned = &turned[layer.at..layer.bias()];
-            let (to_hidden, to_input) = turned.split_at(if l == 0 { 0 } else { layer.inputs * layer.outputs });
+            let transposed = &transposed[layer.at..layer.bias()];
+            let (to_hidden, to_input) = transposed.split_at(if l == 0 { 0 } else { layer.inputs * layer.outputs });
             if let Some(v_hidden) = before.last_mut() {
                 let hidden = &tape.outputs[l - 1];
                 v_hidden.resize(hidden.len(), Default::default());

@@ -1,21 +1,21 @@
 //! The gradient of a layer's weights and bias: outer products summed over all samples.
 //!
-//! The sums run over samples, which lie in the lanes. So the outputs' gradients are turned over first, a strip of outputs at
-//! a time, with the output in the lane: one shuffle for four values, each of which then meets all inputs. Tiles with the sample
-//! in the lane need no turning, but sums across lanes at the end and twice the reads: with them going back, as a whole, came to
-//! half of the multipliers' peak on AVX-512; so it comes to 60 to 75 %, by width.
+//! The sums run over samples, which lie in the lanes. The outputs' gradients are therefore transposed first, a strip of outputs
+//! at a time, with the output in the lane: one shuffle for four values, each of which is then used with all inputs. Tiles with
+//! the sample in the lane need no transpose, but sums across lanes at the end and twice the loads: with them the whole backward
+//! pass reached half of peak FMA throughput on AVX-512; this way it reaches 60 to 75 %, depending on width.
 
 use super::{PANEL, ROWS};
 use crate::{Num, Rows};
 use irradia_compute::simd::{Lanes, Simd};
 
-/// Panels at a time: a strip of 32 outputs is then 16 KiB and stays in the first cache while all inputs meet it (a tenth
-/// faster at width 32 than all panels at a time, equal from 128 on).
+/// Panels at a time: a strip of 32 outputs is then 16 KiB and stays in the L1 cache while all inputs use it (a tenth faster at
+/// width 32 than all panels at a time, equal from 128 on).
 const BLOCK: usize = 4;
 
 /// Adds to a layer's gradient `to`, weights `[inputs, outputs]` and bias: `to[i][o] += sum over samples of x[i][s] v[o][s]`.
 ///
-/// Rows come with their number a panel, the inputs in up to two parts. `strip` is scratch.
+/// Arrays come with their rows per panel, the inputs in up to two parts. `strip` is scratch.
 #[inline(always)]
 pub(super) fn outer<S: Simd>(
     simd: S,
@@ -43,7 +43,7 @@ pub(super) fn outer<S: Simd>(
     }
 }
 
-/// The columns of `to` that `V` vectors of outputs from `first` on make.
+/// The columns of `to` for `V` vectors of outputs from `first` on.
 #[inline(always)]
 fn columns<S: Simd, const V: usize>(
     simd: S,
@@ -61,7 +61,7 @@ fn columns<S: Simd, const V: usize>(
         for s in (0..PANEL).step_by(S::LANES) {
             for k in (0..wide).step_by(S::LANES) {
                 let (from, to) = (&v[k * PANEL + s..], &mut strip[s * wide + k..]);
-                // Rows beyond the outputs land in lanes that are never added; behind the last panel there are none.
+                // Rows beyond the outputs land in lanes that are never added; past the last panel there are none.
                 if from.len() >= (S::LANES - 1) * PANEL + S::LANES {
                     simd.transpose(from, PANEL, to, wide);
                 } else {
@@ -79,17 +79,17 @@ fn columns<S: Simd, const V: usize>(
     for (x, inputs) in x {
         let x = x.as_chunks::<PANEL>().0;
         for i in (0..inputs).step_by(ROWS) {
-            // Eight rows a tile keep 16 accumulators of 16 lanes in registers; with fewer registers, four.
+            // Eight rows per tile keep 16 accumulators of 16 lanes in registers; with fewer registers, four.
             if S::LANES == 16 {
                 let sums = tile::<S, 8, V>(simd, x, i, inputs, strip);
                 for sums in &sums {
-                    add(simd, sums, &mut rows.next().expect("a row an input")[first..]);
+                    add(simd, sums, &mut rows.next().expect("one row per input")[first..]);
                 }
             } else {
                 for i in [i, i + 4] {
                     let sums = tile::<S, 4, V>(simd, x, i, inputs, strip);
                     for sums in &sums {
-                        add(simd, sums, &mut rows.next().expect("a row an input")[first..]);
+                        add(simd, sums, &mut rows.next().expect("one row per input")[first..]);
                     }
                 }
             }
@@ -111,7 +111,7 @@ fn columns<S: Simd, const V: usize>(
     add(simd, &sum, &mut rows.next().expect("the bias comes last")[first..]);
 }
 
-/// Sums over all samples of `I` inputs from `i` on by a strip of outputs.
+/// Products of `I` inputs from `i` on with a strip of outputs, summed over all samples.
 #[inline(always)]
 fn tile<S: Simd, const I: usize, const V: usize>(
     simd: S,
@@ -143,7 +143,7 @@ fn tile<S: Simd, const I: usize, const V: usize>(
     sums
 }
 
-/// Adds sums to the front of a row that may end within them.
+/// Adds sums to the front of a row that may be shorter.
 #[inline(always)]
 fn add<S: Simd, const V: usize>(simd: S, sums: &[S::F; V], row: &mut [Num<S>]) {
     for (v, to) in row.chunks_mut(S::LANES).enumerate().take(V) {

@@ -1,31 +1,32 @@
 //! A layer's product over one panel of samples, as register tiles.
 //!
-//! Weights come in tiles of 8 outputs, `[outputs / 8, inputs, 8]`: a register tile then reads them in one run. As they lie in
-//! the parameters, rows a layer's width apart, a width of 256 puts all rows of a tile into four sets of the first cache.
+//! Weights come in tiles of 8 outputs, `[outputs / 8, inputs, 8]`: a register tile then reads them contiguously. In
+//! the layout of the parameters, with rows a layer's width apart, a width of 256 maps all rows of a tile to four sets of the L1
+//! cache.
 
 use super::{PANEL, ROWS};
 use crate::{Num, Rows};
 use irradia_compute::simd::{Lanes, Scalar, Simd};
 
-/// What a sum starts with.
+/// Initial value of the sums.
 #[derive(Clone, Copy)]
 pub(super) enum Begin<'a, T> {
     Zero,
     Bias(&'a [T]),
-    /// What is there already.
+    /// The present value.
     Add,
 }
 
-/// What happens to a sum at the end.
+/// Final operation on the sums.
 #[derive(Clone, Copy)]
 pub(super) enum Finish<'a, T> {
     Keep,
     Relu,
-    /// Zero where this is not positive: the ReLU's VJP.
+    /// Zero where this is not positive: the VJP of the ReLU.
     Mask(&'a [T]),
 }
 
-/// Weights `[inputs, outputs]` as tiles `[outputs / 8, inputs, 8]`.
+/// Packs weights `[inputs, outputs]` into tiles `[outputs / 8, inputs, 8]`.
 #[inline(always)]
 pub(super) fn pack<T: Scalar>(weights: &[T], outputs: usize, to: &mut Rows<T>) {
     to.resize(weights.len(), T::default());
@@ -48,7 +49,7 @@ pub(super) fn product<S: Simd>(
     finish: Finish<Num<S>>,
     to: &mut [Num<S>],
 ) {
-    // As many accumulators as hide the latency of two multipliers and leave registers for the operands.
+    // Enough accumulators to hide the latency of two FMA units while leaving registers for the operands.
     match S::LANES {
         16 => tiles::<S, 8, 2>(simd, w, x, begin, finish, to),
         4 | 8 => tiles::<S, 4, 2>(simd, w, x, begin, finish, to),
@@ -92,7 +93,7 @@ fn tiles<S: Simd, const O: usize, const V: usize>(
                     }
                 }
                 for (w, x) in [(w_first, first), (w_again, again)] {
-                    // Four inputs a turn (there are always eight or more), so that the loop is a small part.
+                    // Four inputs per iteration (there are always eight or more) amortise the loop.
                     for (w, x) in w.as_chunks::<4>().0.iter().zip(x.as_chunks::<4>().0) {
                         for i in 0..4 {
                             let mut xs = [zero; V];
@@ -116,7 +117,7 @@ fn tiles<S: Simd, const O: usize, const V: usize>(
                             Finish::Relu => sums[k][v].max(zero),
                             Finish::Mask(mask) => {
                                 let mask = simd.load(&mask[(row + k) * PANEL + at..]);
-                                sums[k][v].zero_where_not(zero.lt(mask))
+                                sums[k][v].masked(zero.lt(mask))
                             }
                         };
                         sum.store(&mut to[o + k][at..]);
@@ -132,7 +133,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_tile_has_eight_neighbouring_outputs_of_every_input() {
+    fn tiles_hold_eight_adjacent_outputs_of_every_input() {
         let (inputs, outputs) = (16, 24);
         let weights: Vec<f32> = (0..inputs * outputs).map(|n| n as f32).collect();
         let mut tiles = Rows::default();

@@ -1,13 +1,13 @@
-//! Samples on their way through a network, in panels.
+//! A block of samples in a network, in panels.
 
 use crate::Rows;
 use crate::mlp::{MlpTape, PANEL};
 use irradia_compute::simd::Scalar;
 
-/// A block of samples on its way through; buffers are reused. Rows are padded to eight, samples to 32.
+/// Inputs, activations and gradients of a block of samples; buffers are reused. Rows are padded to eight, samples to 32.
 #[derive(Clone, Debug, Default)]
 pub struct Block<T> {
-    /// Samples.
+    /// Number of samples.
     pub len: usize,
     /// Positions in the unit cube, `[panels, 3, 32]`.
     pub points: Rows<T>,
@@ -17,7 +17,7 @@ pub struct Block<T> {
     pub codes: Rows<T>,
     /// Encoded positions, `[panels, rows, 32]`.
     pub encoded: Rows<T>,
-    /// Densities, one over field units, `[panels * 32]`.
+    /// Densities, in inverse field units, `[panels * 32]`.
     pub density: Rows<T>,
     /// Colours, `[panels, 3, 32]`.
     pub rgb: Rows<T>,
@@ -29,7 +29,7 @@ pub struct Block<T> {
     pub v_encoded: Rows<T>,
     /// Gradient of the colour part's input, `[panels, rows, 32]`.
     pub(super) v_color_in: Rows<T>,
-    /// The derivative of the density by what the network gives out.
+    /// The derivative of the density by the network's output.
     pub(super) slope: Rows<T>,
     pub(super) density_tape: MlpTape<T>,
     pub(super) color_in: Rows<T>,
@@ -37,12 +37,12 @@ pub struct Block<T> {
 }
 
 impl<T: Scalar> Block<T> {
-    /// Panels that hold [`Self::len`] samples.
+    /// Number of panels for [`Self::len`] samples.
     pub fn panels(&self) -> usize {
         self.len.div_ceil(PANEL)
     }
 
-    /// Makes room for `len` points; what they are is to be set by [`set3`].
+    /// Makes room for `len` points, to be set with [`set3`].
     pub fn reset(&mut self, len: usize) {
         self.len = len;
         self.points.clear();
@@ -50,7 +50,7 @@ impl<T: Scalar> Block<T> {
     }
 
     /// Gives all samples the same appearance code.
-    pub(crate) fn share_code(&mut self, code: &[T]) {
+    pub(crate) fn fill_code(&mut self, code: &[T]) {
         self.codes.clear();
         self.codes.resize(self.panels() * code.len() * PANEL, T::default());
         for row in self.codes.chunks_exact_mut(code.len().max(1) * PANEL) {
@@ -60,7 +60,7 @@ impl<T: Scalar> Block<T> {
         }
     }
 
-    /// Keeps the samples `kept` (ascending) and forgets the others.
+    /// Keeps the samples `kept` (ascending) and drops the others.
     pub fn keep(&mut self, kept: &[u32]) {
         if kept.len() == self.len {
             return;
@@ -82,7 +82,7 @@ impl<T: Scalar> Block<T> {
     }
 }
 
-/// Where row 0 of sample `i` lies among panels of `rows` rows; the other rows follow at distances of 32.
+/// Index of row 0 of sample `i` in panels of `rows` rows; the other rows follow at a stride of 32.
 #[inline(always)]
 pub fn place(rows: usize, i: usize) -> usize {
     i / PANEL * rows * PANEL + i % PANEL

@@ -1,7 +1,7 @@
-//! One network of a field: encoded position to density and geometry features, and these with the direction to colour.
+//! One network of a field: maps an encoded position to density and geometry features, and these with the direction to colour.
 //!
-//! A block of samples goes through in three steps, so that those which nobody sees need not go on:
-//! [`Net::density`], [`Block::keep`], [`Net::color`]; then back through [`Net::backward`].
+//! A block of samples is evaluated in three steps, so that occluded samples can be dropped between them:
+//! [`Net::density`], [`Block::keep`], [`Net::color`]; then [`Net::backward`].
 
 use crate::encoding::hash_grid::{GridLevel, encode_level, encode_level_point_vjp, encode_level_vjp};
 use crate::encoding::{DirectionEncoding, PositionEncoding};
@@ -15,11 +15,11 @@ mod block;
 
 pub use block::{Block, get3, place, set3};
 
-/// How a network's first output becomes a density, one over field units.
+/// Activation that turns a network's first output into a density, in inverse field units.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Activation {
-    /// e^x, cut off at x = 10 (Instant-NGP).
+    /// e^x, clamped at x = 10 (Instant-NGP).
     Exp,
     /// ln(1 + e^x) (mip-NeRF).
     Softplus,
@@ -27,17 +27,17 @@ pub enum Activation {
     Relu,
 }
 
-/// The half of a network that knows colour.
+/// The colour part of a network.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ColorShape {
-    /// How the viewing direction comes in.
+    /// Encoding of the viewing direction.
     pub direction: DirectionEncoding,
-    /// Features of a hidden layer.
+    /// Width of a hidden layer.
     pub width: usize,
     /// Hidden layers: 2 in Instant-NGP, 1 of half the width in NeRF.
     pub depth: usize,
-    /// Numbers of a photograph's own appearance code; 0 for none.
+    /// Length of a photograph's appearance code; 0 for none.
     #[serde(default)]
     pub appearance: usize,
 }
@@ -46,38 +46,38 @@ pub struct ColorShape {
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct NetShape {
-    /// How positions come in.
+    /// Encoding of positions.
     pub encoding: PositionEncoding,
-    /// Features of a hidden layer of the density part: 64 in Instant-NGP, 256 in NeRF.
+    /// Width of a hidden layer of the density part: 64 in Instant-NGP, 256 in NeRF.
     pub width: usize,
     /// Hidden layers of the density part: 1 in Instant-NGP, 8 in NeRF.
     pub depth: usize,
-    /// The hidden layer (from 0) that sees the encoded position again; NeRF: 5.
+    /// The hidden layer (from 0) that takes the encoded position as an additional input; NeRF: 5.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub skip: Option<usize>,
-    /// Features handed from density to colour: 15 in Instant-NGP, 256 in NeRF.
+    /// Features passed from density to colour: 15 in Instant-NGP, 256 in NeRF.
     pub geometry: usize,
-    /// How the density is made positive.
+    /// Activation of the density.
     pub activation: Activation,
-    /// What is added to the raw density.
+    /// Added to the raw density.
     pub density_bias: f32,
-    /// `None` for a proposal network, which knows densities alone.
+    /// `None` for a proposal network, which has only densities.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub color: Option<ColorShape>,
 }
 
-/// A network laid out; [`NetParameters`] are its numbers.
+/// The layout of a network; its parameters are [`NetParameters`].
 #[derive(Clone, Debug)]
 pub struct Net {
     /// The sizes.
     pub shape: NetShape,
-    /// The tables' levels, none for frequencies.
+    /// The levels of the hash grid, empty for frequencies.
     pub levels: Vec<GridLevel>,
     density: Mlp,
     color: Option<Mlp>,
 }
 
-/// What is trained: also the shape of gradients and moments.
+/// The trained parameters; gradients and moments have the same shape.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct NetParameters<T> {
     /// All levels' tables, `[entries, F]`.
@@ -97,7 +97,7 @@ impl<T: Scalar> NetParameters<T> {
         }
     }
 
-    /// Zeros for the networks, and no table.
+    /// Zeros for the networks, without a table.
     pub fn without_table(&self) -> Self {
         Self {
             table: Vec::new(),
@@ -108,7 +108,7 @@ impl<T: Scalar> NetParameters<T> {
 }
 
 impl Net {
-    /// Lays a network out.
+    /// Lays out a network.
     pub fn new(shape: NetShape) -> Self {
         let levels = match &shape.encoding {
             PositionEncoding::HashGrid(grid) => grid.level_table(),
@@ -138,7 +138,7 @@ impl Net {
         }
     }
 
-    /// Random parameters: tables uniform within 1e-4 (Instant-NGP), weights as [`Mlp::init`] has them.
+    /// Random parameters: tables uniform within 1e-4 (Instant-NGP), weights from [`Mlp::init`].
     pub fn init(&self, rng: &mut Rng) -> NetParameters<f32> {
         NetParameters {
             table: (0..self.shape.encoding.parameters())
@@ -149,13 +149,13 @@ impl Net {
         }
     }
 
-    /// Makes every colour grey (a half) until something is learnt.
-    pub(crate) fn silence(&self, parameters: &mut NetParameters<f32>) {
+    /// Zeroes the last colour layer, so that every colour starts at grey (a half).
+    pub(crate) fn zero_color(&self, parameters: &mut NetParameters<f32>) {
         let (mlp, _) = self.color_parts();
         parameters.color[mlp.last_layer()].fill(0.0);
     }
 
-    /// How many numbers table, density and colour part have.
+    /// Number of parameters of table, density part and colour part.
     pub fn sizes(&self) -> [usize; 3] {
         [
             self.shape.encoding.parameters(),
@@ -164,7 +164,7 @@ impl Net {
         ]
     }
 
-    /// Multiplications of a sample in the networks, forward.
+    /// Multiplications per sample in the forward pass of the networks.
     pub fn products(&self) -> usize {
         self.density.products() + self.color.as_ref().map_or(0, Mlp::products)
     }
@@ -174,7 +174,7 @@ impl Net {
         self.density.inputs()
     }
 
-    /// The weights turned over, for going back; no table.
+    /// The transposed weights, for the backward pass; no table.
     pub fn transposed<T: Scalar>(&self, parameters: &NetParameters<T>) -> NetParameters<T> {
         NetParameters {
             table: Vec::new(),
@@ -216,7 +216,7 @@ impl Net {
         }
     }
 
-    /// `block.points` to `block.density`.
+    /// Computes `block.density` from `block.points`.
     #[inline(always)]
     pub fn density<S: Simd>(&self, simd: S, parameters: &NetParameters<Num<S>>, block: &mut Block<Num<S>>) {
         self.encode(simd, &parameters.table, block);
@@ -240,12 +240,9 @@ impl Net {
                     Activation::Softplus => {
                         let e = (-x.abs()).exp();
                         let slope = one / (one + e);
-                        (
-                            x.max(zero) + (one + e).map(ln),
-                            slope.or_where_not(zero.le(x), one - slope),
-                        )
+                        (x.max(zero) + (one + e).map(ln), slope.select(zero.le(x), one - slope))
                     }
-                    Activation::Relu => (x.max(zero), one.zero_where_not(zero.lt(x))),
+                    Activation::Relu => (x.max(zero), one.masked(zero.lt(x))),
                 };
                 density.store(&mut block.density[p * PANEL + s..]);
                 slope.store(&mut block.slope[p * PANEL + s..]);
@@ -253,10 +250,10 @@ impl Net {
         }
     }
 
-    /// `block.directions` (and codes) with what [`Net::density`] left, to `block.rgb`.
+    /// Computes `block.rgb` from `block.directions` (and codes) and the output of [`Net::density`].
     ///
     /// # Panics
-    /// Where the network knows no colour.
+    /// When the network has no colour part.
     #[inline(always)]
     pub fn color<S: Simd>(&self, simd: S, parameters: &NetParameters<Num<S>>, block: &mut Block<Num<S>>) {
         let (mlp, shape) = self.color_parts();
@@ -283,10 +280,10 @@ impl Net {
         for p in 0..panels {
             for s in (0..3 * PANEL).step_by(S::LANES) {
                 let x = simd.load(&block.color_tape.output()[p * out_rows * PANEL + s..]);
-                // The sigmoid by the side on which nothing overflows.
+                // The sigmoid of -|x|, which does not overflow, mirrored.
                 let e = (-x.abs()).exp();
                 let right = one / (one + e);
-                let y = right.or_where_not(simd.splat(0.0).le(x), one - right);
+                let y = right.select(simd.splat(0.0).le(x), one - right);
                 y.store(&mut block.rgb[p * 3 * PANEL + s..]);
             }
         }
@@ -295,17 +292,17 @@ impl Net {
     fn color_parts(&self) -> (&Mlp, &ColorShape) {
         match (&self.color, &self.shape.color) {
             (Some(mlp), Some(shape)) => (mlp, shape),
-            _ => panic!("this network knows no colour"),
+            _ => panic!("this network has no colour part"),
         }
     }
 
-    /// From `block.v_density` and, where `with_color`, `block.v_rgb`: adds to the networks' `grads` and leaves
-    /// `block.v_encoded`, from which tables and positions get theirs.
+    /// The VJP from `block.v_density` and, if `with_color`, `block.v_rgb`: adds to the networks' `grads` and writes
+    /// `block.v_encoded`, the source of the gradients of tables and positions.
     #[inline(always)]
     pub fn backward<S: Simd>(
         &self,
         simd: S,
-        turned: &NetParameters<Num<S>>,
+        transposed: &NetParameters<Num<S>>,
         block: &mut Block<Num<S>>,
         grads: &mut NetParameters<Num<S>>,
         with_color: bool,
@@ -332,7 +329,7 @@ impl Net {
             let v_in = Some(&mut block.v_color_in);
             mlp.backward(
                 simd,
-                &turned.color,
+                &transposed.color,
                 &block.color_in,
                 &mut block.color_tape,
                 &mut grads.color,
@@ -355,7 +352,7 @@ impl Net {
         }
         self.density.backward(
             simd,
-            &turned.density,
+            &transposed.density,
             &block.encoded,
             &mut block.density_tape,
             &mut grads.density,
@@ -363,14 +360,14 @@ impl Net {
         );
     }
 
-    /// The gradient of appearance code number `k` of sample `i`, after [`Net::backward`].
+    /// The gradient of component `k` of sample `i`'s appearance code, after [`Net::backward`].
     pub fn code_gradient<T: Copy>(&self, block: &Block<T>, i: usize, k: usize) -> T {
         let (mlp, shape) = self.color_parts();
         let row = self.shape.geometry + shape.direction.features() + k;
         block.v_color_in[place(mlp.inputs(), i) + row * PANEL]
     }
 
-    /// Adds to the tables' gradient from `points` and `v_encoded` of a block, sample after sample.
+    /// Adds the tables' gradient from `points` and `v_encoded` of a block to `grads`, in sample order.
     #[inline(always)]
     pub fn table_gradient<S: Simd>(&self, simd: S, points: &[Num<S>], v_encoded: &[Num<S>], grads: &mut [Num<S>]) {
         let PositionEncoding::HashGrid(grid) = &self.shape.encoding else {
@@ -383,13 +380,13 @@ impl Net {
         }
     }
 
-    /// The derivative of each sample's density by its point, `[panels, 3, 32]`, after [`Net::density`].
+    /// Writes the derivative of each sample's density by its point, `[panels, 3, 32]`, after [`Net::density`].
     #[inline(always)]
     pub fn density_slope<S: Simd>(
         &self,
         simd: S,
         parameters: &NetParameters<Num<S>>,
-        turned: &NetParameters<Num<S>>,
+        transposed: &NetParameters<Num<S>>,
         block: &mut Block<Num<S>>,
         slope: &mut Rows<Num<S>>,
     ) {
@@ -402,11 +399,11 @@ impl Net {
         }
         let v_encoded = Some(&mut block.v_encoded);
         self.density
-            .pull_back(simd, &turned.density, &mut block.density_tape, v_encoded);
+            .pull_back(simd, &transposed.density, &mut block.density_tape, v_encoded);
         self.point_gradient(simd, &parameters.table, block, slope);
     }
 
-    /// The gradient of `block.points` from `block.v_encoded`, `[panels, 3, 32]`.
+    /// Writes the gradient of `block.points` from `block.v_encoded`, `[panels, 3, 32]`.
     #[inline(always)]
     pub fn point_gradient<S: Simd>(
         &self,

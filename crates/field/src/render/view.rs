@@ -9,18 +9,18 @@ use irradia_compute::Level;
 use irradia_scene::Camera;
 use rayon::prelude::*;
 
-/// How a view is rendered.
+/// Options of [`render_view`].
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct RenderOptions {
-    /// What lies behind the field, sRGB in \[0, 1\], unless it has learnt that itself.
+    /// Background, sRGB in \[0, 1\], unless the field has learnt one.
     pub background: [f32; 3],
-    /// The photograph whose appearance code is used; the mean code, zero, where there is none.
+    /// The photograph whose appearance code to use; `None` for the mean code, zero.
     pub image: Option<u32>,
-    /// Whether normals are wanted; they take a third more time.
+    /// Whether to compute normals, which takes a third more time.
     pub normals: bool,
 }
 
-/// A rendered view; every plane is `[H * W]`, row after row.
+/// A rendered view; every plane is `[H * W]`, row-major.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct FieldView {
     /// Width in pixels.
@@ -29,30 +29,30 @@ pub struct FieldView {
     pub height: u32,
     /// Red, green and blue, `[3, H * W]`, over the background.
     pub color: Vec<f32>,
-    /// How much of each pixel the field covers.
+    /// Opacity of the field in each pixel.
     pub alpha: Vec<f32>,
-    /// Depth along the camera's +Z, world units, the mean over what the ray meets; 0 where alpha is.
+    /// Depth along the camera's +Z, world units, the weighted mean along the ray; 0 where alpha is 0.
     pub depth: Vec<f32>,
     /// Depth at which the ray's transmittance falls below a half; 0 where it never does.
     pub median_depth: Vec<f32>,
-    /// Unit normals in the world, `[3, H * W]`, against the density's slope, the mean over what the ray meets; 0 where alpha
-    /// is. Empty where not asked for.
+    /// Unit normals in the world, `[3, H * W]`: the weighted mean of the negative density gradient along the ray; 0 where alpha is
+    /// 0. Empty if not requested.
     pub normals: Vec<f32>,
 }
 
-/// The field's ray through pixel coordinates `(x, y)` of `camera`, and how much depth a world unit along it is.
+/// The field's ray through pixel coordinates `(x, y)` of `camera`, and the depth per world unit along it.
 pub fn camera_ray(field: &Field, camera: &Camera, x: f32, y: f32) -> (Ray, f32) {
     let direction = camera.ray_direction(Vec2::new(x, y));
     let ray = field.space.ray(camera.pose.position.to_array(), direction.to_array());
     (ray, direction.dot(camera.pose.rotation * Vec3::Z))
 }
 
-/// Renders what `camera` sees; its lens is not looked at.
+/// Renders the view of `camera`; its lens is ignored.
 pub fn render_view(field: &Field, camera: &Camera, options: &RenderOptions) -> FieldView {
     let (width, height) = (camera.intrinsics.width, camera.intrinsics.height);
     let pixels = width as usize * height as usize;
     let level = Level::detect();
-    let turned = field.turned();
+    let transposed = field.transposed();
     let last = field.nets.len() - 1;
     let mut rows = vec![[0.0f32; 9]; pixels];
     rows.par_chunks_mut(width.max(1) as usize).enumerate().for_each_init(
@@ -67,7 +67,7 @@ pub fn render_view(field: &Field, camera: &Camera, options: &RenderOptions) -> F
                 let taken = trace(level, field, &only[at..], &images[at..], None, passes);
                 let pass = &mut passes[last];
                 if options.normals {
-                    pass.slope(level, field, last, &turned[last]);
+                    pass.slope(level, field, last, &transposed[last]);
                 }
                 for r in 0..taken {
                     row[at + r] = pixel(field, pass, r, &rays[at + r], options);
@@ -106,8 +106,8 @@ fn pixel(field: &Field, pass: &Pass, r: usize, (ray, cosine): &(Ray, f32), optio
             normal -= pass.weights[i] * slope.normalize_or_zero();
         }
     }
-    let background = field.behind(ray.view).unwrap_or(options.background);
-    let color: [f32; 3] = std::array::from_fn(|c| color[c] + pass.behind[r] * background[c]);
+    let background = field.background_toward(ray.view).unwrap_or(options.background);
+    let color: [f32; 3] = std::array::from_fn(|c| color[c] + pass.transmittance[r] * background[c]);
     let depth = if alpha > 0.0 { depth / alpha } else { 0.0 };
     let median = pass.median(r).map_or(0.0, depth_at);
     let [x, y, z] = normal.normalize_or_zero().to_array();

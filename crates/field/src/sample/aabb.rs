@@ -1,11 +1,11 @@
-//! Where a ray meets a box (Kay and Kajiya 1986, slabs).
+//! Intersection of a ray and a box (Kay and Kajiya 1986, slabs).
 
-/// The distances along the ray at which it enters and leaves the box, not before 0; `None` where it misses.
+/// The distances along the ray at which it enters and leaves the box, clamped to 0; `None` if it misses.
 pub fn intersect(origin: [f32; 3], direction: [f32; 3], low: [f32; 3], high: [f32; 3]) -> Option<[f32; 2]> {
     let (mut near, mut far) = (0.0f32, f32::INFINITY);
     for c in 0..3 {
         if direction[c] == 0.0 {
-            // Along the slab: all of the ray lies in it or none.
+            // Parallel to the slab: the ray lies entirely inside or outside.
             if origin[c] < low[c] || origin[c] > high[c] {
                 return None;
             }

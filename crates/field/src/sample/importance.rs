@@ -1,15 +1,19 @@
-//! Samples where the weights are: the inverse of a histogram's distribution function (NeRF, section 5.2).
+//! Importance sampling: the inverse of a histogram's distribution function (NeRF, section 5.2).
 
 use irradia_scene::Rng;
 
 /// `n` ascending samples of the histogram with `edges [m + 1]` and unnormalised `weights [m]`, in equal steps of probability,
-/// with `rng` moved within their steps. A histogram of zeros counts as even.
+/// jittered within them by `rng`. A histogram of zeros counts as uniform.
 pub fn importance(edges: &[f32], weights: &[f32], n: usize, mut rng: Option<&mut Rng>, samples: &mut Vec<f32>) {
     samples.clear();
     let total: f32 = weights.iter().sum();
-    let even = total <= 0.0 || !total.is_finite();
-    let weight = |i: usize| if even { edges[i + 1] - edges[i] } else { weights[i] };
-    let total = if even { edges[weights.len()] - edges[0] } else { total };
+    let uniform = total <= 0.0 || !total.is_finite();
+    let weight = |i: usize| if uniform { edges[i + 1] - edges[i] } else { weights[i] };
+    let total = if uniform {
+        edges[weights.len()] - edges[0]
+    } else {
+        total
+    };
     let (mut bin, mut below) = (0, 0.0);
     for k in 0..n {
         let within = rng.as_mut().map_or(0.5, |rng| rng.uniform());
@@ -18,8 +22,8 @@ pub fn importance(edges: &[f32], weights: &[f32], n: usize, mut rng: Option<&mut
             below += weight(bin);
             bin += 1;
         }
-        let share = ((target - below) / weight(bin).max(1e-20)).clamp(0.0, 1.0);
-        samples.push(edges[bin] + share * (edges[bin + 1] - edges[bin]));
+        let fraction = ((target - below) / weight(bin).max(1e-20)).clamp(0.0, 1.0);
+        samples.push(edges[bin] + fraction * (edges[bin + 1] - edges[bin]));
     }
 }
 

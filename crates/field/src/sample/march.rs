@@ -1,53 +1,53 @@
-//! Steps along a ray through the occupancy grid (Mueller et al. 2022, appendix E).
+//! Ray marching through the occupancy grid (Mueller et al. 2022, appendix E).
 
 use super::occupancy::{Cell, OccupancyGrid};
 use crate::space::{Outside, Ray, Space};
 use serde::{Deserialize, Serialize};
 
-/// How long steps are.
+/// Step lengths.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Steps {
     /// Shortest step, field units (the cube is 2 wide).
     pub shortest: f32,
-    /// A step is at least this share of the distance from the camera: 0 in a bounded scene, 1/256 in Instant-NGP's unbounded
+    /// Minimum step as a fraction of the distance from the camera: 0 in a bounded scene, 1/256 in Instant-NGP's unbounded
     /// ones.
     pub cone: f32,
 }
 
 impl Steps {
-    /// The step at distance `t`.
+    /// Step length at distance `t`.
     #[inline]
     pub fn at(&self, t: f32) -> f32 {
         self.shortest.max(t * self.cone)
     }
 
-    /// About the step at a point of field space that cameras see from near the middle.
+    /// Approximate step length at a point of field space, for cameras near the centre.
     pub fn near(&self, p: [f32; 3]) -> f32 {
         self.at(p.iter().map(|v| v * v).sum::<f32>().sqrt())
     }
 }
 
-/// Rays on their way through an occupancy grid.
+/// A ray marcher.
 #[derive(Clone, Copy, Debug)]
 pub struct March<'a> {
-    /// Where the grid lies.
+    /// The space of the grid.
     pub space: &'a Space,
-    /// What is empty.
+    /// The occupied cells.
     pub grid: &'a OccupancyGrid,
-    /// How long steps are.
+    /// Step lengths.
     pub steps: Steps,
 }
 
 impl March<'_> {
-    /// The distance at which `ray`'s first step begins. `offset` in \[0, 1) moves all steps by that share of one.
+    /// The distance at which the first step of `ray` begins. `offset` in \[0, 1) shifts all steps by that fraction of a step.
     pub fn first(&self, ray: &Ray, offset: f32) -> f32 {
         ray.near + (offset - 0.5) * self.steps.at(ray.near)
     }
 
-    /// Adds the middles and lengths of the steps from the distance `t` on that lie in occupied cells, at most `most` of them.
-    /// Returns the distance at which the rest begins: at or behind the ray's end where there is none.
-    pub fn go(&self, ray: &Ray, mut t: f32, most: usize, middles: &mut Vec<f32>, lengths: &mut Vec<f32>) -> f32 {
+    /// Appends the middles and lengths of up to `most` steps from distance `t` on that lie in occupied cells. Returns the distance
+    /// at which to continue, at or beyond the ray's end when done.
+    pub fn advance(&self, ray: &Ray, mut t: f32, most: usize, middles: &mut Vec<f32>, lengths: &mut Vec<f32>) -> f32 {
         let straight = !matches!(self.space.outside, Outside::Contracted);
         let full = middles.len().saturating_add(most);
         while t < ray.far && middles.len() < full {
@@ -67,8 +67,8 @@ impl March<'_> {
                 Cell::Empty => 1.0 / self.grid.side as f32,
                 Cell::EmptyBrick => 4.0 / self.grid.side as f32,
             };
-            // Out of the cell by whole steps, so that samples keep their places whatever is skipped. Where space is
-            // contracted rays are straight in the inner cube alone.
+            // Leaves the cell by whole steps, so that sample positions do not depend on what is skipped. In contracted space
+            // rays are straight only in the inner cube.
             let inner = straight || p.iter().all(|v| v.abs() < 1.0);
             if !inner || self.steps.cone > 0.0 && t * self.steps.cone > self.steps.shortest {
                 t += step;

@@ -1,4 +1,4 @@
-//! Where along a ray a field is looked at.
+//! Sampling along rays.
 
 pub mod aabb;
 pub mod importance;

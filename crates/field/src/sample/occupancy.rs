@@ -1,34 +1,34 @@
-//! The occupancy grid: where a field is empty nothing is evaluated (Mueller et al. 2022, appendix E).
+//! The occupancy grid, which lets ray marching skip empty space (Mueller et al. 2022, appendix E).
 //!
-//! A cell's density is an exponential moving maximum of what the network says. Cells are kept as bits, bricks of 4 x 4 x 4 in
-//! one word: one test skips an empty brick.
+//! A cell's density is a decaying maximum of the network's output. Occupancy is stored as bits, a brick of 4 x 4 x 4 cells per
+//! word: one test skips an empty brick.
 
 use irradia_scene::Rng;
 
-/// Cells of the unit cube with their remembered densities.
+/// Cells of the unit cube with their densities.
 #[derive(Clone, Debug, PartialEq)]
 pub struct OccupancyGrid {
-    /// Cells a side, a multiple of four.
+    /// Cells per side, a multiple of four.
     pub side: usize,
-    /// Remembered density of each cell, x fastest.
+    /// Decaying maximum density of each cell, x fastest.
     pub density: Vec<f32>,
-    /// Occupied cells, a word a brick, x fastest.
+    /// Occupied cells, one word per brick, x fastest.
     bricks: Vec<u64>,
 }
 
-/// What a point's cell says.
+/// The state of a point's cell.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Cell {
-    /// There may be something.
+    /// The cell may contain something.
     Occupied,
-    /// This cell is empty.
+    /// The cell is empty.
     Empty,
-    /// All 64 cells of the brick are.
+    /// All 64 cells of its brick are empty.
     EmptyBrick,
 }
 
 impl OccupancyGrid {
-    /// Everything occupied, since nothing is known.
+    /// A grid with every cell occupied.
     pub fn new(side: usize) -> Self {
         let side = side.next_multiple_of(4).max(4);
         Self {
@@ -38,7 +38,7 @@ impl OccupancyGrid {
         }
     }
 
-    /// From remembered densities `[side^3]`; [`Self::threshold`] makes the bits.
+    /// A grid of given densities `[side^3]`; [`Self::threshold`] computes the bits.
     pub fn from_density(side: usize, density: Vec<f32>) -> Option<Self> {
         (side > 0 && side.is_multiple_of(4) && density.len() == side.pow(3)).then(|| Self {
             side,
@@ -68,7 +68,7 @@ impl OccupancyGrid {
         }
     }
 
-    /// The coordinates of cell number `cell`.
+    /// The coordinates of the cell with index `cell`.
     pub fn cell(&self, cell: usize) -> [usize; 3] {
         [
             cell % self.side,
@@ -77,21 +77,21 @@ impl OccupancyGrid {
         ]
     }
 
-    /// Whether cell number `cell` is occupied.
+    /// Whether the cell with index `cell` is occupied.
     pub fn occupied(&self, cell: usize) -> bool {
         let (brick, bit) = self.brick(self.cell(cell));
         self.bricks[brick] >> bit & 1 == 1
     }
 
-    /// The share of cells that are occupied.
-    pub fn share(&self) -> f32 {
+    /// The fraction of cells that are occupied.
+    pub fn occupied_fraction(&self) -> f32 {
         let cells: u32 = self.bricks.iter().map(|b| b.count_ones()).sum();
         cells as f32 / self.density.len() as f32
     }
 
-    /// The cells to look at again: all, or the occupied ones and a random share `1 / one_in` of the others; with a random point
-    /// in each.
-    pub fn choose(&self, all: bool, one_in: u32, rng: &mut Rng) -> (Vec<u32>, Vec<[f32; 3]>) {
+    /// Selects cells to update: all, or the occupied ones and a random fraction `1 / one_in` of the others; with a random
+    /// point in each.
+    pub fn sample_cells(&self, all: bool, one_in: u32, rng: &mut Rng) -> (Vec<u32>, Vec<[f32; 3]>) {
         let cells: Vec<u32> = (0..self.density.len())
             .filter(|c| all || self.occupied(*c) || rng.below(one_in) == 0)
             .map(|c| c as u32)
@@ -104,26 +104,26 @@ impl OccupancyGrid {
         (cells, points)
     }
 
-    /// Remembers densities seen: `max(decay * old, new)`, for the cells looked at.
-    pub fn remember(&mut self, cells: &[u32], densities: &[f32], decay: f32) {
+    /// Updates the densities of `cells` to `max(decay * old, new)`.
+    pub fn update(&mut self, cells: &[u32], densities: &[f32], decay: f32) {
         for (cell, new) in cells.iter().zip(densities) {
             let old = &mut self.density[*cell as usize];
             *old = (*old * decay).max(*new);
         }
     }
 
-    /// Marks the cells whose density, times the step there (`step(u)` at the cell's centre), reaches `thickness` or, where the
-    /// whole grid is thinner, its mean.
+    /// Marks the cells whose optical depth over a step (`step(u)` at the cell's centre) reaches `thickness`, or the mean over the
+    /// grid if that is lower.
     pub fn threshold(&mut self, thickness: f32, step: impl Fn([f32; 3]) -> f32) {
         let scale = 1.0 / self.side as f32;
-        let thick: Vec<f32> = (0..self.density.len())
+        let optical_depths: Vec<f32> = (0..self.density.len())
             .map(|c| self.density[c] * step(self.cell(c).map(|x| (x as f32 + 0.5) * scale)))
             .collect();
-        let mean = thick.iter().map(|t| f64::from(*t)).sum::<f64>() / thick.len() as f64;
+        let mean = optical_depths.iter().map(|t| f64::from(*t)).sum::<f64>() / optical_depths.len() as f64;
         let limit = thickness.min(mean as f32);
         self.bricks.fill(0);
-        for (c, thick) in thick.iter().enumerate() {
-            if *thick >= limit {
+        for (c, optical_depth) in optical_depths.iter().enumerate() {
+            if *optical_depth >= limit {
                 let (brick, bit) = self.brick(self.cell(c));
                 self.bricks[brick] |= 1 << bit;
             }

@@ -1,11 +1,11 @@
-//! The two losses that make proposal networks and compact densities (mip-NeRF 360).
+//! The losses that train proposal networks and favour compact densities (mip-NeRF 360).
 //!
 //! Symbols: `s` edges, `w` weights of the last round; `s_hat`, `w_hat` those of a proposal.
 
 use irradia_compute::simd::Scalar;
 
-/// The interlevel loss (equation 13): how far the last round's weights, taken as they are, stick out of the bound
-/// that the proposal's overlapping intervals make. Adds the gradient of `w_hat` to `v`.
+/// The interlevel loss (equation 13): how far the last round's weights, held constant, exceed the bound given by the
+/// proposal's overlapping intervals. Adds the gradient of `w_hat` to `v`.
 pub fn interlevel<T: Scalar>(s: &[T], w: &[T], s_hat: &[T], w_hat: &[T], scale: T, v: &mut [T]) -> T {
     let mut loss = T::default();
     let (two, tiny) = (T::from_f64(2.0), T::from_f64(1e-7));
@@ -42,12 +42,12 @@ pub fn distortion<T: Scalar>(s: &[T], w: &[T], scale: T, v: &mut [T]) -> T {
         moment = moment + w[i] * middle(i);
     }
     let mut loss = T::default();
-    // Weight and moment of what lies before.
+    // Weight and moment of the preceding intervals.
     let (mut before, mut moment_before) = (T::default(), T::default());
     for i in 0..w.len() {
         let (m, length) = (middle(i), s[i + 1] - s[i]);
-        let (behind, moment_behind) = (total - before - w[i], moment - moment_before - w[i] * m);
-        let pull = m * before - moment_before + moment_behind - m * behind;
+        let (after, moment_after) = (total - before - w[i], moment - moment_before - w[i] * m);
+        let pull = m * before - moment_before + moment_after - m * after;
         loss = loss + scale * (w[i] * pull + third * w[i] * w[i] * length);
         v[i] = v[i] + scale * (two * pull + two * third * w[i] * length);
         before = before + w[i];

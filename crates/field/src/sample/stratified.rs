@@ -1,8 +1,8 @@
-//! Even intervals, moved at random (NeRF, equation 2).
+//! Even intervals with random jitter (NeRF, equation 2).
 
 use irradia_scene::Rng;
 
-/// `n + 1` edges from 0 to 1; with `rng` the inner ones are moved within half an interval.
+/// `n + 1` edges from 0 to 1; with `rng` the inner ones are jittered by up to half an interval.
 pub fn stratified(n: usize, rng: Option<&mut Rng>, edges: &mut Vec<f32>) {
     let step = 1.0 / n as f32;
     edges.clear();

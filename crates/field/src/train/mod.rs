@@ -1,13 +1,13 @@
-//! One step of training: rays in, better numbers out.
+//! One training step.
 //!
-//! The rays of a batch are cut into a fixed number of groups, whatever the number of threads. A group goes through its chunks
-//! one after the other and keeps sums of its own for the networks' gradients, which are then added in the groups' order. The
-//! tables' gradients are scattered afterwards, each level by one task that walks all samples in their order: no locks, no
-//! atomics, and the same bits for any number of threads.
+//! The rays of a batch are split into a fixed number of groups, independent of the number of threads. A group processes its
+//! chunks in order and keeps its own sums of the networks' gradients, which are then added in group order. The tables'
+//! gradients are scattered afterwards, each level by one task that visits all samples in order: no locks, no atomics, and the
+//! same bits for any number of threads.
 
 use crate::batch::{Background, Draw, RayBatch, TrainView};
 use crate::field::Field;
-use crate::look::update_occupancy;
+use crate::query::update_occupancy;
 use crate::state::FieldState;
 use irradia_compute::Level;
 use irradia_compute::adam::AdamStep;
@@ -19,15 +19,15 @@ mod residual;
 mod update;
 mod worker;
 
-pub use residual::{Sight, residual_at, train_residual};
+pub use residual::{ResidualQuery, residual_at, train_residual};
 
-/// Groups of a batch: threads that can work at once.
+/// Groups per batch: the most threads that can work at once.
 const GROUPS: usize = 32;
-/// Streams of a step's seed beside the groups'.
+/// Random streams of a step, beside those of the groups.
 const STREAM_RAYS: u64 = 0xfe;
-pub(crate) const STREAM_LOOK: u64 = 0xff;
+pub(crate) const STREAM_OCCUPANCY: u64 = 0xff;
 
-/// What one step does.
+/// Options of one step.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct StepOptions {
     /// Learning rate of tables; 0.01 in Instant-NGP.
@@ -42,16 +42,16 @@ pub struct StepOptions {
     pub interlevel: f32,
     /// Weight of the distortion loss; 0.01 in mip-NeRF 360.
     pub distortion: f32,
-    /// Weight of the mean squared error of distance, over the rays whose distance is known, in the measure in which samples
+    /// Weight of the mean squared error of distance, over the rays of known distance, in the measure in which samples
     /// are spread ([`crate::Space::spread`]): field units, and disparity in the far part of a contracted world.
     pub depth: f32,
-    /// What lies behind photographs; behind one that has no alpha only where the field does not learn that itself.
+    /// Background behind photographs; for those without alpha, a background learnt by the field takes precedence.
     pub background: Background,
-    /// Samples that [`train_views`] chooses the number of rays for; 2^18 in Instant-NGP.
+    /// Target number of samples per batch, by which [`train_views`] sets the number of rays; 2^18 in Instant-NGP.
     pub samples: usize,
-    /// Whether [`train_views`] looks at the occupancy grid after the step; every 16th time in Instant-NGP.
-    pub look: bool,
-    /// Everything random follows from it and the number of the step.
+    /// Whether [`train_views`] updates the occupancy grid after the step; every 16th step in Instant-NGP.
+    pub update_occupancy: bool,
+    /// Random seed; random numbers depend on it and the number of the step.
     pub seed: u64,
 }
 
@@ -67,22 +67,22 @@ impl Default for StepOptions {
             depth: 0.0,
             background: Background::Random,
             samples: 1 << 16,
-            look: true,
+            update_occupancy: true,
             seed: 0,
         }
     }
 }
 
-/// What a step found, means over its rays.
+/// Losses of a step, means over its rays.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct StepLoss {
     /// Mean squared error of the last network's colour.
     pub color: f64,
-    /// Everything with its weights.
+    /// Weighted sum of all losses.
     pub total: f64,
-    /// Rays of the batch.
+    /// Rays in the batch.
     pub rays: usize,
-    /// Samples whose colour was computed, all networks: what the next batch's size can be chosen by.
+    /// Samples whose colour was computed, over all networks; determines the size of the next batch.
     pub samples: usize,
 }
 
@@ -92,19 +92,19 @@ pub(crate) struct Scratch {
     workers: Vec<Worker>,
     /// Gradients of the tables, zero between steps.
     tables: Vec<Vec<f32>>,
-    /// The rays that [`train_views`] draws.
+    /// The batch of [`train_views`].
     batch: RayBatch,
 }
 
-/// One in so many empty cells is looked at.
-const LOOK_ONE_IN: u32 = 16;
-/// The fewest and the most rays of a batch.
+/// One in this many empty cells is updated.
+const EMPTY_ONE_IN: u32 = 16;
+/// Bounds of the number of rays in a batch.
 const RAYS: [usize; 2] = [64, 16_384];
-/// One in so many rays goes through a pixel of known depth where that counts.
+/// One in this many rays passes through a pixel of known depth if the depth loss is on.
 const KNOWN_ONE_IN: usize = 4;
 
-/// One whole step on photographs: draws [`FieldState::rays`] rays, trains on them, keeps the occupancy grid up to date and sets
-/// the number of rays for next time such that they make about `options.samples` samples.
+/// One step on photographs: samples [`FieldState::rays`] rays, trains on them, updates the occupancy grid, and sets the number of
+/// rays of the next batch to yield about `options.samples` samples.
 pub fn train_views(state: &mut FieldState, views: &[TrainView], options: &StepOptions) -> StepLoss {
     let mut batch = std::mem::take(&mut state.scratch.batch);
     let mut rng = Rng::new(options.seed, (state.step << 8) + STREAM_RAYS);
@@ -120,22 +120,22 @@ pub fn train_views(state: &mut FieldState, views: &[TrainView], options: &StepOp
     batch.draw(views, &what, &state.field.space, &mut rng);
     let loss = train_step(state, &batch, options);
     state.scratch.batch = batch;
-    if options.look && loss.rays > 0 {
-        update_occupancy(state, false, LOOK_ONE_IN, options.seed);
+    if options.update_occupancy && loss.rays > 0 {
+        update_occupancy(state, false, EMPTY_ONE_IN, options.seed);
     }
     let wanted = options.samples as f64 * loss.rays as f64 / loss.samples.max(1) as f64;
     state.rays = ((0.8 * state.rays as f64 + 0.2 * wanted) as usize).clamp(RAYS[0], RAYS[1]);
     loss
 }
 
-/// Makes one step on `batch`.
+/// Takes one step on `batch`.
 pub fn train_step(state: &mut FieldState, batch: &RayBatch, options: &StepOptions) -> StepLoss {
     descend(state, options, |level, field, step, workers| {
         gradients(level, field, batch, options, step, workers)
     })
 }
 
-/// One step of Adam for what `fill` leaves in the workers; it is told the number of the step. What it finds is handed on.
+/// Takes one step of Adam with the gradients that `fill` leaves in the workers, given the number of the step. Returns its loss.
 fn descend(
     state: &mut FieldState,
     options: &StepOptions,
@@ -157,7 +157,7 @@ fn descend(
     loss
 }
 
-/// Leaves every gradient in `workers`: those of networks, codes and background in the first one, the tables' with their points.
+/// Computes all gradients: those of networks, codes and background end up in the first worker, the tables' stay with their points.
 fn gradients(
     level: Level,
     field: &Field,
@@ -166,12 +166,12 @@ fn gradients(
     step: u64,
     workers: &mut [Worker],
 ) -> StepLoss {
-    let turned = field.turned();
+    let transposed = field.transposed();
     let known = batch.depths.iter().filter(|depth| **depth > 0.0).count();
     let task = Task {
         level,
         field,
-        turned: &turned,
+        transposed: &transposed,
         batch,
         options,
         depth: options.depth / known.max(1) as f32,
@@ -192,7 +192,7 @@ fn gradients(
     }
 }
 
-/// Adds the workers' sums to the first one's, in their order; their losses.
+/// Adds the workers' sums to the first one's, in order; returns the sum of their losses.
 fn add_up(workers: &mut [Worker]) -> StepLoss {
     let (first, others) = workers.split_at_mut(1);
     let (sum, mut loss) = (&mut first[0], StepLoss::default());

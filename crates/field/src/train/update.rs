@@ -1,4 +1,4 @@
-//! The end of a step: the tables' gradients are scattered, and Adam moves everything.
+//! The end of a step: scatters the tables' gradients and applies Adam.
 
 use super::{Scratch, StepOptions};
 use crate::encoding::PositionEncoding;
@@ -10,7 +10,7 @@ use irradia_compute::adam::AdamStep;
 use irradia_compute::simd::{Kernel, Lanes, Simd};
 use rayon::prelude::*;
 
-/// Scatters the tables' gradients and makes Adam's step on everything.
+/// Scatters the tables' gradients and takes a step of Adam on all parameters.
 pub(super) fn update(
     level: Level,
     state: &mut FieldState,

@@ -1,4 +1,4 @@
-//! What one group of a batch's rays goes through: forward, losses, and the way back.
+//! Forward pass, losses and backward pass of one group of a batch's rays.
 
 use super::{StepLoss, StepOptions};
 use crate::background::background_vjp;
@@ -18,55 +18,55 @@ use irradia_scene::Rng;
 #[derive(Clone, Debug, Default)]
 pub(super) struct Worker {
     passes: Vec<Pass>,
-    /// Points that lie on no ray.
+    /// Points that do not lie on rays.
     pub(super) block: Block<f32>,
     pub grads: Vec<NetParameters<f32>>,
     pub codes: Vec<f32>,
     pub background: Vec<f32>,
-    /// For each network the points and the gradients of their encodings, panel after panel.
+    /// For each network the points and the gradients of their encodings, panel by panel.
     pub stored: Vec<[Vec<f32>; 2]>,
     v_weights: Vec<f32>,
-    v_thickness: Vec<f32>,
+    v_optical_depth: Vec<f32>,
     pub loss: StepLoss,
 }
 
-/// What [`Worker::rays`] needs of the outside.
+/// Shared inputs of [`Worker::rays`].
 pub(super) struct Task<'a> {
     pub level: Level,
     pub field: &'a Field,
-    pub turned: &'a [NetParameters<f32>],
+    pub transposed: &'a [NetParameters<f32>],
     pub batch: &'a RayBatch,
     pub options: &'a StepOptions,
     /// Weight of one ray's squared error of distance in the sum over all.
     pub depth: f32,
 }
 
-/// How well a ray's colour is met.
+/// The colour error of a ray.
 struct Score {
     /// Mean squared error.
     squares: f32,
-    /// What lay behind.
+    /// Background of the ray.
     background: [f32; 3],
     /// The gradient of the batch's mean by the colour.
     v_color: [f32; 3],
 }
 
 impl Task<'_> {
-    /// Compares ray `ray`, of which `color` is met and `behind` gets through; adds to the gradient of the learnt background.
-    fn score(&self, ray: usize, color: [f32; 3], behind: f32, v_background: &mut [f32]) -> Score {
+    /// Compares ray `ray`, composited to `color` with `transmittance`, to its target; adds to the gradient of the learnt background.
+    fn score(&self, ray: usize, color: [f32; 3], transmittance: f32, v_background: &mut [f32]) -> Score {
         let batch = self.batch;
-        let share = 1.0 / batch.rays.len() as f32;
+        let ray_weight = 1.0 / batch.rays.len() as f32;
         let view = batch.rays[ray].view;
         let learnt = if batch.opaque[ray] {
-            self.field.behind(view)
+            self.field.background_toward(view)
         } else {
             None
         };
         let background = learnt.unwrap_or(batch.backgrounds[ray]);
-        let error: [f32; 3] = std::array::from_fn(|c| color[c] + behind * background[c] - batch.targets[ray][c]);
-        let v_color = error.map(|e| 2.0 / 3.0 * e * share);
+        let error: [f32; 3] = std::array::from_fn(|c| color[c] + transmittance * background[c] - batch.targets[ray][c]);
+        let v_color = error.map(|e| 2.0 / 3.0 * e * ray_weight);
         if learnt.is_some() {
-            background_vjp(background, view, v_color.map(|v| v * behind), v_background);
+            background_vjp(background, view, v_color.map(|v| v * transmittance), v_background);
         }
         Score {
             squares: error.iter().map(|e| e * e / 3.0).sum(),
@@ -77,7 +77,7 @@ impl Task<'_> {
 }
 
 impl Worker {
-    /// All sums zero.
+    /// Resets all sums to zero.
     pub fn clear(&mut self, field: &Field) {
         self.loss = StepLoss::default();
         self.stored.resize_with(field.nets.len(), Default::default);
@@ -105,14 +105,14 @@ impl Worker {
             let images = &task.batch.images[range.clone()];
             let taken = trace(task.level, field, rays, images, Some(rng), &mut self.passes);
             for net in 0..field.nets.len() {
-                self.back(task, net, range.start..range.start + taken);
+                self.backward(task, net, range.start..range.start + taken);
             }
             range.start += taken;
         }
     }
 
-    /// Losses of one network's pass over the rays `range`, and the way back through it.
-    fn back(&mut self, task: &Task, net: usize, range: std::ops::Range<usize>) {
+    /// Losses of one network's pass over the rays `range`, and its backward pass.
+    fn backward(&mut self, task: &Task, net: usize, range: std::ops::Range<usize>) {
         let (field, batch) = (task.field, task.batch);
         let last = net + 1 == field.nets.len();
         let with_color = field.nets[net].shape.color.is_some();
@@ -125,13 +125,13 @@ impl Worker {
             }
             return;
         }
-        let share = 1.0 / batch.rays.len() as f32;
+        let ray_weight = 1.0 / batch.rays.len() as f32;
         self.v_weights.clear();
         self.v_weights.resize(n, 0.0);
         let v_weights = &mut self.v_weights;
         let padded = pass.block.panels() * crate::mlp::PANEL;
-        self.v_thickness.clear();
-        self.v_thickness.resize(padded, 0.0);
+        self.v_optical_depth.clear();
+        self.v_optical_depth.resize(padded, 0.0);
         pass.block.v_rgb.clear();
         pass.block.v_rgb.resize(3 * padded, 0.0);
         for (r, ray) in range.clone().enumerate() {
@@ -141,7 +141,7 @@ impl Worker {
                     squares,
                     background,
                     v_color,
-                } = task.score(ray, pass.composite(r).0, pass.behind[r], &mut self.background);
+                } = task.score(ray, pass.composite(r).0, pass.transmittance[r], &mut self.background);
                 for i in samples.clone() {
                     let rgb = get3(&pass.block.rgb, i);
                     v_weights[i] = (0..3).map(|c| v_color[c] * (rgb[c] - background[c])).sum();
@@ -149,13 +149,13 @@ impl Worker {
                 }
                 let known = batch.depths.get(ray).copied().unwrap_or(0.0);
                 if known > 0.0 && task.depth > 0.0 {
-                    // As far as the ray ends in the field: what gets through is left out of the mean.
+                    // The mean over the weights, without the transmitted part of the ray.
                     let beyond = |i: usize| field.space.spread(pass.middles[i]) - field.space.spread(known);
                     let error: f32 = samples.clone().map(|i| pass.weights[i] * beyond(i)).sum();
                     for i in samples.clone() {
                         v_weights[i] += 2.0 * task.depth * error * beyond(i);
                     }
-                    self.loss.total += f64::from(task.depth * error * error / share);
+                    self.loss.total += f64::from(task.depth * error * error / ray_weight);
                 }
                 self.loss.color += if last { f64::from(squares) } else { 0.0 };
                 self.loss.total += f64::from(squares);
@@ -166,20 +166,20 @@ impl Worker {
             let count_of = |net: usize| rounds.get(net).map_or(*count, |(_, n)| *n);
             let edges = &pass.edges[r * (count_of(net) + 1)..][..samples.len() + 1];
             if last && task.options.distortion > 0.0 {
-                let scale = task.options.distortion * share;
+                let scale = task.options.distortion * ray_weight;
                 let v = &mut v_weights[samples.clone()];
                 let loss = distortion(edges, &pass.weights[samples.clone()], scale, v);
-                self.loss.total += f64::from(loss / share);
+                self.loss.total += f64::from(loss / ray_weight);
             }
             if let (false, Some(fine)) = (last, later.last()) {
                 let of = fine.of(r);
                 let stride = count_of(field.nets.len() - 1) + 1;
                 let fine_edges = &fine.edges[r * stride..][..of.len() + 1];
-                let scale = task.options.interlevel * share;
+                let scale = task.options.interlevel * ray_weight;
                 let v = &mut v_weights[samples.clone()];
                 let bound = &pass.weights[samples.clone()];
                 let loss = interlevel(fine_edges, &fine.weights[of], edges, bound, scale, v);
-                self.loss.total += f64::from(loss / share);
+                self.loss.total += f64::from(loss / ray_weight);
             }
         }
         if with_color {
@@ -189,18 +189,18 @@ impl Worker {
             let samples = pass.of(r);
             let (through, weights) = (&pass.through[samples.clone()], &pass.weights[samples.clone()]);
             let counted = samples.len();
-            let v = &mut self.v_thickness[samples.clone()];
+            let v = &mut self.v_optical_depth[samples.clone()];
             weights_vjp(through, weights, &v_weights[samples], counted, v);
         }
         pass.block.v_density.resize(padded, 0.0);
         let lengths = pass.lengths.iter().chain(std::iter::repeat(&0.0));
-        let thickness = self.v_thickness.iter().zip(lengths);
-        for (to, (v, length)) in pass.block.v_density.iter_mut().zip(thickness) {
+        let optical_depths = self.v_optical_depth.iter().zip(lengths);
+        for (to, (v, length)) in pass.block.v_density.iter_mut().zip(optical_depths) {
             *to = v * length;
         }
         task.level.run(Backward {
             net: &field.nets[net],
-            turned: &task.turned[net],
+            transposed: &task.transposed[net],
             block: &mut pass.block,
             grads: &mut self.grads[net],
             with_color,
@@ -222,7 +222,7 @@ impl Worker {
         }
     }
 
-    /// The loss of rays that meet nothing.
+    /// The loss of rays without samples.
     fn score_empty(&mut self, task: &Task, range: std::ops::Range<usize>, last: bool) {
         for ray in range {
             let squares = task.score(ray, [0.0; 3], 1.0, &mut self.background).squares;
@@ -234,7 +234,7 @@ impl Worker {
 
 pub(super) struct Backward<'a> {
     pub net: &'a Net,
-    pub turned: &'a NetParameters<f32>,
+    pub transposed: &'a NetParameters<f32>,
     pub block: &'a mut Block<f32>,
     pub grads: &'a mut NetParameters<f32>,
     pub with_color: bool,
@@ -249,6 +249,6 @@ impl Kernel for Backward<'_> {
         S::F: Lanes<Scalar = f32>,
     {
         self.net
-            .backward(simd, self.turned, self.block, self.grads, self.with_color);
+            .backward(simd, self.transposed, self.block, self.grads, self.with_color);
     }
 }

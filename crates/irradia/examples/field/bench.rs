@@ -103,7 +103,7 @@ impl Kernel for Through {
         let mlp = Mlp::new(self.shape);
         let mut rng = Rng::new(1, 2);
         let parameters = mlp.init(&mut rng);
-        let turned = mlp.transposed(&parameters);
+        let transposed = mlp.transposed(&parameters);
         let panels = 16;
         let mut x = Rows::default();
         x.resize(panels * mlp.inputs() * PANEL, 0.0);
@@ -126,7 +126,7 @@ impl Kernel for Through {
                 let v = tape.output_gradient();
                 v.resize(out.len(), 0.0);
                 v.copy_from_slice(&out);
-                mlp.backward(simd, &turned, &x, &mut tape, &mut grads, Some(&mut v_x));
+                mlp.backward(simd, &transposed, &x, &mut tape, &mut grads, Some(&mut v_x));
             }
             backward = backward.min(began.elapsed().as_secs_f64() / f64::from(repeats));
         }

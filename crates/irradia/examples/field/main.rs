@@ -139,7 +139,7 @@ fn train(args: &[String]) -> Result<()> {
         let options = StepOptions {
             net_rate: base.net_rate * decay,
             table_rate: base.table_rate * decay,
-            look: looks.next() == Some(16),
+            update_occupancy: looks.next() == Some(16),
             ..base
         };
         let loss = train_views(&mut state, &views, &options);
@@ -147,7 +147,7 @@ fn train(args: &[String]) -> Result<()> {
         spent += began.elapsed().as_secs_f64();
         if spent >= next {
             next += seconds / 12.0;
-            let share = state.field.occupancy.as_ref().map_or(1.0, |g| g.share());
+            let share = state.field.occupancy.as_ref().map_or(1.0, |g| g.occupied_fraction());
             println!(
                 "{spent:6.1} s CPU, step {:5}: loss {:.2} dB, {:.2} dB held out, {} rays, {:.1} samples a ray, {:.2} % occupied",
                 state.step,

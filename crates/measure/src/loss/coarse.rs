@@ -1,4 +1,4 @@
-//! The squared error of images brought to low frequency, for the coarse phase of a curriculum.
+//! The squared error of low-pass filtered images, for the coarse phase of a curriculum.
 //!
 //! Render x and truth y are averaged over cells of `factor x factor` pixels (those at the far border may be smaller),
 //! weighted by the mask m in \[0, 1\]. With M the sum of m over a cell and D that of `m (x - y)`,
@@ -7,8 +7,8 @@
 //! loss = sum over cells and channels of M (D / M)^2 / (3 sum of M)        d loss / d x = 2 m D / (M 3 sum of M)
 //! ```
 //!
-//! so that cells count by what they cover, and without a mask it is the mean squared error of the two small images. The
-//! gradient is that of the small image spread back evenly.
+//! so that cells are weighted by the mask they cover; without a mask it is the mean squared error of the two downscaled images.
+//! The gradient is that of the downscaled image, distributed evenly over each cell.
 
 use super::Target;
 use super::job::{Gains, Job};
@@ -17,7 +17,7 @@ use irradia_compute::simd::{Kernel, Lanes, Level, Scalar, Simd};
 use rayon::prelude::*;
 use std::sync::Mutex;
 
-/// Computes the loss and its gradient; keeps its working memory.
+/// Computes the loss and its gradient; reuses its working memory.
 pub struct CoarseLoss {
     level: Level,
     memory: Memory<f32>,
@@ -30,7 +30,7 @@ impl Default for CoarseLoss {
 }
 
 impl CoarseLoss {
-    /// With the instructions of `level`.
+    /// Runs at SIMD `level`.
     pub fn with_level(level: Level) -> Self {
         Self {
             level,
@@ -42,7 +42,7 @@ impl CoarseLoss {
     /// gradient is added to `v_render`, of the same shape. A factor of 1 is the mean squared error.
     ///
     /// # Panics
-    /// When a length does not match the target's size, or `factor` is 0: that is a bug of the caller.
+    /// When a length does not match the target's size, or `factor` is 0: a bug in the caller.
     pub fn evaluate(
         &mut self,
         render: &[f32],
@@ -80,7 +80,7 @@ impl<T: Scalar> Default for Memory<T> {
 struct Cells<'a, T> {
     job: Job<'a, T>,
     factor: usize,
-    /// Of the gradient: `2 weight / (3 sum of M)`.
+    /// Factor of the gradient: `2 weight / (3 sum of M)`.
     gain: f64,
 }
 
@@ -94,7 +94,7 @@ impl<T: Scalar> Memory<T> {
         v_render: &mut [T],
         run: impl Fn(&Cells<T>, &mut Rows<T>, &mut [T]) -> f64 + Sync,
     ) -> f64 {
-        assert!(factor > 0, "cells have pixels");
+        assert!(factor > 0, "the factor is positive");
         target.assert_lengths(render.len(), v_render.len());
         let (width, height) = (target.width, target.height);
         let (pixels, stride) = (width * height, render.len() / 3);
@@ -155,7 +155,7 @@ impl Kernel for CellsKernel<'_, '_> {
     }
 }
 
-/// x, y, m, and by column D, M and the gradient.
+/// Rows of x, y, m, and per column D, M and the gradient.
 const ROWS: usize = 6;
 
 /// Adds the gradient of a row of cells to `v_rows` and returns the sum of `D^2 / M`.
@@ -173,7 +173,7 @@ fn row_of_cells<S: Simd>(
     for row in cells.job.rows.clone() {
         cells.job.load_row(simd, row, [&mut *x, &mut *y, &mut *m]);
         for at in (0..x.len()).step_by(S::LANES) {
-            // x is y + m (x - y) already.
+            // x has already been replaced by y + m (x - y).
             let d = simd.load(&differences[at..]) + (simd.load(&x[at..]) - simd.load(&y[at..]));
             d.store(&mut differences[at..]);
             (simd.load(&weights[at..]) + simd.load(&m[at..])).store(&mut weights[at..]);
@@ -187,7 +187,7 @@ fn row_of_cells<S: Simd>(
             d += differences[column].to_f64();
             m += weights[column].to_f64();
         }
-        // A cell without weight has no difference either.
+        // In a cell of weight 0 the difference is 0, too.
         let mean = if m > 0.0 { d / m } else { 0.0 };
         sum += d * mean;
         gains[columns].fill(Scalar::from_f64(cells.gain * mean));
@@ -234,7 +234,7 @@ mod tests {
     const SIZES: [(usize, usize); 4] = [(1, 1), (23, 17), (16, 9), (7, 30)];
 
     #[test]
-    fn it_is_the_squared_error_of_small_images() {
+    fn the_loss_is_the_squared_error_of_downscaled_images() {
         for (width, height) in SIZES {
             for factor in [1, 2, 3, 8, 100] {
                 let picture = Picture::random(width, height, false, 3);
@@ -261,20 +261,20 @@ mod tests {
     }
 
     #[test]
-    fn finite_differences_hold_the_gradient() {
+    fn gradients_match_finite_differences() {
         for (width, height) in SIZES {
             for (factor, masked) in [(1, false), (2, true), (4, false), (5, true), (64, true)] {
                 let picture = Picture::random(width, height, masked, 11);
                 let (_, v) = in_double(&picture, &picture.render, factor);
-                // Quadratic: central differences are exact but for rounding.
+                // Quadratic: central differences are exact up to rounding.
                 let value = |render: &[f64]| in_double(&picture, render, factor).0;
-                Differences::of_largest(1e-4, 1e-7).hold("coarse", &picture.render, &v, some_of(v.len()), value);
+                Differences::of_largest(1e-4, 1e-7).check("coarse", &picture.render, &v, some_of(v.len()), value);
             }
         }
     }
 
     #[test]
-    fn every_instruction_set_agrees_adds_and_ignores_what_is_masked() {
+    fn every_level_agrees_accumulates_and_ignores_masked_pixels() {
         for level in Level::all() {
             let mut loss = CoarseLoss::with_level(level);
             for (masked, factor) in [(false, 4), (true, 3), (true, 1)] {
@@ -309,7 +309,7 @@ mod tests {
     }
 
     #[test]
-    fn cells_of_one_pixel_are_the_photometric_squared_error_and_bytes_are_colours() {
+    fn cells_of_one_pixel_match_the_photometric_squared_error() {
         let picture = Picture::random(20, 14, false, 8);
         let bytes: Vec<u8> = picture.image(&picture.truth).to_u8();
         let render: Vec<f32> = picture.render.iter().map(|v| *v as f32).collect();

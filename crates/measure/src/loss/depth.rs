@@ -1,5 +1,5 @@
-//! L1 between rendered depth and the depth of sparse points (L_depth of CurriculumGS; the points are those of structure
-//! from motion that the view sees).
+//! L1 between rendered depth and the depth of sparse points (L_depth of CurriculumGS), namely the structure-from-motion points
+//! visible in the view.
 //!
 //! Symbols, for each sample: D rendered expected depth, accumulated depth A over alpha; z the point's depth; w its weight.
 //!
@@ -8,11 +8,10 @@
 //! relative:  loss = sum w |a z + b - D| / sum w D,   (a, b) = argmin sum w (a z + b - D)^2,  a >= 0
 //! ```
 //!
-//! Either is free of the scene's unit, so one weight serves every scene. In the relative kind it is the *given* depth that is
-//! brought to the render: its spread does not change while training, so the fit is well conditioned and the residual linear
-//! in D, and dividing by the mean of D takes away what shrinking the scene would gain. The gradient goes through the fit and
-//! through that mean: it is that of the formula as it stands. A fit that would turn the depth round (a < 0) is
-//! replaced by a = 0.
+//! Both are independent of the scene's unit, so one weight suits every scene. The relative kind fits the *given* depth to the
+//! render: its spread does not change during training, so the fit is well conditioned and the residual linear in D; dividing
+//! by the mean of D removes the gain from shrinking the scene. The gradient includes the fit and that mean. A fit that would
+//! invert the depth (a < 0) is replaced by a = 0.
 
 use irradia_compute::simd::Scalar;
 
@@ -21,39 +20,39 @@ use irradia_compute::simd::Scalar;
 pub struct DepthSample {
     /// `y * width + x`.
     pub pixel: u32,
-    /// Along +Z of the camera, in world units where depth is metric. Not counted unless positive and finite.
+    /// Depth along the camera's +Z, in world units if metric. Ignored unless positive and finite.
     pub depth: f32,
-    /// How much it counts. Not counted unless positive and finite.
+    /// Weight. Ignored unless positive and finite.
     pub weight: f32,
 }
 
-/// What the given depths mean.
+/// Meaning of the given depths.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum DepthKind {
     /// World units.
     #[default]
     Metric,
-    /// Known up to scale and shift, as a network guesses it.
+    /// Known up to scale and shift, such as a network's estimate.
     Relative,
 }
 
-/// What the loss was.
+/// The value of the loss.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct DepthValues {
-    /// Before its weight; 0 where nothing counted.
+    /// The unweighted loss; 0 if no sample counted.
     pub loss: f64,
-    /// Samples that counted.
+    /// Number of samples that counted.
     pub samples: usize,
-    /// What the given depths were multiplied by.
+    /// Scale applied to the given depths.
     pub scale: f64,
-    /// What was then added to them.
+    /// Shift then added to them.
     pub shift: f64,
 }
 
-/// Computes the loss and its gradient; keeps its working memory.
+/// Computes the loss and its gradient; reuses its working memory.
 #[derive(Clone, Debug)]
 pub struct DepthLoss {
-    /// Pixels less opaque than this do not count: their depth is that of whatever little there is. 0.5 by default.
+    /// Pixels less opaque than this do not count, since their depth is unreliable. 0.5 by default.
     pub min_alpha: f32,
     counted: Vec<Counted>,
 }
@@ -82,7 +81,7 @@ impl DepthLoss {
     /// `v_alpha`, of the same shape. Samples beyond the image do not count.
     ///
     /// # Panics
-    /// When the lengths differ: that is a bug of the caller.
+    /// When the lengths differ: a bug in the caller.
     pub fn evaluate(
         &mut self,
         depth: &[f32],
@@ -96,7 +95,7 @@ impl DepthLoss {
         self.run(depth, alpha, samples, kind, f64::from(weight), v_depth, v_alpha)
     }
 
-    // One thread: a view has some thousand samples, which take microseconds.
+    // Single-threaded: a view has some thousand samples, which take microseconds.
     fn run<T: Scalar>(
         &mut self,
         depth: &[T],
@@ -110,12 +109,12 @@ impl DepthLoss {
         for length in [alpha.len(), v_depth.len(), v_alpha.len()] {
             assert_eq!(length, depth.len(), "depth, alpha and their gradients are [H, W]");
         }
-        self.take_in(depth, alpha, samples);
+        self.collect(depth, alpha, samples);
         let (fit, norm) = match kind {
             DepthKind::Metric => (Fit::NONE, self.sum(|s| s.weight * s.given)),
             DepthKind::Relative => (Fit::of(&self.counted), self.sum(|s| s.weight * s.rendered)),
         };
-        // Also false where it is NaN; nothing counted leaves 0.
+        // Also false for NaN; without samples the loss stays 0.
         let sound = norm > 0.0 && norm.is_finite();
         if !sound {
             return DepthValues {
@@ -148,7 +147,7 @@ impl DepthLoss {
         }
     }
 
-    fn take_in<T: Scalar>(&mut self, depth: &[T], alpha: &[T], samples: &[DepthSample]) {
+    fn collect<T: Scalar>(&mut self, depth: &[T], alpha: &[T], samples: &[DepthSample]) {
         self.counted.clear();
         let good = |value: f32| value > 0.0 && value.is_finite();
         for sample in samples.iter().filter(|s| good(s.depth) && good(s.weight)) {
@@ -177,12 +176,12 @@ fn sign(x: f64) -> f64 {
     if x == 0.0 { 0.0 } else { x.signum() }
 }
 
-/// How given depths are brought to the render: `scale z + shift`.
+/// The fit of given depths to the render: `scale z + shift`.
 struct Fit {
     scale: f64,
     shift: f64,
     mean_given: f64,
-    /// Of z; 0 where the scale does not depend on the render.
+    /// Variance term of z; 0 if the scale does not depend on the render.
     inverse_variance: f64,
     /// Sum of w.
     weight: f64,
@@ -204,7 +203,7 @@ impl Fit {
         let (mean_given, mean_rendered) = (sum(&|s| s.given) / weight, sum(&|s| s.rendered) / weight);
         let variance = sum(&|s| (s.given - mean_given).powi(2)) / weight;
         let covariance = sum(&|s| (s.given - mean_given) * (s.rendered - mean_rendered)) / weight;
-        // A spread that is only rounding fits nothing.
+        // A spread that is only rounding error determines no scale.
         let fits = covariance > 0.0 && variance > 1e-12 * mean_given * mean_given;
         let scale = if fits { covariance / variance } else { 0.0 };
         Self {
@@ -259,23 +258,23 @@ mod tests {
     }
 
     #[test]
-    fn finite_differences_hold_both_gradients_of_both_kinds() {
+    fn gradients_of_both_kinds_match_finite_differences() {
         for seed in 0..4 {
             for kind in [DepthKind::Metric, DepthKind::Relative] {
                 let (depth, alpha, mut samples) = random(seed);
                 if seed == 3 {
-                    // Turned round: the fit is held at a = 0.
+                    // Inverted depth: the fit is clamped to a = 0.
                     samples.iter_mut().for_each(|s| s.depth = 10.0 - s.depth);
                 }
                 let (values, [v_depth, v_alpha]) = value(&depth, &alpha, &samples, kind);
                 assert!(values.samples > 10 && values.loss > 0.0);
                 assert_eq!(values.scale == 0.0, seed == 3 && kind == DepthKind::Relative);
-                // No residual of these seeds lies within a step of its kink, no alpha within one of the threshold.
+                // For these seeds no residual lies within a step of its kink, and no alpha within a step of the threshold.
                 let differences = Differences::of_largest(1e-6, 1e-6);
                 let by_depth = |d: &[f64]| value(d, &alpha, &samples, kind).0.loss;
-                differences.hold("depth", &depth, &v_depth, some_of(depth.len()), by_depth);
+                differences.check("depth", &depth, &v_depth, some_of(depth.len()), by_depth);
                 let by_alpha = |a: &[f64]| value(&depth, a, &samples, kind).0.loss;
-                differences.hold("alpha", &alpha, &v_alpha, some_of(alpha.len()), by_alpha);
+                differences.check("alpha", &alpha, &v_alpha, some_of(alpha.len()), by_alpha);
             }
         }
     }
@@ -289,7 +288,7 @@ mod tests {
     }
 
     #[test]
-    fn half_a_unit_off_at_depth_two_is_a_quarter() {
+    fn an_error_of_half_a_unit_at_depth_two_costs_a_quarter() {
         let samples = [sample(0, 2.0), sample(1, 2.0)];
         let (values, [v_depth, v_alpha]) = value(&[2.5, 0.75], &[1.0, 0.5], &samples, DepthKind::Metric);
         assert_eq!((values.loss, values.samples), (0.25, 2));
@@ -299,7 +298,7 @@ mod tests {
     }
 
     #[test]
-    fn relative_depth_needs_neither_scale_nor_shift_nor_the_scenes_unit() {
+    fn relative_depth_is_invariant_to_scale_shift_and_scene_unit() {
         let (depth, alpha, samples) = random(5);
         let (first, _) = value(&depth, &alpha, &samples, DepthKind::Relative);
         let larger: Vec<f64> = depth.iter().map(|d| 7.0 * d).collect();
@@ -311,7 +310,7 @@ mod tests {
             })
             .collect();
         let (second, _) = value(&larger, &alpha, &other, DepthKind::Relative);
-        // The samples are single precision.
+        // The samples are in single precision.
         assert!((first.loss - second.loss).abs() < 1e-6, "{first:?} {second:?}");
         assert!(
             (second.scale - first.scale * 7.0 / 4.0).abs() < 1e-5,
@@ -323,7 +322,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_judged_does_not_count() {
+    fn invalid_samples_are_ignored() {
         let poison = [
             sample(9, 1.0),
             sample(u32::MAX, 1.0),
@@ -338,11 +337,11 @@ mod tests {
             },
         ];
         for kind in [DepthKind::Metric, DepthKind::Relative] {
-            // Pixel 1 is nearly empty, pixel 2 holds no number.
+            // Pixel 1 is nearly transparent, pixel 2 is NaN.
             let (values, v) = value(&[1.0, 0.1, f64::NAN], &[1.0, 0.1, 1.0], &poison, kind);
             assert_eq!((values.loss, values.samples), (0.0, 0));
             assert!(v.iter().flatten().all(|v| *v == 0.0));
-            // One sample, or equal ones, cannot be fitted: only the shift remains, and nothing is left.
+            // One sample, or equal ones, determine no scale: the shift alone fits them exactly.
             let (values, v) = value(&[1.0, 0.1, 1.5], &[1.0; 3], &[sample(0, 3.0)], kind);
             assert_eq!(values.loss == 0.0, kind == DepthKind::Relative);
             assert!(v.iter().flatten().all(|v| v.is_finite()));
@@ -350,7 +349,7 @@ mod tests {
     }
 
     #[test]
-    fn single_precision_adds_its_weighted_gradient() {
+    fn weighted_gradients_accumulate_in_single_precision() {
         let (depth, alpha, samples) = random(6);
         let (want, [v_want, _]) = value(&depth, &alpha, &samples, DepthKind::Relative);
         let single = |v: &[f64]| v.iter().map(|v| *v as f32).collect::<Vec<f32>>();

@@ -1,25 +1,25 @@
-//! One band's share of the work: what is read, and where its rows come from.
+//! The inputs of one band, and how its rows are loaded.
 
 use super::{LossWeights, Truth};
 use irradia_compute::simd::{Lanes, Scalar, Simd};
 use std::ops::Range;
 
-/// Rows in a band of an image of `height` rows: about 128, for the windows' reach makes each band compute ten rows more
-/// than it has, and as equal as may be.
-pub(super) fn rows_a_band(height: usize) -> usize {
+/// Rows per band of an image of `height` rows: about 128, since each band computes ten extra rows for the windows, and as equal
+/// as possible.
+pub(super) fn rows_per_band(height: usize) -> usize {
     height.div_ceil(height.div_ceil(128))
 }
 
 /// Rows of one channel.
 pub(super) struct Job<'a, T> {
-    /// This channel, `[H, W]`.
+    /// The render's channel, `[H, W]`.
     pub(super) render: &'a [T],
     /// All channels.
     pub(super) truth: Truth<'a, T>,
     pub(super) channel: usize,
     /// `[H, W]`.
     pub(super) mask: Option<&'a [u8]>,
-    /// The 256 values that 8 bits stand for.
+    /// The colour of each of the 256 8-bit values.
     pub(super) shades: &'a [T; 256],
     pub(super) width: usize,
     pub(super) height: usize,
@@ -27,7 +27,7 @@ pub(super) struct Job<'a, T> {
     pub(super) gains: Gains,
 }
 
-/// What the gradient of each part is multiplied by: its weight over the number of values, and its sign.
+/// Factors of the gradient of each part: its weight over the number of values, with its sign.
 #[derive(Clone, Copy)]
 pub(super) struct Gains {
     pub(super) l1: f64,
@@ -36,7 +36,7 @@ pub(super) struct Gains {
 }
 
 impl Gains {
-    /// For losses that have their own.
+    /// For losses that scale their own gradients.
     pub(super) const NONE: Self = Self {
         l1: 0.0,
         ssim: 0.0,
@@ -72,8 +72,8 @@ impl Sums {
 }
 
 impl<T: Scalar> Job<'_, T> {
-    /// Row `row` of the image: render, truth and weights into `[x, y, m]`, each at least `width` long; what lies past
-    /// `width` stays as it is.
+    /// Loads row `row` of render, truth and weights into `[x, y, m]`, each at least `width` long; values past `width` are not
+    /// written.
     #[inline(always)]
     pub(super) fn load_row<S: Simd>(&self, simd: S, row: usize, [x, y, m]: [&mut [T]; 3])
     where
@@ -102,9 +102,9 @@ impl<T: Scalar> Job<'_, T> {
         }
         for at in (0..x.len()).step_by(S::LANES) {
             let (weight, truth) = (simd.load(&m[at..]), simd.load(&y[at..]));
-            // Selected and not only multiplied: a render that is not finite must not come through a weight of 0.
+            // Selected, not just multiplied: a non-finite render must not pass through a weight of 0.
             let counted = simd.splat(0.0).lt(weight);
-            let difference = ((simd.load(&x[at..]) - truth) * weight).zero_where_not(counted);
+            let difference = ((simd.load(&x[at..]) - truth) * weight).masked(counted);
             (truth + difference).store(&mut x[at..]);
         }
     }

@@ -1,13 +1,13 @@
-//! The losses with their gradients. Here the photometric one: L1, D-SSIM and squared error, fused, one pass over the image.
-//! It overwrites the gradient; all others ([`coarse`], [`depth`], [`perceptual`], [`smooth`]) add to what is there, and
-//! their share is multiplied by a weight on the way, so that a sum of losses needs no further pass.
+//! Losses with their gradients. This module has the photometric loss: L1, D-SSIM and squared error, fused into one pass over
+//! the image. It overwrites the gradient; all others ([`coarse`], [`depth`], [`perceptual`], [`smooth`]) add their weighted
+//! gradient to it, so that a sum of losses needs no further pass.
 //!
 //! `total = l1 L1 + ssim (1 - SSIM) + mse MSE`, each a mean over the H W 3 values. With a mask m in \[0, 1\] the render x is
-//! first replaced by `y + m (x - y)`, y being the truth, so that a pixel of weight 0 differs in nothing and has no
+//! first replaced by `y + m (x - y)`, y being the truth, so that a pixel of weight 0 has neither loss nor
 //! gradient; means are then weighted by m. SSIM is that of [`crate::ssim`].
 //!
-//! The image is cut into bands of rows of one channel, whose number depends on its height alone, and their sums are added
-//! in order: the number of threads changes no bit of the result.
+//! The image is split into bands of rows of one channel, whose number depends only on its height, and their sums are added in
+//! order: the result does not depend on the number of threads.
 
 pub mod coarse;
 pub mod depth;
@@ -23,14 +23,14 @@ use job::{Gains, Job, Sums};
 use rayon::prelude::*;
 use std::sync::Mutex;
 
-/// How much each part of the loss counts.
+/// Weights of the parts of the loss.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct LossWeights {
-    /// Of the mean absolute difference.
+    /// Weight of the mean absolute difference.
     pub l1: f32,
-    /// Of `1 - SSIM`; 0 skips its computation, which is most of the time.
+    /// Weight of `1 - SSIM`; 0 skips its computation, which takes most of the time.
     pub ssim: f32,
-    /// Of the mean squared difference.
+    /// Weight of the mean squared difference.
     pub mse: f32,
 }
 
@@ -45,14 +45,14 @@ impl LossWeights {
     }
 }
 
-/// What a loss was, each part before its weight.
+/// The value of the loss, and its unweighted parts.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct LossValues {
     /// The weighted sum.
     pub total: f64,
     /// Mean absolute difference.
     pub l1: f64,
-    /// Mean structural similarity; `None` where its weight is 0.
+    /// Mean structural similarity; `None` if its weight is 0.
     pub ssim: Option<f64>,
     /// Mean squared difference; `-10 log10` of it is the PSNR.
     pub mse: f64,
@@ -61,13 +61,13 @@ pub struct LossValues {
 /// A photograph's colours.
 #[derive(Clone, Copy, Debug)]
 pub enum Truth<'a, T = f32> {
-    /// `[H, W, 3]` in 256 steps.
+    /// `[H, W, 3]`, 8 bits.
     Rgb8(&'a [u8]),
     /// `[3, stride]` with `stride >= H * W`.
     Planar(&'a [T]),
 }
 
-/// What a render is compared with.
+/// The photograph a render is compared with.
 #[derive(Clone, Copy, Debug)]
 pub struct Target<'a, T = f32> {
     /// Columns.
@@ -76,13 +76,13 @@ pub struct Target<'a, T = f32> {
     pub height: usize,
     /// The photograph.
     pub truth: Truth<'a, T>,
-    /// Weights `[H, W]` of the pixels, 255 counting as 1; `None` is 1 everywhere.
+    /// Pixel weights `[H, W]`, with 255 for a weight of 1; `None` is 1 everywhere.
     pub mask: Option<&'a [u8]>,
 }
 
-/// Computes the loss and its gradient; keeps its working memory, so that nothing is allocated from the second call on.
+/// Computes the loss and its gradient; reuses its working memory, so that only the first call allocates.
 ///
-/// `T` is `f32`; double precision exists for the tests, through the same code.
+/// `T` is `f32`; tests run the same code in double precision.
 pub struct PhotometricLoss<T = f32> {
     level: Level,
     scratch: Mutex<Vec<ssim::Scratch<T>>>,
@@ -97,19 +97,19 @@ impl Default for PhotometricLoss {
 }
 
 impl PhotometricLoss {
-    /// With the widest instructions of this processor.
+    /// Runs at the widest SIMD level of this processor.
     pub fn new() -> Self {
         Self::with_level(Level::detect())
     }
 
-    /// The loss of `render [3, stride]`, `stride >= H * W`, with respect to which `v_render`, of the same shape, becomes the
-    /// gradient. What lies past H * W in a plane is neither read nor written.
+    /// The loss of `render [3, stride]`, `stride >= H * W`; sets `v_render`, of the same shape, to its gradient. Values past H * W
+    /// in a plane are neither read nor written.
     ///
-    /// The L1 part's gradient is 0 where both are equal. With nothing to compare (no pixels, or a mask of zeros) the loss
-    /// and the gradient are 0 and SSIM is 1.
+    /// The gradient of L1 is 0 at equal values. With nothing to compare (no pixels, or a mask of zeros) loss and gradient are 0
+    /// and SSIM is 1.
     ///
     /// # Panics
-    /// When a length does not match the target's size: that is a bug of the caller.
+    /// When a length does not match the target's size: a bug in the caller.
     pub fn evaluate(
         &mut self,
         render: &[f32],
@@ -157,7 +157,7 @@ fn band<S: Simd>(
 }
 
 impl<T: Scalar> PhotometricLoss<T> {
-    /// As [`PhotometricLoss::new`] with the instructions of `level`.
+    /// As [`PhotometricLoss::new`], at SIMD `level`.
     pub fn with_level(level: Level) -> Self {
         Self {
             level,
@@ -185,7 +185,7 @@ impl<T: Scalar> PhotometricLoss<T> {
                 .for_each(|v| v[..pixels].fill(T::default()));
             return LossValues::of(&Sums::default(), weights, 1.0);
         }
-        let rows = job::rows_a_band(height);
+        let rows = job::rows_per_band(height);
         let bands = height.div_ceil(rows);
         self.sums.resize(3 * bands, Sums::default());
         let (scratch, shades) = (&self.scratch, &self.shades);
@@ -207,7 +207,7 @@ impl<T: Scalar> PhotometricLoss<T> {
                     rows: band * rows..((band + 1) * rows).min(height),
                     gains: Gains::of(weights, count),
                 };
-                // One working memory a thread at most is ever made; the lock is held for a push or a pop.
+                // At most one scratch per thread is ever made; the lock is held only for a push or a pop.
                 let kept = scratch.lock().expect("no band panics").pop();
                 let mut mine = kept.unwrap_or_default();
                 *sums = run(&job, &mut mine, v_rows);
@@ -222,7 +222,7 @@ impl<T: Scalar> PhotometricLoss<T> {
 impl LossValues {
     fn of(sums: &Sums, weights: &LossWeights, count: f64) -> Self {
         let (l1, mse) = (sums.l1 / count, sums.mse / count);
-        // Dissimilarities are summed, for they are 0 where there is nothing to compare.
+        // Sums of `1 - SSIM`, which are 0 where there is nothing to compare.
         let dissimilarity = sums.dissimilarity / count;
         Self {
             total: f64::from(weights.l1) * l1 + f64::from(weights.ssim) * dissimilarity + f64::from(weights.mse) * mse,
@@ -256,7 +256,7 @@ impl<T> Target<'_, T> {
     fn assert_lengths(&self, render: usize, v_render: usize) {
         let pixels = self.width * self.height;
         let planar = |len: usize| len.is_multiple_of(3) && len / 3 >= pixels;
-        assert!(planar(render), "the render is [3, stride] and holds every pixel");
+        assert!(planar(render), "the render is [3, stride] and covers every pixel");
         assert_eq!(render, v_render, "the gradient has the render's shape");
         self.assert_truth();
     }
@@ -266,7 +266,7 @@ impl<T> Target<'_, T> {
         let planar = |len: usize| len.is_multiple_of(3) && len / 3 >= pixels;
         match self.truth {
             Truth::Rgb8(truth) => assert_eq!(truth.len(), 3 * pixels, "the truth is [H, W, 3]"),
-            Truth::Planar(truth) => assert!(planar(truth.len()), "the truth is [3, stride] and holds every pixel"),
+            Truth::Planar(truth) => assert!(planar(truth.len()), "the truth is [3, stride] and covers every pixel"),
         }
         if let Some(mask) = self.mask {
             assert_eq!(mask.len(), pixels, "the mask is [H, W]");

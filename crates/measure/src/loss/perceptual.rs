@@ -1,7 +1,7 @@
 //! LPIPS as a loss, on the whole image or a part of it.
 //!
-//! The network sees two images forward and one backward, which makes it by far the dearest of the losses; a random part of
-//! 128 x 128 pixels a step costs an eighth of a 270 x 480 image and has, but for the border, the same mean gradient.
+//! The network evaluates two images forward and one backward, which makes this by far the most expensive loss; a random crop of
+//! 128 x 128 pixels per step costs an eighth of a 270 x 480 image and has, except at the border, the same mean gradient.
 
 use super::Target;
 use crate::metric::{Lpips, LpipsError, Map, Network};
@@ -22,7 +22,7 @@ pub struct Crop {
 }
 
 impl Crop {
-    /// All of an image.
+    /// The whole image.
     pub fn whole(width: usize, height: usize) -> Self {
         Self {
             x: 0,
@@ -32,7 +32,7 @@ impl Crop {
         }
     }
 
-    /// A square of `side` pixels, or as much of it as there is, anywhere in an image.
+    /// A random square of `side` pixels in the image, clipped to its size.
     pub fn random(width: usize, height: usize, side: usize, rng: &mut Rng) -> Self {
         let mut place = |length: usize| {
             let part = side.min(length);
@@ -51,7 +51,7 @@ impl Crop {
 /// When a side of `crop` is below [`LpipsNet::min_side`](crate::LpipsNet::min_side).
 ///
 /// # Panics
-/// When a length does not match the target's size or `crop` leaves the image: that is a bug of the caller.
+/// When a length does not match the target's size or `crop` exceeds the image: a bug in the caller.
 pub fn perceptual(
     lpips: &Lpips,
     render: &[f32],
@@ -103,7 +103,7 @@ fn on_crop<T: Real>(
     let mut seen = truth.clone();
     for (pixel, color) in pixels().map(at).zip(seen.as_chunks_mut::<3>().0) {
         let m = mask(pixel);
-        // A render that is not finite must not come through a weight of 0.
+        // A non-finite render must not pass through a weight of 0.
         if m > T::zero() {
             for (c, value) in color.iter_mut().enumerate() {
                 *value += m * (render[c * stride + pixel] - *value);
@@ -139,7 +139,7 @@ mod tests {
     }
 
     #[test]
-    fn finite_differences_hold_along_random_directions() {
+    fn gradients_match_directional_finite_differences() {
         let Some(path) = shared(WEIGHTS) else { return };
         let network = Network::<f64>::load(&path).unwrap();
         let whole = |p: &Picture| Crop::whole(p.width, p.height);
@@ -164,7 +164,7 @@ mod tests {
     }
 
     #[test]
-    fn an_image_like_its_truth_is_at_rest_and_others_go_downhill() {
+    fn equal_images_have_no_gradient_and_descent_lowers_the_loss() {
         let Some(path) = shared(WEIGHTS) else { return };
         let lpips = Lpips::load(path).unwrap();
         let picture = Picture::random(48, 40, false, 5);
@@ -185,7 +185,7 @@ mod tests {
         let mut last = first;
         for _ in 0..5 {
             let square: f32 = v.iter().map(|v| v * v).sum();
-            // As far as would lower a straight slope by a fifth.
+            // A step that would lower a linear loss by a fifth.
             let step = 0.2 * last as f32 / square;
             render.iter_mut().zip(&v).for_each(|(x, v)| *x -= step * v);
             v.fill(0.0);
@@ -197,7 +197,7 @@ mod tests {
     }
 
     #[test]
-    fn the_loss_is_the_metric_and_its_gradient_stays_in_the_crop() {
+    fn the_loss_matches_the_metric_and_its_gradient_stays_in_the_crop() {
         let Some(path) = shared(WEIGHTS) else { return };
         let lpips = Lpips::load(path).unwrap();
         let picture = Picture::random(40, 30, false, 6);
@@ -235,7 +235,7 @@ mod tests {
     }
 
     #[test]
-    fn the_number_of_threads_changes_no_bit() {
+    fn results_do_not_depend_on_the_number_of_threads() {
         let Some(path) = shared(WEIGHTS) else { return };
         let lpips = Lpips::load(path).unwrap();
         let picture = Picture::random(70, 60, true, 7);
@@ -261,7 +261,7 @@ mod tests {
     }
 
     #[test]
-    fn a_random_crop_lies_in_the_image() {
+    fn random_crops_lie_within_the_image() {
         let mut rng = Rng::new(1, 0);
         for _ in 0..100 {
             let crop = Crop::random(70, 20, 32, &mut rng);

@@ -1,9 +1,9 @@
-//! Pictures for the tests of the losses.
+//! Test images for the losses.
 
 use super::{Target, Truth};
 use irradia_scene::{Image, Rng};
 
-/// A render, a truth and perhaps a mask, planar.
+/// A render, a truth and an optional mask, planar.
 pub(super) struct Picture {
     pub(super) width: usize,
     pub(super) height: usize,
@@ -13,8 +13,8 @@ pub(super) struct Picture {
 }
 
 impl Picture {
-    /// Smooth colours with noise; the render a little off the truth. In single precision, for both precisions to see the
-    /// same values.
+    /// Smooth colours with noise, and a render close to the truth. Values are rounded to single precision, so that both precisions
+    /// use the same ones.
     pub(super) fn random(width: usize, height: usize, masked: bool, seed: u64) -> Self {
         let mut rng = Rng::new(seed, 0);
         let pixels = width * height;

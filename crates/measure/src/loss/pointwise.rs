@@ -1,10 +1,10 @@
-//! What depends on one pixel alone: absolute and squared differences.
+//! The per-pixel parts of the loss: absolute and squared differences.
 
 use super::job::{Job, Sums};
 use super::rows::Rows;
 use irradia_compute::simd::{Lanes, Scalar, Simd};
 
-/// Running sums of absolute and squared differences, by lane.
+/// Sums of absolute and squared differences per lane.
 #[derive(Clone, Copy)]
 pub(super) struct Differences<F> {
     absolute: F,
@@ -20,15 +20,15 @@ impl<F: Lanes> Differences<F> {
         }
     }
 
-    /// Adds `x - y` and gives its gradient: `l1 sign(x - y) + mse (x - y)`.
+    /// Adds `x - y` and returns its gradient: `l1 sign(x - y) + mse (x - y)`.
     #[inline(always)]
     pub(super) fn add(&mut self, x: F, y: F, gain_l1: F, gain_mse: F) -> F {
         let zero = x.splat(0.0);
         let d = x - y;
         self.absolute += d.abs();
         self.squared = d.mul_add(d, self.squared);
-        let positive = gain_l1.zero_where_not(zero.lt(d));
-        let l1 = (-gain_l1).or_where_not(d.lt(zero), positive);
+        let positive = gain_l1.masked(zero.lt(d));
+        let l1 = (-gain_l1).select(d.lt(zero), positive);
         d.mul_add(gain_mse, l1)
     }
 

@@ -1,33 +1,33 @@
-//! Image rows laid out for vectors: zeros on either side, so that a window may reach beyond the border, and every row at
-//! the start of a cache line.
+//! Image rows laid out for SIMD: zeros on either side for windows that extend beyond the border, and every row aligned to a
+//! cache line.
 
 use irradia_compute::simd::Scalar;
 
-/// Columns a vector may have at most; every row's width is rounded up to it.
+/// Width of the widest vector; row widths are rounded up to a multiple of it.
 pub(super) const BLOCK: usize = 16;
 
-/// A number of rows of one width.
+/// Rows of equal width.
 #[derive(Default)]
 pub(super) struct Rows<T> {
     data: Vec<T>,
-    /// Where the first row starts: the first cache line of the allocation.
+    /// Start of the first row: the first cache line of the allocation.
     start: usize,
     stride: usize,
     /// Columns, rounded up.
     width: usize,
-    /// Columns asked for.
+    /// Requested columns.
     used: usize,
 }
 
 impl<T: Scalar> Rows<T> {
-    /// `rows` rows of zeros of at least `width` columns, unless they have that width already.
+    /// Reshapes to `rows` rows of zeros of at least `used` columns, unless they have that width already.
     pub(super) fn reshape(&mut self, rows: usize, used: usize) {
-        // Also where the rounded width is the same: what another width left behind this one's last column is not zero.
+        // Also if only the rounded width is equal: the padding may then hold values of the previous width.
         if self.used == used {
             return;
         }
         let width = used.next_multiple_of(BLOCK);
-        // An odd number of cache lines: rows a power of two apart would evict one another from the first-level cache.
+        // An odd number of cache lines: rows a power of two apart would evict one another from the L1 cache.
         let stride = (((width + 2 * BLOCK) / BLOCK) | 1) * BLOCK;
         self.data = vec![T::default(); rows * stride + 64];
         let aligned = self.data.as_ptr().align_offset(64);
@@ -35,7 +35,7 @@ impl<T: Scalar> Rows<T> {
         (self.stride, self.width, self.used) = (stride, width, used);
     }
 
-    /// Row `row` with [`BLOCK`] zeros before its first column and as many behind its last.
+    /// Row `row` with [`BLOCK`] zeros before its first column and after its last.
     #[inline(always)]
     pub(super) fn padded(&self, row: usize) -> &[T] {
         let from = self.start + row * self.stride;
@@ -49,7 +49,7 @@ impl<T: Scalar> Rows<T> {
         self.data[from..from + self.width].as_chunks().0
     }
 
-    /// The columns of `N` rows from `row` on, to be written.
+    /// The columns of `N` rows from `row` on, mutable.
     #[inline(always)]
     pub(super) fn columns_mut<const N: usize>(&mut self, row: usize) -> [&mut [T]; N] {
         let from = self.start + row * self.stride;

@@ -1,33 +1,33 @@
 //! Edge-aware smoothness of rendered depth (L_smooth; Godard, Mac Aodha, Brostow 2017, eq. 5).
 //!
-//! Symbols: A accumulated depth, alpha opacity; q disparity alpha / A (or depth A / alpha); I the photograph, whose change
-//! |dI| between two pixels is the mean over its channels; k how sharply an edge of the photograph permits one in depth.
+//! Symbols: A accumulated depth, alpha opacity; q disparity alpha / A (or depth A / alpha); I the photograph, whose
+//! difference |dI| between two pixels is the mean over channels; k the sensitivity to edges of the photograph.
 //!
 //! ```text
 //! loss = sum over pairs of neighbours |dq| exp(-k |dI|) / sum q
 //! ```
 //!
-//! which is the published loss over q divided by its mean, as the authors' later work has it (Godard et al. 2019, section
-//! 3.3): without that a scene could become smooth by moving away. The gradient goes through the mean. k = 0 is plain total
-//! variation. Pixels that the mask leaves out, or that are nearly empty, take no part.
+//! which is the published loss with q divided by its mean, as in the authors' later work (Godard et al. 2019, section 3.3):
+//! otherwise a scene could become smooth by moving away. The gradient includes the mean. k = 0 is total variation. Pixels that
+//! are masked or nearly transparent are excluded.
 
 use super::{Target, Truth};
 use crate::real::{Real, sum_over};
 use rayon::prelude::*;
 
-/// What is to be smooth.
+/// The quantity to smooth.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Smoothed {
-    /// One over depth: what is far, and little known, counts little.
+    /// Inverse depth: distant, poorly known surfaces count little.
     #[default]
     Disparity,
-    /// Depth itself.
+    /// Depth.
     Depth,
 }
 
-/// Computes the loss and its gradient; keeps its working memory.
+/// Computes the loss and its gradient; reuses its working memory.
 pub struct SmoothLoss {
-    /// Pixels less opaque than this take no part. 0.5 by default.
+    /// Pixels less opaque than this are excluded. 0.5 by default.
     pub min_alpha: f32,
     memory: Memory<f32>,
 }
@@ -42,12 +42,12 @@ impl Default for SmoothLoss {
 }
 
 impl SmoothLoss {
-    /// The loss of the accumulated `depth [H * W]` and `alpha [H * W]` before the photograph `target` (whose colours in
-    /// \[0, 1\] are compared, so that k of 10 lets an edge of 0.1 count 1 / e); `weight` times the gradients is added to
-    /// `v_depth` and `v_alpha`, of the same shape.
+    /// The loss of the accumulated `depth [H * W]` and `alpha [H * W]`, guided by the photograph `target` (with colours in
+    /// \[0, 1\], so that with k = 10 an edge of 0.1 has a weight of 1 / e); `weight` times the gradients is added to `v_depth`
+    /// and `v_alpha`, of the same shape.
     ///
     /// # Panics
-    /// When a length does not match the target's size: that is a bug of the caller.
+    /// When a length does not match the target's size: a bug in the caller.
     pub fn evaluate(
         &mut self,
         depth: &[f32],
@@ -78,17 +78,17 @@ struct Knobs {
 
 #[derive(Default)]
 struct Memory<T> {
-    /// q, 0 where a pixel takes no part.
+    /// q, 0 for excluded pixels.
     q: Vec<T>,
-    /// `exp(-k |dI|) sign(dq)` towards the right and downwards, 0 where either takes no part, `[2, H, W]` row by row.
+    /// `exp(-k |dI|) sign(dq)` to the right and downwards, 0 if either pixel is excluded, `[2, H, W]` row by row.
     slopes: Vec<T>,
-    /// By row.
+    /// Sums per row.
     sums: Vec<f64>,
-    /// `exp(-k |dI|)` by the sum of three channels' differences in 256 steps.
+    /// `exp(-k |dI|)`, indexed by the sum of three channels' 8-bit differences.
     edges: Vec<T>,
 }
 
-/// Three channels' largest difference in 256 steps.
+/// Largest sum of three channels' 8-bit differences.
 const LARGEST: usize = 3 * 255;
 
 impl<T: Real> Memory<T> {
@@ -168,11 +168,11 @@ impl<T: Real> Memory<T> {
             let (v_depth, v_alpha) = (&mut v_depth[..width], &mut v_alpha[..width]);
             let mut before = T::zero();
             for x in 0..width {
-                // Of a pair, the later pixel's gradient is the slope and the earlier's its negative.
+                // In each pair the gradient of the later pixel is the slope, that of the earlier its negative.
                 let above = above.map_or(T::zero(), |above| above[x]);
                 let v_q = gain * (before + above - right[x] - down[x] - by_mean);
                 before = right[x];
-                // q is the quotient of the two: its derivative by either is q over it, with a sign.
+                // q is the quotient of the two: its derivative by either is q divided by it, up to sign.
                 let (v_q, counts) = (sign * v_q * q[x], q[x] != T::zero());
                 v_depth[x] += if counts { v_q / depth[x] } else { T::zero() };
                 v_alpha[x] += if counts { -v_q / alpha[x] } else { T::zero() };
@@ -199,7 +199,7 @@ fn quantities<T: Real>(depth: &[T], alpha: &[T], mask: Option<&[u8]>, knobs: &Kn
     sum
 }
 
-/// Gives each of `weights` the sign of `b - a`, or makes it 0 where either takes no part; the sum of weighted sizes.
+/// Gives each of `weights` the sign of `b - a`, or 0 if either is excluded; returns the sum of weighted absolute differences.
 fn slopes_between<T: Real>(a: &[T], b: &[T], weights: &mut [T]) -> f64 {
     for ((a, b), weight) in a.iter().zip(b).zip(weights.iter_mut()) {
         let both = (*a != T::zero()) & (*b != T::zero());
@@ -258,7 +258,7 @@ mod tests {
     }
 
     #[test]
-    fn finite_differences_hold_both_gradients() {
+    fn gradients_match_finite_differences() {
         for (seed, (width, height)) in [(9, 7), (1, 5), (6, 1), (13, 12)].into_iter().enumerate() {
             for of in [Smoothed::Disparity, Smoothed::Depth] {
                 for (k, masked) in [(10.0, false), (0.0, true), (3.0, true)] {
@@ -266,19 +266,19 @@ mod tests {
                     let (depth, alpha) = planes(width * height, seed as u64);
                     let (target, knobs) = (picture.target(), knobs(of, k));
                     let (_, [v_depth, v_alpha]) = value(&depth, &alpha, &target, &knobs);
-                    // No two neighbours of these seeds are within a step of one another, no alpha of the threshold.
+                    // For these seeds no two neighbours are within a step of each other, and no alpha within a step of the threshold.
                     let by_depth = |depth: &[f64]| value(depth, &alpha, &target, &knobs).0;
                     let differences = Differences::of_largest(1e-7, 1e-6);
-                    differences.hold("depth", &depth, &v_depth, some_of(depth.len()), by_depth);
+                    differences.check("depth", &depth, &v_depth, some_of(depth.len()), by_depth);
                     let by_alpha = |alpha: &[f64]| value(&depth, alpha, &target, &knobs).0;
-                    differences.hold("alpha", &alpha, &v_alpha, some_of(alpha.len()), by_alpha);
+                    differences.check("alpha", &alpha, &v_alpha, some_of(alpha.len()), by_alpha);
                 }
             }
         }
     }
 
     #[test]
-    fn a_step_costs_its_height_and_an_edge_of_the_photograph_excuses_it() {
+    fn a_depth_step_costs_its_height_and_less_at_an_image_edge() {
         // Depth 1 on the left, 3 on the right of a 4 x 2 image: two pairs differ by 2; depths add up to 16.
         let depth = [1.0, 1.0, 3.0, 3.0].repeat(2);
         let alpha = vec![1.0; 8];
@@ -309,7 +309,7 @@ mod tests {
     }
 
     #[test]
-    fn the_scenes_unit_does_not_matter_and_empty_pixels_take_no_part() {
+    fn the_loss_is_scale_invariant_and_excludes_empty_pixels() {
         let picture = Picture::random(12, 9, false, 4);
         let (mut depth, mut alpha) = planes(108, 4);
         let (target, knobs) = (picture.target(), knobs(Smoothed::Disparity, 5.0));
@@ -329,7 +329,7 @@ mod tests {
     }
 
     #[test]
-    fn bytes_are_colours_threads_change_nothing_and_gradients_are_added() {
+    fn eight_bit_truths_threads_and_accumulation_agree() {
         let picture = Picture::random(31, 22, true, 9);
         let bytes = picture.image(&picture.truth).to_u8();
         let rounded: Vec<f32> = (0..3 * 682)

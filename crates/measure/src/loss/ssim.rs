@@ -1,4 +1,4 @@
-//! All parts of the loss, SSIM among them, streamed down a band of rows.
+//! The loss with SSIM, streamed down a band of rows.
 //!
 //! Symbols: x render, y truth, m weight; G the window; s = x^2 + y^2 and p = xy, whose window means are all that SSIM needs
 //! beside those of x and y:
@@ -7,12 +7,12 @@
 //! SSIM = (2 mu_x mu_y + C1) (2 (G p - mu_x mu_y) + C2) / ((mu_x^2 + mu_y^2 + C1) (G s - mu_x^2 - mu_y^2 + C2))
 //! ```
 //!
-//! The gradient of its sum is `G a + x (G b) + y (G c)`, with a, b / 2 and c the derivatives by mu_x, G s and G p (held halved): with zeros
-//! beyond the border the window is its own adjoint.
+//! The gradient of its sum is `G a + x (G b) + y (G c)`, with a, b / 2 and c the derivatives by mu_x, G s and
+//! G p (stored halved): with zeros beyond the border the window is its own adjoint.
 //!
-//! Each step takes in [`STEP`] rows, finishes the maps of the rows [`RADIUS`] above them and the gradient of the rows twice
-//! that far above, so that three rings of 16 rows, which stay in the cache, are all the memory. Four rows at a time, for
-//! then 14 loads serve 4 windows along y where one row takes 11 for one.
+//! Each step loads [`STEP`] rows, finishes the maps of the rows [`RADIUS`] above them and the gradient of the rows twice that far
+//! above, so that three rings of 16 rows, which stay in the cache, suffice. It handles four rows at a time, since 14 loads then
+//! serve 4 windows along y, where a single row takes 11 loads for one.
 
 use super::job::{Job, Sums};
 use super::pointwise::Differences;
@@ -20,13 +20,13 @@ use super::rows::{BLOCK, Rows};
 use crate::window::{C1, C2, RADIUS, TAPS, half_window};
 use irradia_compute::simd::{Lanes, Scalar, Simd};
 
-/// Rows a step.
+/// Rows per step.
 const STEP: usize = 4;
-/// Rows that the windows of a step's rows see.
+/// Rows covered by the windows of a step's rows.
 const SEEN: usize = STEP + 2 * RADIUS;
 /// Rows in a ring, a power of two not below `SEEN`.
 const RING: usize = 16;
-/// What a ring of moments holds of each row: x, y, m, s, p.
+/// Rows of a ring of moments per image row: x, y, m, s, p.
 const MOMENTS: usize = 5;
 const X: usize = 0;
 const Y: usize = 1;
@@ -75,7 +75,7 @@ pub(super) fn band<S: Simd>(
         *w = simd.splat(value);
     }
     let mut sums = Sums::default();
-    // Rows are counted so that the first that the band reads, which may lie above the image, is number RING.
+    // Rows are numbered such that the first row the band reads, possibly above the image, is RING.
     let first = RING + 2 * RADIUS;
     let last = first + job.rows.len();
     let image_row = |row: usize| {
@@ -85,9 +85,9 @@ pub(super) fn band<S: Simd>(
     };
     for step in (RING..last + 2 * RADIUS).step_by(STEP) {
         for row in step..step + STEP {
-            take_in(simd, job, image_row(row), &mut scratch.moments, row % RING);
+            load_row(simd, job, image_row(row), &mut scratch.moments, row % RING);
         }
-        // Rows whose windows began before the band's first row are computed and not used.
+        // Rows whose windows begin before the band's first row are computed but not used.
         if step + STEP >= RING + 2 * RADIUS {
             blur_moments(simd, scratch, &window, step);
             for i in 0..STEP {
@@ -115,7 +115,13 @@ pub(super) fn band<S: Simd>(
 
 /// Loads a row of the image (zeros outside it) into slot `slot` of the ring, with its products.
 #[inline(always)]
-fn take_in<S: Simd>(simd: S, job: &Job<ScalarOf<S>>, row: Option<usize>, moments: &mut Rows<ScalarOf<S>>, slot: usize) {
+fn load_row<S: Simd>(
+    simd: S,
+    job: &Job<ScalarOf<S>>,
+    row: Option<usize>,
+    moments: &mut Rows<ScalarOf<S>>,
+    slot: usize,
+) {
     let rows: [&mut [ScalarOf<S>]; MOMENTS] = moments.columns_mut(slot * MOMENTS);
     let Some(row) = row else {
         rows.into_iter().for_each(|row| row.fill(Default::default()));
@@ -236,14 +242,14 @@ fn differentiate<S: Simd>(
             let squares = mu_x.mul_add(mu_x, mu_y * mu_y);
             let (n1, d1) = (two.mul_add(product, c1), squares + c1);
             let n2 = two.mul_add(mean_p - product, c2);
-            // A sum of variances is not negative; rounding may make it so where values are far above 1.
+            // A sum of variances is non-negative, but rounding may make it negative for values far above 1.
             let d2 = (mean_s - squares).max(simd.splat(0.0)) + c2;
-            // Columns past the image's, and rows outside it, have m = 0 and so no derivative.
+            // Columns and rows outside the image have m = 0 and hence no derivative.
             let inverse = one / (d1 * d2);
             let scale = m * inverse;
             let ssim = n1 * n2 * scale;
             dissimilarity += m - ssim;
-            // ssim / d2 and ssim / d1, without their divisions.
+            // ssim / d2 and ssim / d1, without dividing.
             let (by_d2, by_d1) = (ssim * (d1 * inverse), ssim * (d2 * inverse));
             let by_means = (mu_y * scale).mul_add(n2 - n1, mu_x * (by_d2 - by_d1));
             by_means.store(&mut a[block][at..]);

@@ -44,7 +44,7 @@ impl Picture {
 const SIZES: [(usize, usize); 7] = [(1, 1), (5, 3), (23, 17), (1, 40), (40, 1), (16, 16), (33, 150)];
 
 #[test]
-fn the_parts_are_what_plain_code_computes() {
+fn every_part_matches_plain_code() {
     for (seed, (width, height)) in SIZES.into_iter().enumerate() {
         let case = Picture::random(width, height, false, seed as u64);
         let (values, _) = case.in_double(&case.render, &MIXED);
@@ -61,22 +61,22 @@ fn the_parts_are_what_plain_code_computes() {
             "{width}x{height} {values:?} {ssim}"
         );
         let total = 0.7 * l1 + 0.3 * (1.0 - ssim) + 0.5 * mse;
-        // The weights are single precision.
+        // The weights are in single precision.
         assert!((values.total - total).abs() < 1e-7, "{width}x{height}");
     }
 }
 
 #[test]
-fn finite_differences_hold_every_gradient() {
+fn gradients_match_finite_differences() {
     const STEP: f64 = 1e-5;
     for (seed, (width, height)) in SIZES.into_iter().enumerate() {
         for masked in [false, true] {
             for weights in [MIXED, LossWeights { ssim: 0.0, ..MIXED }, LossWeights::photometric(1.0)] {
                 let case = Picture::random(width, height, masked, seed as u64 + 100);
                 let (_, v_render) = case.in_double(&case.render, &weights);
-                // A value within a step of its truth sits on the kink of L1.
+                // Values within a step of the truth are at the kink of L1.
                 let smooth = |i: &usize| (case.render[*i] - case.truth[*i]).abs() >= 2.0 * STEP;
-                // Curvature makes an error of STEP^2 times the third derivative over the gradient; SSIM's constants are 1e-3,
+                // Truncation error is STEP^2 times the third derivative over the gradient; SSIM's constants are 1e-3,
                 // so 1e-5 of the largest gradient; 1e-10 is the rounding of a loss near 1 over 2 STEP.
                 let differences = Differences {
                     absolute: 1e-10,
@@ -85,14 +85,14 @@ fn finite_differences_hold_every_gradient() {
                 let what = format!("{width}x{height} masked {masked} {weights:?}");
                 let value = |render: &[f64]| case.in_double(render, &weights).0.total;
                 let which = some_of(v_render.len()).filter(smooth);
-                differences.hold(&what, &case.render, &v_render, which, value);
+                differences.check(&what, &case.render, &v_render, which, value);
             }
         }
     }
 }
 
 #[test]
-fn every_instruction_set_agrees_with_double_precision() {
+fn every_level_matches_double_precision() {
     for level in Level::all() {
         let mut loss = PhotometricLoss::with_level(level);
         for (seed, (width, height)) in SIZES.into_iter().chain([(70, 300)]).enumerate() {
@@ -120,7 +120,7 @@ fn every_instruction_set_agrees_with_double_precision() {
 }
 
 #[test]
-fn the_number_of_threads_changes_no_bit() {
+fn results_do_not_depend_on_the_number_of_threads() {
     let case = Picture::random(70, 300, true, 5);
     let run = |threads: usize| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
@@ -133,7 +133,7 @@ fn the_number_of_threads_changes_no_bit() {
 }
 
 #[test]
-fn working_memory_of_another_size_leaves_no_trace() {
+fn changing_the_size_leaves_no_stale_memory() {
     let mut reused = PhotometricLoss::new();
     // 70, 68 and 80 columns round up to the same number of vectors.
     for (seed, (width, height)) in [(70, 40), (68, 40), (80, 9), (3, 3), (70, 40)].into_iter().enumerate() {
@@ -144,20 +144,20 @@ fn working_memory_of_another_size_leaves_no_trace() {
 }
 
 #[test]
-fn equal_images_have_no_loss_and_no_gradient() {
+fn equal_images_have_zero_loss_and_gradient() {
     let mut case = Picture::random(30, 20, false, 1);
     case.render = case.truth.clone();
     let (values, v_render) = case.in_single(&mut PhotometricLoss::new(), &LossWeights::photometric(0.2));
     assert_eq!((values.l1, values.mse), (0.0, 0.0));
     assert!(values.total.abs() < 1e-6);
-    // What is left is rounding, beside gradients of 1 / 1800 where images differ.
+    // Only rounding remains, beside gradients of 1 / 1800 where images differ.
     assert!(v_render.iter().all(|v| v.abs() < 1e-7));
     let (_, v_render) = case.in_single(&mut PhotometricLoss::new(), &LossWeights::photometric(0.0));
     assert!(v_render.iter().all(|v| *v == 0.0));
 }
 
 #[test]
-fn masked_pixels_have_no_say_whatever_they_hold() {
+fn masked_pixels_have_no_effect_even_if_not_finite() {
     let case = Picture::random(40, 30, true, 9);
     let mask = case.mask.clone().unwrap();
     let (clean, v_clean) = case.in_single(&mut PhotometricLoss::new(), &MIXED);

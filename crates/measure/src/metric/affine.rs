@@ -1,24 +1,24 @@
-//! Affine maps of colours: what tells two exposures of one scene apart.
+//! Affine colour maps, which model the difference between two exposures of one scene.
 
 use irradia_scene::Image;
 
 /// `y = A x + b` on sRGB-encoded colours.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Affine {
-    /// A, row by row.
+    /// A, row-major.
     pub matrix: [[f64; 3]; 3],
     /// b.
     pub offset: [f64; 3],
 }
 
 impl Affine {
-    /// Changes nothing.
+    /// The identity.
     pub const IDENTITY: Self = Self {
         matrix: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
         offset: [0.0; 3],
     };
 
-    /// Of one colour.
+    /// Maps one colour.
     pub fn apply(&self, x: [f32; 3]) -> [f32; 3] {
         std::array::from_fn(|c| {
             let sum: f64 = (0..3).map(|k| self.matrix[c][k] * f64::from(x[k])).sum();
@@ -26,18 +26,18 @@ impl Affine {
         })
     }
 
-    /// Of every pixel of `image` `[H, W, 3]`, clamped to \[0, 1\].
+    /// Maps every pixel of `image [H, W, 3]`, clamped to \[0, 1\].
     pub fn apply_to(&self, image: &Image) -> Image {
         let pixels = image.data.as_chunks::<3>().0.iter();
         let data = pixels.flat_map(|x| self.apply(*x).map(|v| v.clamp(0.0, 1.0))).collect();
         Image::new(image.width, image.height, 3, data)
     }
 
-    /// The map that brings `from` closest to `to` in the sense of least squares, over the pixels that `counts` says, by index.
-    /// Pixels at which either is clipped (below 1/255 or above 254/255 in any channel) say nothing of the map and are left
-    /// out. The identity where too few are left for a map.
+    /// The least-squares map from `from` to `to` over the pixels whose index satisfies `counts`. Pixels at which either image is
+    /// clipped (below 1/255 or above 254/255 in any channel) carry no information and are skipped. The identity if too few
+    /// pixels remain.
     pub fn fit(from: &Image, to: &Image, counts: impl Fn(usize) -> bool) -> Self {
-        // Normal equations of four unknowns a channel: [r, g, b, 1].
+        // Normal equations of four unknowns per channel: [r, g, b, 1].
         let (mut normal, mut right, mut count) = ([[0.0f64; 4]; 4], [[0.0f64; 3]; 4], 0usize);
         let clipped = |x: &[f32; 3]| x.iter().any(|v| *v < 1.0 / 255.0 || *v > 254.0 / 255.0);
         let pixels = from.data.as_chunks::<3>().0.iter().zip(to.data.as_chunks::<3>().0);
@@ -59,7 +59,7 @@ impl Affine {
         if count < LEAST_PIXELS {
             return Self::IDENTITY;
         }
-        // A picture of one colour leaves the map open: the identity is then preferred, by a weight far below any signal.
+        // An image of one colour does not determine the map: a weight far below any signal then favours the identity.
         for (i, row) in normal.iter_mut().enumerate() {
             let weight = RIDGE * count as f64;
             row[i] += weight;
@@ -77,12 +77,12 @@ impl Affine {
     }
 }
 
-/// Fewer pixels than this say too little.
+/// Fewest pixels that determine a map.
 const LEAST_PIXELS: usize = 64;
-/// Weight of the identity, in units of squared colour a pixel: a hundredth of a grey level.
+/// Weight of the identity, in units of squared colour per pixel: a hundredth of a grey level.
 const RIDGE: f64 = 1.6e-9;
 
-/// Gaussian elimination with partial pivoting; `None` where the matrix is singular.
+/// Gaussian elimination with partial pivoting; `None` if the matrix is singular.
 fn solve(mut a: [[f64; 4]; 4], mut b: [[f64; 3]; 4]) -> Option<[[f64; 3]; 4]> {
     for column in 0..4 {
         let pivot = (column..4).max_by(|i, j| a[*i][column].abs().total_cmp(&a[*j][column].abs()))?;
@@ -118,7 +118,7 @@ mod tests {
     }
 
     #[test]
-    fn a_map_is_found_again_by_half_of_the_picture() {
+    fn fitting_half_of_the_image_recovers_the_map() {
         let map = Affine {
             matrix: [[1.2, 0.05, 0.0], [0.0, 0.9, 0.02], [0.01, 0.0, 1.1]],
             offset: [0.02, -0.01, 0.0],
@@ -134,7 +134,7 @@ mod tests {
     }
 
     #[test]
-    fn clipped_pixels_one_colour_and_nothing_do_no_harm() {
+    fn clipped_uniform_and_empty_input_give_sensible_maps() {
         let from = noise(2);
         let mut to = from.clone();
         to.data[..384].fill(1.0);

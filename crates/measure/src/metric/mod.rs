@@ -22,18 +22,18 @@ pub struct Evaluation {
     pub ssim: f64,
     /// Learned perceptual distance, 0 for equal images; `None` without weights or for images below [`LpipsNet::min_side`].
     pub lpips: Option<f64>,
-    /// PSNR in dB over the right half of the view, after exposure or pose were fitted on its left half; `None` where that
-    /// was not asked for. [`evaluate`] leaves it so.
+    /// PSNR in dB over the right half of the view, after fitting exposure or pose on its left half; `None` if not requested.
+    /// [`evaluate`] returns `None`.
     pub half_fit_psnr: Option<f64>,
 }
 
-/// All metrics of `render` against `truth`, both `[H, W, 3]`, both rounded to 8 bits first, as published numbers are.
+/// All metrics of `render` against `truth`, both `[H, W, 3]` and first rounded to 8 bits, as for published figures.
 ///
-/// `mask [H, W]` leaves out the pixels that are 0: PSNR and SSIM do not count them and the render is given the truth's
-/// colours there, so that SSIM's windows and LPIPS see no difference. LPIPS stays a mean over the whole image.
+/// Pixels where `mask [H, W]` is 0 are excluded: PSNR and SSIM do not count them, and the render takes the truth's colours
+/// there, so that SSIM's windows and LPIPS see no difference. LPIPS remains a mean over the whole image.
 ///
 /// # Panics
-/// When sizes differ: that is a bug of the caller.
+/// When sizes differ: a bug in the caller.
 pub fn evaluate(render: &Image, truth: &Image, mask: Option<&[u8]>, lpips: Option<&Lpips>) -> Evaluation {
     assert_same_size(render, truth, mask);
     let (mut render, truth) = (render.rounded_to_8_bits(), truth.rounded_to_8_bits());
@@ -63,9 +63,9 @@ fn with_truth_where_masked(render: &Image, truth: &Image, mask: &[u8]) -> Image 
 
 fn assert_same_size(render: &Image, truth: &Image, mask: Option<&[u8]>) {
     let size = |image: &Image| (image.width, image.height, image.channels);
-    assert_eq!(size(render), size(truth), "render and truth have one size");
+    assert_eq!(size(render), size(truth), "render and truth have the same size");
     if let Some(mask) = mask {
         let pixels = truth.width as usize * truth.height as usize;
-        assert_eq!(mask.len(), pixels, "the mask has one value a pixel");
+        assert_eq!(mask.len(), pixels, "the mask has one value per pixel");
     }
 }

@@ -11,7 +11,7 @@ pub fn psnr(render: &Image, truth: &Image) -> f64 {
     psnr_masked(render, truth, None)
 }
 
-/// [`psnr`] over the pixels at which `mask [H, W]` is not 0. No such pixel at all: no error, infinity.
+/// [`psnr`] over the pixels at which `mask [H, W]` is not 0; infinity if there are none.
 ///
 /// # Panics
 /// When sizes differ.
@@ -30,7 +30,7 @@ pub fn psnr_masked(render: &Image, truth: &Image, mask: Option<&[u8]>) -> f64 {
             count += channels;
         }
     }
-    // A sum of 0 gives +infinity here, whatever the count.
+    // A sum of 0 gives +infinity, for any count.
     -10.0 * (sum / count.max(1) as f64).log10()
 }
 
@@ -42,7 +42,7 @@ mod tests {
     fn a_constant_difference_of_a_tenth_is_twenty_decibels() {
         let truth = Image::new(4, 3, 3, vec![0.25; 36]);
         let render = Image::new(4, 3, 3, vec![0.35; 36]);
-        // 0.35 - 0.25 in f32 is a tenth to 1e-7, which is 1e-5 dB.
+        // 0.35 - 0.25 in f32 is a tenth to within 1e-7, or 1e-5 dB.
         assert!((psnr(&render, &truth) - 20.0).abs() < 1e-5);
         assert_eq!(psnr(&truth, &truth), f64::INFINITY);
     }

@@ -4,7 +4,7 @@ use irradia_scene::Image;
 use rayon::prelude::*;
 
 /// Mean structural similarity (Wang et al. 2004, eq. 13) over pixels and channels: 11x11 Gaussian window of sigma 1.5,
-/// zeros beyond the border, as the Inria code has it.
+/// zeros beyond the border, as in the Inria code.
 ///
 /// # Panics
 /// When sizes differ.
@@ -12,8 +12,8 @@ pub fn ssim(render: &Image, truth: &Image) -> f64 {
     ssim_masked(render, truth, None)
 }
 
-/// [`ssim`] as a mean over the pixels at which `mask [H, W]` is not 0. Windows see the render as it is everywhere.
-/// No such pixel at all: nothing differs, 1.
+/// [`ssim`] as a mean over the pixels at which `mask [H, W]` is not 0; 1 if there are none. Windows include masked pixels
+/// of the render.
 ///
 /// # Panics
 /// When sizes differ.
@@ -21,7 +21,7 @@ pub fn ssim_masked(render: &Image, truth: &Image, mask: Option<&[u8]>) -> f64 {
     assert_same_size(render, truth, mask);
     let (width, channels) = (truth.width as usize, truth.channels as usize);
     let counts = |x: usize, y: usize| mask.is_none_or(|mask| mask[y * width + x] != 0);
-    // Rows are collected before they are summed, so that the sum has one order whatever the number of threads.
+    // Rows are collected before they are summed, so that the order of the sum does not depend on the number of threads.
     let rows: Vec<(f64, usize)> = (0..truth.height as usize)
         .into_par_iter()
         .map_init(
@@ -97,20 +97,20 @@ mod tests {
     use super::*;
 
     #[test]
-    fn equal_images_are_similar_by_one_and_opposite_ones_below_zero() {
+    fn equal_images_score_one_and_inverted_ones_below_zero() {
         let stripes: Vec<f32> = (0..64 * 64 * 3).map(|i| ((i / 3) % 2) as f32).collect();
         let truth = Image::new(64, 64, 3, stripes);
         let mut render = truth.clone();
         assert!((ssim(&render, &truth) - 1.0).abs() < 1e-12);
         render.data.iter_mut().for_each(|v| *v = 1.0 - *v);
-        // -1 but for the rim of five pixels, where both windows hold the same zeros.
+        // -1 except within five pixels of the border, where both windows contain the same zeros.
         let opposite = ssim(&render, &truth);
         assert!(opposite < -0.6, "{opposite}");
     }
 
     #[test]
-    fn a_single_pixel_has_the_answer_of_the_formula() {
-        // One pixel: every moment is the value times w0^2, for zeros surround it.
+    fn a_single_pixel_matches_the_formula() {
+        // One pixel surrounded by zeros: every moment is the value times w0^2.
         let (a, b) = (0.5f64, 0.25);
         let w = half_window()[0] * half_window()[0];
         let image = |v: f64| Image::new(1, 1, 3, vec![v as f32; 3]);
@@ -120,7 +120,7 @@ mod tests {
     }
 
     #[test]
-    fn masked_pixels_are_left_out_of_the_mean() {
+    fn masked_pixels_are_excluded_from_the_mean() {
         let truth = Image::new(40, 1, 3, vec![0.5; 120]);
         let mut render = truth.clone();
         render.data[..3].fill(0.0);

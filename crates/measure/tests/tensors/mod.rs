@@ -1,11 +1,11 @@
-//! How images and golden tensors are read.
+//! Reading of images and golden tensors.
 
 use irradia_scene::Image;
 use safetensors::SafeTensors;
 use std::path::PathBuf;
 
 /// An 8-bit file as `[H, W, 3]` in \[0, 1\].
-#[allow(dead_code, reason = "each test file is a crate of its own and takes what it needs")]
+#[allow(dead_code, reason = "each test file is a separate crate and uses what it needs")]
 pub fn read_image(path: PathBuf) -> Image {
     let rgb = image::open(&path).expect("the file is there").to_rgb8();
     let data = rgb.as_raw().iter().map(|v| f32::from(*v) / 255.0).collect();
@@ -26,7 +26,7 @@ pub fn tensor_image(tensors: &SafeTensors, name: &str) -> Image {
 }
 
 /// The double-precision tensor `name`, flat.
-#[allow(dead_code, reason = "each test file is a crate of its own and takes what it needs")]
+#[allow(dead_code, reason = "each test file is a separate crate and uses what it needs")]
 pub fn tensor_f64(tensors: &SafeTensors, name: &str) -> Vec<f64> {
     let tensor = tensors.tensor(name).expect("the tensor is there");
     tensor

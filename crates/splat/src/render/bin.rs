@@ -7,9 +7,9 @@
 //! it touches, reducing its gradients above all, is as much as eight blocks.
 
 use super::blend::{Footprint2d, LOG2_ALPHA_MIN};
-use irradia_compute::each;
 use irradia_compute::simd::{Kernel, Lanes, Level, Simd};
 use irradia_compute::sort::{Pair, pair, payload, sort_by_key};
+use irradia_compute::unroll;
 use rayon::prelude::*;
 use std::sync::atomic::{AtomicU32, AtomicU64, Ordering::Relaxed};
 
@@ -291,7 +291,7 @@ fn touched_tiles(s: &Footprint2d, tiles_x: usize, tiles_y: usize, mut hit: impl 
     };
     const BANDS: usize = TILE / BLOCK_WIDTH;
     for column in first_band / BANDS..=last_band / BANDS {
-        let spans = each!(i in 4 => {
+        let spans = unroll!(i in 4 => {
             let k = BANDS * column + i;
             if (first_band..=last_band).contains(&k) { span(k) } else { (usize::MAX, 0) }
         });

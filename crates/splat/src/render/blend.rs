@@ -7,8 +7,8 @@
 //! later product then fails the same test, which saves a mask in the inner loop.
 
 use super::bin::{BAND_BLOCKS, BLOCK_HEIGHT, BLOCK_WIDTH, Entry, TILE};
-use irradia_compute::each;
 use irradia_compute::simd::{Kernel, Lanes, Mask, Simd};
+use irradia_compute::unroll;
 use std::f64::consts::LN_2;
 
 /// Alpha never exceeds this (Inria code).
@@ -94,7 +94,7 @@ pub(super) fn fragment<F: Lanes>(p: F, transmittance: F) -> Fragment<F> {
 pub(super) fn fragment_vjp<F: Lanes>(at: &Fragment<F>, transmittance: F, g: F, rest: F) -> F {
     let one = g.splat(1.0);
     let v_alpha = (-rest).mul_add((one - at.alpha).recip(), transmittance * g);
-    (v_alpha * at.alpha).zero_where_not(at.drawn.and_not(at.capped))
+    (v_alpha * at.alpha).masked(at.drawn.and_not(at.capped))
 }
 
 /// Blends one tile front to back into `out [CHANNELS, blocks, BLOCK]`.
@@ -147,7 +147,7 @@ impl<I: Iterator<Item = Entry>> BlendTile<'_, I> {
                 continue;
             }
             let s = &self.footprints[entry.splat as usize];
-            let color = each!(c in 3 => simd.set(s.color[c]));
+            let color = unroll!(c in 3 => simd.set(s.color[c]));
             let depth = simd.set(s.depth);
             for band in 0..TILE / BLOCK_WIDTH {
                 let mut todo = band_blocks(blocks, band);
@@ -163,17 +163,17 @@ impl<I: Iterator<Item = Entry>> BlendTile<'_, I> {
                         let at = (band * BAND_BLOCKS + block) * BLOCK + part * S::LANES;
                         let t = simd.load(&transmittances[at..]);
                         let f = fragment(over.p(part, over.dy(simd, part, block)), t);
-                        let w = f.weight.zero_where_not(f.drawn);
+                        let w = f.weight.masked(f.drawn);
                         w.mul_add(color[0], simd.load(&red[at..])).store(&mut red[at..]);
                         w.mul_add(color[1], simd.load(&green[at..])).store(&mut green[at..]);
                         w.mul_add(color[2], simd.load(&blue[at..])).store(&mut blue[at..]);
                         if DEPTH {
                             w.mul_add(depth, simd.load(&depths[at..])).store(&mut depths[at..]);
                         }
-                        let t_next = f.behind.or_where_not(f.drawn, t);
+                        let t_next = f.behind.select(f.drawn, t);
                         t_next.store(&mut transmittances[at..]);
                         if !f.ends.none() {
-                            (-t.abs()).or_where_not(f.ends, t_next).store(&mut transmittances[at..]);
+                            (-t.abs()).select(f.ends, t_next).store(&mut transmittances[at..]);
                             ended = true;
                         }
                     }
@@ -216,7 +216,7 @@ where
     #[inline(always)]
     fn new(simd: S, s: &Footprint2d, corner: [f32; 2], band: usize) -> Self {
         let zero = simd.splat(0.0);
-        let [a, b, c] = each!(i in 3 => simd.set(s.quadratic[i]));
+        let [a, b, c] = unroll!(i in 3 => simd.set(s.quadratic[i]));
         let l = simd.set(s.log2_opacity);
         let mut over = Self {
             c,
@@ -318,12 +318,12 @@ impl<I: Iterator<Item = Entry>> BlendTileVjp<'_, I> {
                 continue;
             }
             let s = &self.footprints[entry.splat as usize];
-            let color = each!(c in 3 => simd.set(s.color[c]));
+            let color = unroll!(c in 3 => simd.set(s.color[c]));
             let depth = simd.set(s.depth);
             let mut sums = [zero; 6];
             let mut v_color = [zero; 4];
             let mut gathered = [zero; 2];
-            let [a, b, c] = each!(i in 3 => simd.set(s.quadratic[i]));
+            let [a, b, c] = unroll!(i in 3 => simd.set(s.quadratic[i]));
             for band in 0..TILE / BLOCK_WIDTH {
                 let mut todo = band_blocks(blocks, band);
                 if todo == 0 {
@@ -341,7 +341,7 @@ impl<I: Iterator<Item = Entry>> BlendTileVjp<'_, I> {
                         let t = simd.load(&transmittances[at..]);
                         let dy = over.dy(simd, part, block);
                         let f = fragment(over.p(part, dy), t);
-                        let w = f.weight.zero_where_not(f.drawn);
+                        let w = f.weight.masked(f.drawn);
                         let v = [
                             simd.load(&v_red[at..]),
                             simd.load(&v_green[at..]),
@@ -377,10 +377,10 @@ impl<I: Iterator<Item = Entry>> BlendTileVjp<'_, I> {
                         let v_dy = v_p * dy;
                         m[1] += v_dy;
                         m[2] = v_dy.mul_add(dy, m[2]);
-                        let t_next = f.behind.or_where_not(f.drawn, t);
+                        let t_next = f.behind.select(f.drawn, t);
                         t_next.store(&mut transmittances[at..]);
                         if !f.ends.none() {
-                            (-t.abs()).or_where_not(f.ends, t_next).store(&mut transmittances[at..]);
+                            (-t.abs()).select(f.ends, t_next).store(&mut transmittances[at..]);
                             ended = true;
                         }
                     }
@@ -402,7 +402,7 @@ impl<I: Iterator<Item = Entry>> BlendTileVjp<'_, I> {
             let [s0, s1, s2, s3, s4, s5] = sums;
             let [c0, c1, c2, c3] = v_color;
             if GATHER == gather::ABSOLUTE {
-                gathered = each!(i in 2 => gathered[i] * simd.splat(LN_2));
+                gathered = unroll!(i in 2 => gathered[i] * simd.splat(LN_2));
             }
             let [g0, g1] = gathered;
             S::F::sums(&[s0, s1, s2, s3, s4, s5, c0, c1, c2, c3, g0, g1], out);

@@ -6,8 +6,8 @@ use super::harmonics::{CHUNK, Harmonics};
 use super::project::{Footprint, Geometry, footprint_gradient, project, project_vjp, quadratic};
 use super::{CameraGradient, RenderOptions, Renderer, ViewParams};
 use crate::Splats;
-use irradia_compute::each;
 use irradia_compute::simd::{Kernel, Lanes, Mask, Simd};
+use irradia_compute::unroll;
 
 #[inline(always)]
 fn load_geometry<S: Simd>(simd: S, splats: &Splats, at: usize) -> Geometry<S::F>
@@ -15,9 +15,9 @@ where
     S::F: Lanes<Scalar = f32>,
 {
     Geometry {
-        mean: each!(c in 3 => simd.load(&splats.means.plane(c)[at..])),
-        quat: each!(c in 4 => simd.load(&splats.quats.plane(c)[at..])),
-        log_scale: each!(c in 3 => simd.load(&splats.log_scales.plane(c)[at..])),
+        mean: unroll!(c in 3 => simd.load(&splats.means.plane(c)[at..])),
+        quat: unroll!(c in 4 => simd.load(&splats.quats.plane(c)[at..])),
+        log_scale: unroll!(c in 3 => simd.load(&splats.log_scales.plane(c)[at..])),
         opacity_logit: simd.load(&splats.opacity_logits.plane(0)[at..]),
     }
 }
@@ -88,7 +88,7 @@ impl Kernel for ProjectChunk<'_> {
                 value.store(to);
             }
             for lane in (0..S::LANES).filter(|lane| visible >> lane & 1 == 1) {
-                let v = each!(i in 9 => columns[i][lane]);
+                let v = unroll!(i in 9 => columns[i][lane]);
                 if v.iter().any(|v| !v.is_finite()) {
                     continue; // A poisoned splat is not drawn; the file reader and the optimiser are where it is told.
                 }
@@ -106,7 +106,7 @@ impl Kernel for ProjectChunk<'_> {
         let colors = harmonics.colors(simd, self.splats, self.first, self.clamp);
         for at in harmonics.starts() {
             for i in at..at + S::LANES {
-                let color = each!(c in 3 => colors[c][i]);
+                let color = unroll!(c in 3 => colors[c][i]);
                 self.footprints[i].color = color;
                 if color.iter().any(|v| !v.is_finite()) {
                     self.depth_keys[i] = u32::MAX;
@@ -207,8 +207,8 @@ impl ProjectChunkVjp<'_, '_> {
                 visible.store(&mut chunk.active[at..]);
                 continue;
             }
-            let [s0, sx, sy, sxx, sxy, syy, red, green, blue, v_depth] = each!(i in 10 => simd.load(&sums[i]));
-            let [a, b, c, log2_opacity, shown_red, shown_green, shown_blue] = each!(i in 7 => simd.load(&image[i]));
+            let [s0, sx, sy, sxx, sxy, syy, red, green, blue, v_depth] = unroll!(i in 10 => simd.load(&sums[i]));
+            let [a, b, c, log2_opacity, shown_red, shown_green, shown_blue] = unroll!(i in 7 => simd.load(&image[i]));
             let moments = [s0, sx, sy, sxx, sxy, syy];
             let v_footprint = footprint_gradient([a, b, c], log2_opacity, moments, v_depth);
             let geometry = load_geometry(simd, self.splats, first);
@@ -217,9 +217,9 @@ impl ProjectChunkVjp<'_, '_> {
 
             // Colour was clamped at 0 where it is not above.
             let v_color = [
-                red.zero_where_not(zero.lt(shown_red)),
-                green.zero_where_not(zero.lt(shown_green)),
-                blue.zero_where_not(zero.lt(shown_blue)),
+                red.masked(zero.lt(shown_red)),
+                green.masked(zero.lt(shown_green)),
+                blue.masked(zero.lt(shown_blue)),
             ];
             harmonics.look(at, geometry.mean, view.center);
             for c in 0..3 {
@@ -235,9 +235,9 @@ impl ProjectChunkVjp<'_, '_> {
             if CAMERA {
                 let counts = shown.and(magnitude.lt(simd.splat(f64::from(f32::MAX))));
                 for i in 0..3 {
-                    v_translation[i] += v_camera.translation[i].zero_where_not(counts);
+                    v_translation[i] += v_camera.translation[i].masked(counts);
                     for j in 0..3 {
-                        v_rotation[i][j] += v_camera.rotation[i][j].zero_where_not(counts);
+                        v_rotation[i][j] += v_camera.rotation[i][j].masked(counts);
                     }
                 }
             }
@@ -272,7 +272,7 @@ impl ProjectChunkVjp<'_, '_> {
                 if CAMERA {
                     for c in 0..3 {
                         let finite = v_mean[c].abs().lt(simd.splat(f64::from(f32::MAX)));
-                        v_center[c] -= v_mean[c].zero_where_not(shown.and(finite));
+                        v_center[c] -= v_mean[c].masked(shown.and(finite));
                     }
                 }
                 for (v, to) in v_mean.iter().zip(&mut chunk.columns[0]) {
@@ -282,13 +282,13 @@ impl ProjectChunkVjp<'_, '_> {
             }
             let finite = magnitude.lt(simd.splat(f64::from(f32::MAX)));
             chunk.non_finite += shown.and_not(finite).bits().count_ones() as usize;
-            visible.zero_where_not(shown.and(finite)).store(&mut chunk.active[at..]);
+            visible.masked(shown.and(finite)).store(&mut chunk.active[at..]);
         }
         if CAMERA {
             chunk.camera = self.view.gradient(
-                each!(i in 3 => each!(j in 3 => f64::from(v_rotation[i][j].sum()))),
-                each!(i in 3 => f64::from(v_translation[i].sum())),
-                each!(i in 3 => f64::from(v_center[i].sum())),
+                unroll!(i in 3 => unroll!(j in 3 => f64::from(v_rotation[i][j].sum()))),
+                unroll!(i in 3 => f64::from(v_translation[i].sum())),
+                unroll!(i in 3 => f64::from(v_center[i].sum())),
             );
         }
     }

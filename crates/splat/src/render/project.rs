@@ -6,8 +6,8 @@
 //! `conic = cov^-1 = [A B; B C]`. All functions are generic over lanes: `f32` vectors train, `f64` is tested.
 
 use super::view::ViewLanes;
-use irradia_compute::each;
 use irradia_compute::simd::{Lanes, Mask, Scalar};
+use irradia_compute::unroll;
 use std::f64::consts::{LN_2, LOG2_E};
 
 /// Pixels squared added to the diagonal of the 2D covariance (Inria code, "low-pass filter").
@@ -94,12 +94,12 @@ pub(super) fn dot<F: Lanes>(a: [F; 3], b: [F; 3]) -> F {
 fn intermediate<F: Lanes>(view: &ViewLanes<F>, g: &Geometry<F>, filter: Option<F>) -> Intermediate<F> {
     let one = view.near.splat(1.0);
     let two = view.near.splat(2.0);
-    let x = each!(i in 3 => dot(view.r[i], g.mean) + view.t[i]);
+    let x = unroll!(i in 3 => dot(view.r[i], g.mean) + view.t[i]);
     let inv_z = one / x[2];
-    let tangent = each!(i in 2 => (x[i] * inv_z).min(view.limit[i]).max(-view.limit[i]));
+    let tangent = unroll!(i in 2 => (x[i] * inv_z).min(view.limit[i]).max(-view.limit[i]));
     let inv_q_norm =
         one / (g.quat[0] * g.quat[0] + g.quat[1] * g.quat[1] + g.quat[2] * g.quat[2] + g.quat[3] * g.quat[3]).sqrt();
-    let q = each!(n in 4 => g.quat[n] * inv_q_norm);
+    let q = unroll!(n in 4 => g.quat[n] * inv_q_norm);
     let [w, i, j, k] = q;
     let rot = [
         [
@@ -118,25 +118,25 @@ fn intermediate<F: Lanes>(view: &ViewLanes<F>, g: &Geometry<F>, filter: Option<F
             one - two * (i * i + j * j),
         ],
     ];
-    let own_scale = each!(k in 3 => g.log_scale[k].exp());
+    let own_scale = unroll!(k in 3 => g.log_scale[k].exp());
     // Mip-Splatting (Yu et al. 2024), eq. 8: convolved with an isotropic Gaussian, at the same mass.
     let (scale, share, thinning) = match filter {
         Some(variance) => {
-            let scale: [F; 3] = each!(k in 3 => own_scale[k].mul_add(own_scale[k], variance).sqrt());
-            let ratio: [F; 3] = each!(k in 3 => own_scale[k] / scale[k]);
+            let scale: [F; 3] = unroll!(k in 3 => own_scale[k].mul_add(own_scale[k], variance).sqrt());
+            let ratio: [F; 3] = unroll!(k in 3 => own_scale[k] / scale[k]);
             (
                 scale,
-                each!(k in 3 => ratio[k] * ratio[k]),
+                unroll!(k in 3 => ratio[k] * ratio[k]),
                 ratio[0] * ratio[1] * ratio[2],
             )
         }
         None => (own_scale, [one; 3], one),
     };
     // J = [[fx/z, 0, -fx tx/z], [0, fy/z, -fy ty/z]] with the clamped tangents tx, ty.
-    let j_scale = each!(r in 2 => view.f[r] * inv_z);
-    let jr = each!(r in 2 => each!(c in 3 => j_scale[r] * (view.r[r][c] - tangent[r] * view.r[2][c])));
-    let u: [[F; 3]; 2] = each!(r in 2 => each!(c in 3 => dot(jr[r], [rot[0][c], rot[1][c], rot[2][c]])));
-    let v: [[F; 3]; 2] = each!(r in 2 => each!(c in 3 => u[r][c] * scale[c]));
+    let j_scale = unroll!(r in 2 => view.f[r] * inv_z);
+    let jr = unroll!(r in 2 => unroll!(c in 3 => j_scale[r] * (view.r[r][c] - tangent[r] * view.r[2][c])));
+    let u: [[F; 3]; 2] = unroll!(r in 2 => unroll!(c in 3 => dot(jr[r], [rot[0][c], rot[1][c], rot[2][c]])));
+    let v: [[F; 3]; 2] = unroll!(r in 2 => unroll!(c in 3 => u[r][c] * scale[c]));
     let cov = [dot(v[0], v[0]), dot(v[0], v[1]), dot(v[1], v[1])];
     // |V0 x V1|^2 (Lagrange) instead of a c - b^2: the difference of two large products loses needles to rounding.
     let cross = [
@@ -186,7 +186,7 @@ pub(super) fn project<F: Lanes>(
     } else {
         own_opacity
     };
-    let xy: [F; 2] = each!(i in 2 => view.f[i] * at.x[i] * at.inv_z + view.c[i]);
+    let xy: [F; 2] = unroll!(i in 2 => view.f[i] * at.x[i] * at.inv_z + view.c[i]);
     // alpha >= 1/255 inside d^T conic d <= 2 ln(255 opacity), whose box has half sizes sqrt(2 ln(255 opacity) cov_ii).
     let reach = (opacity * opacity.splat(1.0 / ALPHA_MIN)).map(|v| Scalar::from_f64(2.0 * v.to_f64().max(1.0).ln()));
     let extent = [(reach * a).sqrt(), (reach * c).sqrt()];
@@ -281,7 +281,7 @@ pub(super) fn project_vjp<F: Lanes>(
         let ratio = at.det * inv_det;
         let floor = one.splat(COMPENSATION_FLOOR);
         let compensation = ratio.max(floor).sqrt();
-        let v_ratio = (v_out.opacity * own_opacity * one.splat(0.5) / compensation).zero_where_not(floor.lt(ratio));
+        let v_ratio = (v_out.opacity * own_opacity * one.splat(0.5) / compensation).masked(floor.lt(ratio));
         let v_det = v_ratio * inv_det;
         let v_det_dilated = -v_det * ratio;
         v_cov[0] += v_det * at.cov[2] + v_det_dilated * c;
@@ -294,18 +294,18 @@ pub(super) fn project_vjp<F: Lanes>(
 
     // cov = V V^T, V = U diag(s), U = (J R) Rot.
     let v_v: [[F; 3]; 2] = [
-        each!(k in 3 => two * v_cov[0] * at.v[0][k] + v_cov[1] * at.v[1][k]),
-        each!(k in 3 => two * v_cov[2] * at.v[1][k] + v_cov[1] * at.v[0][k]),
+        unroll!(k in 3 => two * v_cov[0] * at.v[0][k] + v_cov[1] * at.v[1][k]),
+        unroll!(k in 3 => two * v_cov[2] * at.v[1][k] + v_cov[1] * at.v[0][k]),
     ];
-    let v_log_filtered = each!(k in 3 => v_v[0][k] * at.v[0][k] + v_v[1][k] * at.v[1][k]);
+    let v_log_filtered = unroll!(k in 3 => v_v[0][k] * at.v[0][k] + v_v[1][k] * at.v[1][k]);
     let v_log_thinning = v_own_opacity * own_opacity;
     let v_log_scale: [F; 3] = match filter {
-        Some(_) => each!(k in 3 => v_log_filtered[k] * at.share[k] + v_log_thinning * (one - at.share[k])),
+        Some(_) => unroll!(k in 3 => v_log_filtered[k] * at.share[k] + v_log_thinning * (one - at.share[k])),
         None => v_log_filtered,
     };
-    let v_u: [[F; 3]; 2] = each!(r in 2 => each!(k in 3 => v_v[r][k] * at.scale[k]));
-    let v_rot: [[F; 3]; 3] = each!(j in 3 => each!(k in 3 => at.jr[0][j] * v_u[0][k] + at.jr[1][j] * v_u[1][k]));
-    let v_jr: [[F; 3]; 2] = each!(r in 2 => each!(j in 3 => dot(v_u[r], at.rot[j])));
+    let v_u: [[F; 3]; 2] = unroll!(r in 2 => unroll!(k in 3 => v_v[r][k] * at.scale[k]));
+    let v_rot: [[F; 3]; 3] = unroll!(j in 3 => unroll!(k in 3 => at.jr[0][j] * v_u[0][k] + at.jr[1][j] * v_u[1][k]));
+    let v_jr: [[F; 3]; 2] = unroll!(r in 2 => unroll!(j in 3 => dot(v_u[r], at.rot[j])));
 
     // J R: row r is f_r / z (R_r - tangent_r R_2).
     let mut v_x = [zero; 3];
@@ -320,14 +320,14 @@ pub(super) fn project_vjp<F: Lanes>(
         v_x[2] -= v_j_scale * j_scale * at.inv_z;
         let v_tangent = -j_scale * dot(v_jr[r], view.r[2]);
         let tangent = at.x[r] * at.inv_z;
-        let v_tangent = v_tangent.zero_where_not(tangent.abs().lt(view.limit[r]));
+        let v_tangent = v_tangent.masked(tangent.abs().lt(view.limit[r]));
         // The pixel position moves with the tangent too, unclamped.
         let v_free = v_tangent + v_out.xy[r] * view.f[r];
         v_x[r] += v_free * at.inv_z;
         v_x[2] -= v_free * tangent * at.inv_z;
     }
     v_x[2] += v_out.depth;
-    let v_mean = each!(j in 3 => dot(v_x, [view.r[0][j], view.r[1][j], view.r[2][j]]));
+    let v_mean = unroll!(j in 3 => dot(v_x, [view.r[0][j], view.r[1][j], view.r[2][j]]));
     for i in 0..3 {
         for j in 0..3 {
             v_r[i][j] = v_x[i].mul_add(g.mean[j], v_r[i][j]);
@@ -347,7 +347,7 @@ pub(super) fn project_vjp<F: Lanes>(
             - two * k * (m[0][0] + m[1][1])),
     ];
     let along = v_q[0] * w + v_q[1] * i + v_q[2] * j + v_q[3] * k;
-    let v_quat = each!(n in 4 => (v_q[n] - at.q[n] * along) * at.inv_q_norm);
+    let v_quat = unroll!(n in 4 => (v_q[n] - at.q[n] * along) * at.inv_q_norm);
 
     let geometry = Geometry {
         mean: v_mean,

@@ -1,7 +1,7 @@
 //! View-dependent colour: real spherical harmonics of the unit direction from the camera's centre to the mean.
 
-use irradia_compute::each;
 use irradia_compute::simd::Lanes;
+use irradia_compute::unroll;
 use irradia_scene::sh::{C0, C1, C2, C3};
 
 /// Basis functions a degree-3 expansion has.
@@ -55,13 +55,13 @@ pub(super) fn basis_vjp<F: Lanes>(degree: u32, [x, y, z]: [F; 3], v: &[F; MAX_CO
         g = [k!(-C1) * v[3], k!(-C1) * v[1], k!(C1) * v[2]];
     }
     if degree >= 2 {
-        let w: [F; 5] = each!(i in 5 => k!(C2[i]) * v[4 + i]);
+        let w: [F; 5] = unroll!(i in 5 => k!(C2[i]) * v[4 + i]);
         g[0] += w[0] * y + w[3] * z + k!(2.0) * x * (w[4] - w[2]);
         g[1] += w[0] * x + w[1] * z - k!(2.0) * y * (w[4] + w[2]);
         g[2] += w[1] * y + w[3] * x + k!(4.0) * w[2] * z;
     }
     if degree >= 3 {
-        let w: [F; 7] = each!(i in 7 => k!(C3[i]) * v[9 + i]);
+        let w: [F; 7] = unroll!(i in 7 => k!(C3[i]) * v[9 + i]);
         let (xx, yy, zz) = (x * x, y * y, z * z);
         let (xy, yz, xz) = (x * y, y * z, x * z);
         g[0] += k!(6.0) * w[0] * xy + w[1] * yz - k!(2.0) * w[2] * xy - k!(6.0) * w[3] * xz
@@ -85,14 +85,14 @@ pub(super) fn basis_vjp<F: Lanes>(degree: u32, [x, y, z]: [F; 3], v: &[F; MAX_CO
 /// Unit direction from `center` to `mean`, and one over the distance.
 #[inline(always)]
 pub(super) fn direction<F: Lanes>(mean: [F; 3], center: [F; 3]) -> ([F; 3], F) {
-    let d: [F; 3] = each!(i in 3 => mean[i] - center[i]);
+    let d: [F; 3] = unroll!(i in 3 => mean[i] - center[i]);
     let inv = d[0].splat(1.0) / super::project::dot(d, d).max(d[0].splat(1e-24)).sqrt();
-    (each!(i in 3 => d[i] * inv), inv)
+    (unroll!(i in 3 => d[i] * inv), inv)
 }
 
 /// The gradient of the mean through [`direction`].
 #[inline(always)]
 pub(super) fn direction_vjp<F: Lanes>(d: [F; 3], inv: F, v_d: [F; 3]) -> [F; 3] {
     let along = super::project::dot(d, v_d);
-    each!(i in 3 => (v_d[i] - d[i] * along) * inv)
+    unroll!(i in 3 => (v_d[i] - d[i] * along) * inv)
 }

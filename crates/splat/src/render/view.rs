@@ -1,6 +1,6 @@
 use super::CameraGradient;
-use irradia_compute::each;
 use irradia_compute::simd::Simd;
+use irradia_compute::unroll;
 use irradia_scene::Camera;
 
 /// A pinhole camera as the renderer uses it, in double precision so that tests lose nothing.
@@ -73,13 +73,13 @@ impl ViewParams {
     pub(super) fn lanes<S: Simd>(&self, simd: S) -> ViewLanes<S::F> {
         let (limit, center) = (self.tangent_limit(), self.center());
         ViewLanes {
-            r: each!(i in 3 => each!(j in 3 => simd.splat(self.rotation[i][j]))),
-            t: each!(i in 3 => simd.splat(self.translation[i])),
-            f: each!(i in 2 => simd.splat(self.focal[i])),
-            c: each!(i in 2 => simd.splat(self.principal[i])),
-            limit: each!(i in 2 => simd.splat(limit[i])),
+            r: unroll!(i in 3 => unroll!(j in 3 => simd.splat(self.rotation[i][j]))),
+            t: unroll!(i in 3 => simd.splat(self.translation[i])),
+            f: unroll!(i in 2 => simd.splat(self.focal[i])),
+            c: unroll!(i in 2 => simd.splat(self.principal[i])),
+            limit: unroll!(i in 2 => simd.splat(limit[i])),
             size: [simd.splat(f64::from(self.width)), simd.splat(f64::from(self.height))],
-            center: each!(i in 3 => simd.splat(center[i])),
+            center: unroll!(i in 3 => simd.splat(center[i])),
             near: simd.splat(self.near),
         }
     }

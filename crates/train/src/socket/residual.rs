@@ -7,7 +7,7 @@ use crate::schedule::StepPlan;
 use crate::tensor_file::{NamedTensor, TensorSource};
 use crate::trainer::TrainError;
 use glam::Vec3;
-use irradia_field::{Field, FieldState, Sampler, Sight, Space, StepOptions, residual_at, train_residual};
+use irradia_field::{Field, FieldState, ResidualQuery, Sampler, Space, StepOptions, residual_at, train_residual};
 use irradia_splat::Surface;
 
 /// Stream of the run's seed.
@@ -26,7 +26,7 @@ pub fn added_colors(field: &Field, center: Vec3, surfaces: &[Surface]) -> Vec<[f
 }
 
 /// How `field` is asked about `surfaces` seen from `center`.
-fn sights(field: &Field, center: Vec3, surfaces: &[Surface]) -> Vec<Sight> {
+fn sights(field: &Field, center: Vec3, surfaces: &[Surface]) -> Vec<ResidualQuery> {
     let mirrored = matches!(field.config.sampler, Sampler::Given { mirrored: true });
     let sight = |surface: &Surface| {
         let view = (Vec3::from(surface.mean) - center).normalize_or_zero();
@@ -36,7 +36,7 @@ fn sights(field: &Field, center: Vec3, surfaces: &[Surface]) -> Vec<Sight> {
         } else {
             view
         };
-        Sight {
+        ResidualQuery {
             point: surface.mean,
             direction: direction.to_array(),
         }

@@ -1,12 +1,12 @@
-//! The convolutional parts of SqueezeNet 1.1, AlexNet and VGG16 as torchvision numbers their layers, cut at LPIPS's taps,
-//! and their VJP with regard to the image; the weights are fixed.
+//! The convolutional parts of SqueezeNet 1.1, AlexNet and VGG16, with torchvision's layer numbers, split at LPIPS's taps, and
+//! their VJP with respect to the image; the weights are fixed.
 
-use super::layers::{Convolution, Map, Pool, max_pool, max_pool_vjp, stop_where_zero};
+use super::layers::{Convolution, Map, Pool, max_pool, max_pool_vjp, relu_vjp};
 use super::net::LpipsNet;
 use super::weights::{LpipsError, Tensors};
 use crate::real::Real;
 
-/// A step as the published architectures give it; `number` is the layer's in `features.{number}`.
+/// A step of a published architecture; `number` is the layer's in `features.{number}`.
 #[derive(Clone, Copy)]
 enum Plan {
     /// A square convolution with ReLU.
@@ -19,7 +19,7 @@ enum Plan {
         padding: usize,
     },
     Pool(Pool),
-    /// Squeeze to few channels, then expand them by 1x1 and by 3x3 filters side by side, to `expanded` channels each.
+    /// A fire module: squeezes to few channels, then expands them by parallel 1x1 and 3x3 filters to `expanded` channels each.
     Fire {
         number: usize,
         input: usize,
@@ -28,7 +28,7 @@ enum Plan {
     },
 }
 
-/// 3x3, of stride 1, with a border of zeros.
+/// 3x3 with stride 1 and zero padding.
 const fn conv3(number: usize, input: usize, output: usize) -> Plan {
     Plan::Convolution {
         number,
@@ -53,7 +53,7 @@ const fn pool(side: usize, ceil: bool) -> Plan {
     Plan::Pool(Pool { side, ceil })
 }
 
-/// What leads from each tap (from the image) to the next.
+/// The steps that lead to each tap, from the tap before or the image.
 fn plan(net: LpipsNet) -> &'static [&'static [Plan]] {
     match net {
         LpipsNet::Squeeze => SQUEEZE,
@@ -127,7 +127,7 @@ const VGG: &[&[Plan]] = &[
     ],
 ];
 
-/// Channels at each tap.
+/// Number of channels at each tap.
 pub(super) fn tap_channels(net: LpipsNet) -> Vec<usize> {
     let channels = |plan: &Plan| match plan {
         Plan::Convolution { output, .. } => *output,
@@ -151,23 +151,23 @@ impl<T: Real> Fire<T> {
         Convolution::forward_side_by_side(&[&self.expand1, &self.expand3], squeezed)
     }
 
-    /// The gradient of `input`; that of the output `out` is used up.
+    /// The gradient of `input`, given that of the output `out`.
     fn vjp(&self, input: &Map<T>, squeezed: &Map<T>, out: &Map<T>, mut v_out: Map<T>) -> Map<T> {
-        stop_where_zero(out, &mut v_out);
+        relu_vjp(out, &mut v_out);
         let mut v_squeezed = squeezed.zeros_like();
         self.expand1.vjp(&v_out, 0, &mut v_squeezed);
         self.expand3.vjp(&v_out, self.expanded, &mut v_squeezed);
-        stop_where_zero(squeezed, &mut v_squeezed);
+        relu_vjp(squeezed, &mut v_squeezed);
         let mut v_input = input.zeros_like();
         self.squeeze.vjp(&v_squeezed, 0, &mut v_input);
         v_input
     }
 }
 
-/// A step's output and, of a fire module, what lies inside it.
-type Output<T> = (Map<T>, Option<Map<T>>);
+/// The output of a step, and the squeezed map of a fire module.
+type StepOutput<T> = (Map<T>, Option<Map<T>>);
 
-/// A [`Plan`] with its weights.
+/// A [`Plan`] step with its weights.
 enum Step<T> {
     Convolution(Convolution<T>),
     Pool(Pool),
@@ -215,7 +215,7 @@ impl<T: Real> Step<T> {
         })
     }
 
-    fn forward(&self, input: &Map<T>) -> Output<T> {
+    fn forward(&self, input: &Map<T>) -> StepOutput<T> {
         match self {
             Self::Convolution(layer) => (layer.forward(input), None),
             Self::Pool(pool) => (max_pool(input, *pool), None),
@@ -226,18 +226,18 @@ impl<T: Real> Step<T> {
         }
     }
 
-    /// The gradient of `input`, given the step's output with what lies inside and the gradient of the output.
-    fn vjp(&self, input: &Map<T>, (out, inside): &Output<T>, mut v_out: Map<T>) -> Map<T> {
+    /// The gradient of `input`, given what [`Self::forward`] returned and the gradient of the output.
+    fn vjp(&self, input: &Map<T>, (out, squeezed): &StepOutput<T>, mut v_out: Map<T>) -> Map<T> {
         match self {
             Self::Convolution(layer) => {
-                stop_where_zero(out, &mut v_out);
+                relu_vjp(out, &mut v_out);
                 let mut v_input = input.zeros_like();
                 layer.vjp(&v_out, 0, &mut v_input);
                 v_input
             }
             Self::Pool(pool) => max_pool_vjp(input, out, &v_out, *pool),
             Self::Fire(fire) => {
-                let squeezed = inside.as_ref().expect("a fire module keeps what it squeezes");
+                let squeezed = squeezed.as_ref().expect("a fire module keeps its squeezed map");
                 fire.vjp(input, squeezed, out, v_out)
             }
         }
@@ -249,11 +249,11 @@ pub(super) struct Backbone<T> {
     taps: Vec<Vec<Step<T>>>,
 }
 
-/// What the VJP needs of a forward pass.
+/// The activations that the VJP needs.
 pub(super) struct Tape<T> {
     input: Map<T>,
-    /// Of every step, tap by tap.
-    outputs: Vec<Vec<Output<T>>>,
+    /// What every step returned, tap by tap.
+    outputs: Vec<Vec<StepOutput<T>>>,
 }
 
 impl<T: Real> Tape<T> {
@@ -285,7 +285,7 @@ impl<T: Real> Backbone<T> {
             outputs: Vec::with_capacity(self.taps.len()),
         };
         for (tap, steps) in self.taps.iter().enumerate() {
-            let mut outputs: Vec<Output<T>> = Vec::with_capacity(steps.len());
+            let mut outputs: Vec<StepOutput<T>> = Vec::with_capacity(steps.len());
             for step in steps {
                 let input = match (outputs.last(), tap) {
                     (Some((before, _)), _) => before,
@@ -301,11 +301,11 @@ impl<T: Real> Backbone<T> {
 
     /// The gradient of the scaled image, from those of the features at the taps.
     pub(super) fn vjp(&self, tape: &Tape<T>, v_taps: Vec<Map<T>>) -> Map<T> {
-        let mut v_behind: Option<Map<T>> = None;
+        let mut v_next: Option<Map<T>> = None;
         for (tap, v_tap) in v_taps.into_iter().enumerate().rev() {
             let mut v = v_tap;
-            if let Some(v_behind) = v_behind.take() {
-                for (v, more) in v.data.iter_mut().zip(v_behind.data) {
+            if let Some(v_next) = v_next.take() {
+                for (v, more) in v.data.iter_mut().zip(v_next.data) {
                     *v += more;
                 }
             }
@@ -318,8 +318,8 @@ impl<T: Real> Backbone<T> {
                 };
                 v = step.vjp(input, &outputs[i], v);
             }
-            v_behind = Some(v);
+            v_next = Some(v);
         }
-        v_behind.expect("there are taps")
+        v_next.expect("there are taps")
     }
 }

@@ -1,5 +1,5 @@
-//! The two kinds of layer and their VJPs, over maps whose channels lie together: a patch is then three runs of memory, the
-//! result of a matrix product is already the next map, and bands of rows are disjoint, which makes them parallel.
+//! The two kinds of layer and their VJPs, over maps with interleaved channels: the patch of a 3x3 kernel is then three
+//! contiguous runs, the result of a matrix product is already the next map, and bands of rows are disjoint, hence parallel.
 
 use crate::real::Real;
 use ndarray::linalg::general_mat_mul;
@@ -18,7 +18,7 @@ pub(crate) struct Map<T> {
 }
 
 impl<T: Real> Map<T> {
-    /// Zeros of the same shape: a gradient before anything was added to it.
+    /// Zeros of the same shape, to accumulate a gradient.
     pub(super) fn zeros_like(&self) -> Self {
         Self {
             data: vec![T::zero(); self.data.len()],
@@ -38,7 +38,7 @@ pub(super) struct Convolution<T> {
     padding: usize,
 }
 
-/// Output pixels a matrix product: their patches stay in the second-level cache.
+/// Output pixels per matrix product: their patches stay in the L2 cache.
 const PIXELS_A_BAND: usize = 512;
 
 impl<T: Real> Convolution<T> {
@@ -67,7 +67,7 @@ impl<T: Real> Convolution<T> {
         Self::forward_side_by_side(&[self], input)
     }
 
-    /// Convolutions whose outputs have one size, their channels concatenated.
+    /// Convolutions whose outputs have the same size, with their channels concatenated.
     pub(super) fn forward_side_by_side(layers: &[&Self], input: &Map<T>) -> Map<T> {
         let size = |n: usize| (n + 2 * layers[0].padding - layers[0].side) / layers[0].stride + 1;
         let (height, width) = (size(input.height), size(input.width));
@@ -81,7 +81,7 @@ impl<T: Real> Convolution<T> {
             for layer in layers {
                 let columns = first..first + layer.bias.len();
                 if layer.side == 1 {
-                    // A patch is a pixel: the map is its own matrix.
+                    // A patch is a pixel: the map itself is the matrix.
                     let pixels = rows.start * width * layer.input..rows.end * width * layer.input;
                     layer.multiply(&input.data[pixels], out, channels, columns.start);
                 } else {
@@ -104,7 +104,7 @@ impl<T: Real> Convolution<T> {
         }
     }
 
-    /// What each output pixel of `rows` sees, `[rows * width, side * side * input]`, zeros beyond the border.
+    /// The receptive field of each output pixel of `rows`, `[rows * width, side * side * input]`, zeros beyond the border.
     fn patches(&self, input: &Map<T>, rows: Range<usize>, width: usize, patches: &mut Vec<T>) {
         let run = self.side * self.input;
         patches.clear();
@@ -127,8 +127,8 @@ impl<T: Real> Convolution<T> {
         }
     }
 
-    /// Where, in a map `width` wide, row `y` of the patch of output column `ox` lies, clipped to the map; and how many
-    /// values of that row were clipped in front.
+    /// The range of row `y` of the patch of output column `ox` in a map `width` wide, clipped to the map, and how many values
+    /// were clipped at its front.
     fn run(&self, y: usize, ox: usize, width: usize) -> (Range<usize>, usize) {
         let x0 = ox * self.stride;
         let from = x0.max(self.padding) - self.padding;
@@ -137,7 +137,7 @@ impl<T: Real> Convolution<T> {
         (values, (from + self.padding - x0) * self.input)
     }
 
-    /// Columns `first..` of `out [pixels, channels]` become `patches` times the kernel.
+    /// Sets columns `first..` of `out [pixels, channels]` to `patches` times the kernel.
     fn multiply(&self, patches: &[T], out: &mut [T], channels: usize, first: usize) {
         let (inner, outputs) = (self.side * self.side * self.input, self.bias.len());
         let pixels = patches.len() / inner;
@@ -148,7 +148,7 @@ impl<T: Real> Convolution<T> {
         general_mat_mul(T::one(), &patches, &kernel, T::zero(), &mut columns);
     }
 
-    /// Adds to `v_input` what channels `first..` of `v_out` make of it; ReLU is behind already ([`stop_where_zero`]).
+    /// Adds the gradient through channels `first..` of `v_out` to `v_input`; [`relu_vjp`] has been applied to `v_out`.
     pub(super) fn vjp(&self, v_out: &Map<T>, first: usize, v_input: &mut Map<T>) {
         if self.side == 1 {
             let inputs = v_input.data.par_chunks_mut(PIXELS_A_BAND * self.input);
@@ -159,7 +159,7 @@ impl<T: Real> Convolution<T> {
                 });
             return;
         }
-        // The gradients of all patches, then each input row adds up those that saw it: rows are disjoint.
+        // The gradients of all patches; each input row then sums those that contain it: rows are disjoint.
         let run = self.side * self.input;
         let mut v_patches = vec![T::zero(); v_out.height * v_out.width * self.side * run];
         let bands = v_patches.par_chunks_mut(PIXELS_A_BAND * self.side * run);
@@ -203,8 +203,8 @@ impl<T: Real> Convolution<T> {
     }
 }
 
-/// The VJP of ReLU: no gradient where its output `out` is 0.
-pub(super) fn stop_where_zero<T: Real>(out: &Map<T>, v_out: &mut Map<T>) {
+/// The VJP of ReLU: zeroes the gradient where the output `out` is 0.
+pub(super) fn relu_vjp<T: Real>(out: &Map<T>, v_out: &mut Map<T>) {
     const VALUES: usize = 1 << 14;
     let parts = v_out.data.par_chunks_mut(VALUES).zip(out.data.par_chunks(VALUES));
     parts.for_each(|(v, out)| {
@@ -214,24 +214,24 @@ pub(super) fn stop_where_zero<T: Real>(out: &Map<T>, v_out: &mut Map<T>) {
     });
 }
 
-/// Windows two pixels apart.
+/// Max pooling with a stride of two pixels.
 #[derive(Clone, Copy)]
 pub(super) struct Pool {
     /// Side of a window, 2 or 3 pixels.
     pub(super) side: usize,
-    /// Whether windows that reach beyond the border are kept and take what is there ("ceil mode"), as SqueezeNet was trained.
+    /// Whether windows that extend beyond the border are kept and clipped ("ceil mode"), as in SqueezeNet.
     pub(super) ceil: bool,
 }
 
 impl Pool {
-    /// Windows along `n` pixels.
+    /// Number of windows along `n` pixels.
     fn windows(self, n: usize) -> usize {
         let room = n.saturating_sub(self.side);
         1 + if self.ceil { room.div_ceil(2) } else { room / 2 }
     }
 }
 
-/// The largest of each window.
+/// The maximum of each window.
 pub(super) fn max_pool<T: Real>(input: &Map<T>, pool: Pool) -> Map<T> {
     let size = |n: usize| pool.windows(n);
     let (height, width, channels) = (size(input.height), size(input.width), input.channels);
@@ -256,11 +256,11 @@ pub(super) fn max_pool<T: Real>(input: &Map<T>, pool: Pool) -> Map<T> {
     }
 }
 
-/// The VJP of [`max_pool`], whose output was `out`: each window's gradient goes to the first of its largest values.
+/// The VJP of [`max_pool`], which returned `out`: each window's gradient goes to the first of its maxima.
 pub(super) fn max_pool_vjp<T: Real>(input: &Map<T>, out: &Map<T>, v_out: &Map<T>, pool: Pool) -> Map<T> {
     let mut v_input = input.zeros_like();
     let (width, channels) = (input.width, input.channels);
-    // Two input rows at a time: they are seen by the windows that begin in them and by those that began two rows above.
+    // Two input rows at a time: they belong to the windows that begin in them and to those that begin two rows above.
     let bands = v_input.data.par_chunks_mut(2 * width * channels).enumerate();
     bands.for_each_init(Vec::new, |left, (band, v_rows)| {
         let mine = 2 * band..2 * band + v_rows.len() / (width * channels);
@@ -268,7 +268,7 @@ pub(super) fn max_pool_vjp<T: Real>(input: &Map<T>, out: &Map<T>, v_out: &Map<T>
             for ox in 0..out.width {
                 let at = (oy * out.width + ox) * channels;
                 let largest = &out.data[at..at + channels];
-                // What the window has still to give.
+                // The part of the window's gradient not yet assigned.
                 left.clear();
                 left.extend_from_slice(&v_out.data[at..at + channels]);
                 for y in 2 * oy..(2 * oy + pool.side).min(mine.end) {
@@ -321,7 +321,7 @@ mod tests {
     }
 
     /// `vjp(input, out, v_out)` is the gradient of `v_out . forward(input)`.
-    fn holds(
+    fn check(
         forward: impl Fn(&Map<f64>) -> Map<f64>,
         vjp: impl Fn(&Map<f64>, &Map<f64>, Map<f64>) -> Map<f64>,
         input: &Map<f64>,
@@ -334,12 +334,12 @@ mod tests {
             let data = data.to_vec();
             dot(&v_out, &forward(&Map { data, ..*input }))
         };
-        // Piecewise linear: nothing but rounding, unless a kink lies within a step (no seed here has one).
+        // Piecewise linear: only rounding error, unless a kink lies within a step (none for these seeds).
         directional(&input.data, &v_input.data, value, 1e-6, 1e-7);
     }
 
     #[test]
-    fn finite_differences_hold_the_convolutions() {
+    fn convolution_gradients_match_finite_differences() {
         let mut rng = Rng::new(3, 0);
         for (height, width) in [(7, 9), (8, 5), (3, 3)] {
             for (side, stride, padding) in [(1, 1, 0), (3, 1, 1), (3, 2, 0), (5, 1, 2), (7, 4, 2)] {
@@ -349,24 +349,24 @@ mod tests {
                 let layer = Convolution::new(&kernel, bias, inputs, side, stride, padding);
                 let input = random(height, width, inputs, &mut rng);
                 let vjp = |input: &Map<f64>, out: &Map<f64>, mut v_out: Map<f64>| {
-                    stop_where_zero(out, &mut v_out);
+                    relu_vjp(out, &mut v_out);
                     let mut v_input = input.zeros_like();
                     layer.vjp(&v_out, 0, &mut v_input);
                     v_input
                 };
-                holds(|input| layer.forward(input), vjp, &input, &mut rng);
+                check(|input| layer.forward(input), vjp, &input, &mut rng);
             }
         }
     }
 
     #[test]
-    fn finite_differences_hold_the_pooling() {
+    fn pooling_gradients_match_finite_differences() {
         let mut rng = Rng::new(4, 0);
         for (height, width) in [(7, 9), (8, 6), (3, 3), (4, 3)] {
             for (side, ceil) in [(3, true), (3, false), (2, false)] {
                 let pool = Pool { side, ceil };
                 let input = random(height, width, 2, &mut rng);
-                holds(
+                check(
                     |input| max_pool(input, pool),
                     |input, out, v_out| max_pool_vjp(input, out, &v_out, pool),
                     &input,
@@ -377,7 +377,7 @@ mod tests {
     }
 
     #[test]
-    fn of_equal_values_the_first_has_the_gradient() {
+    fn ties_in_pooling_give_the_gradient_to_the_first_value() {
         let flat = Map {
             height: 4,
             width: 3,
@@ -394,8 +394,8 @@ mod tests {
     }
 
     #[test]
-    fn a_convolution_counts_its_neighbours_and_stops_at_the_border() {
-        // All ones: each output is the number of pixels under the window, less the bias of 5, and not below 0.
+    fn a_convolution_of_ones_counts_neighbours_and_pads_with_zeros() {
+        // All ones: each output is the number of pixels under the window, less 5 by the bias, and at least 0.
         let ones = Map {
             height: 3,
             width: 4,
@@ -427,7 +427,7 @@ mod tests {
     }
 
     #[test]
-    fn pooling_keeps_the_windows_that_reach_beyond_the_border() {
+    fn ceil_mode_pooling_keeps_windows_beyond_the_border() {
         let input = Map {
             height: 4,
             width: 3,

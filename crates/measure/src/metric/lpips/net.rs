@@ -1,10 +1,9 @@
-//! Which network LPIPS compares features of.
+//! The networks whose features LPIPS compares.
 
 use std::fmt;
 use std::str::FromStr;
 
-/// A backbone of LPIPS v0.1. Published tables are mostly of AlexNet or VGG; distances of different networks are not
-/// comparable.
+/// A backbone of LPIPS v0.1. Published tables mostly use AlexNet or VGG; distances of different networks are not comparable.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum LpipsNet {
     /// SqueezeNet 1.1 (Iandola et al. 2016): the smallest and fastest.
@@ -16,7 +15,7 @@ pub enum LpipsNet {
 }
 
 impl LpipsNet {
-    /// All, in the order in which a folder is searched.
+    /// All networks, in the order in which a folder is searched.
     pub const ALL: [Self; 3] = [Self::Squeeze, Self::Alex, Self::Vgg];
 
     /// `squeeze`, `alex` or `vgg`, as the authors name them.
@@ -28,7 +27,7 @@ impl LpipsNet {
         }
     }
 
-    /// The name of its weights file in a folder of such files.
+    /// File name of its weights.
     pub fn file_name(self) -> &'static str {
         match self {
             Self::Squeeze => "lpips_squeeze.safetensors",
@@ -37,7 +36,7 @@ impl LpipsNet {
         }
     }
 
-    /// The smallest side of an image, pixels, of which its strides and poolings leave something.
+    /// The smallest image side, pixels, that its strides and poolings do not reduce to nothing.
     pub fn min_side(self) -> u32 {
         match self {
             Self::Squeeze => 17,
@@ -46,7 +45,7 @@ impl LpipsNet {
         }
     }
 
-    /// A tensor that no other backbone has.
+    /// Name of a tensor that no other backbone has.
     fn mark(self) -> &'static str {
         match self {
             Self::Squeeze => "features.3.squeeze.weight",
@@ -55,7 +54,7 @@ impl LpipsNet {
         }
     }
 
-    /// The network whose features `has` names tensors of.
+    /// The network whose tensors are present according to `has`.
     pub(super) fn recognise(has: impl Fn(&str) -> bool) -> Option<Self> {
         Self::ALL.into_iter().find(|net| has(net.mark()))
     }
@@ -72,6 +71,6 @@ impl FromStr for LpipsNet {
 
     fn from_str(text: &str) -> Result<Self, String> {
         let known = Self::ALL.into_iter().find(|net| net.name() == text);
-        known.ok_or_else(|| "give squeeze, alex or vgg".to_owned())
+        known.ok_or_else(|| "use squeeze, alex or vgg".to_owned())
     }
 }

@@ -1,4 +1,4 @@
-//! The distance between the two images' features, and its gradient with regard to the first.
+//! The distance between the features of two images, and its gradient with respect to the first.
 
 use super::backbone::Backbone;
 use super::layers::Map;
@@ -16,7 +16,7 @@ const SCALE: [f64; 3] = [0.458, 0.448, 0.450];
 pub(crate) struct Network<T> {
     pub(super) net: LpipsNet,
     backbone: Backbone<T>,
-    /// What each channel of each tap counts, `[tap][C]`.
+    /// Weight of each channel at each tap, `[tap][C]`.
     heads: Vec<Vec<T>>,
 }
 
@@ -37,7 +37,7 @@ impl<T: Real> Network<T> {
 
     /// The distance between two images `[H, W, 3]` with values in \[0, 1\].
     pub(super) fn distance(&self, render: Map<T>, truth: Map<T>) -> f64 {
-        // Both images go through the network side by side, so that no more than three layers of each are ever held.
+        // Both images pass through the network in step, so that at most three layers of each are held at a time.
         let (mut a, mut b) = (scaled(render), scaled(truth));
         let mut total = 0.0;
         for (tap, head) in self.heads.iter().enumerate() {
@@ -48,7 +48,7 @@ impl<T: Real> Network<T> {
         total
     }
 
-    /// The distance and its gradient with regard to the render, `[H, W, 3]`.
+    /// The distance and its gradient with respect to the render, `[H, W, 3]`.
     pub(crate) fn distance_and_gradient(&self, render: Map<T>, truth: Map<T>) -> (f64, Map<T>) {
         let tape = self.backbone.forward(scaled(render));
         let mut b = scaled(truth);
@@ -71,7 +71,7 @@ impl<T: Real> Network<T> {
     }
 }
 
-/// Colours in \[0, 1\] as the network takes them.
+/// Colours in \[0, 1\], normalised for the network.
 fn scaled<T: Real>(mut image: Map<T>) -> Map<T> {
     let offsets: [T; 3] = std::array::from_fn(|c| T::from_f64(-1.0 - SHIFT[c]));
     let scales: [T; 3] = std::array::from_fn(|c| T::from_f64(SCALE[c]));
@@ -83,8 +83,8 @@ fn scaled<T: Real>(mut image: Map<T>) -> Map<T> {
     image
 }
 
-/// Mean over pixels of `sum_c head_c (a_c / |a| - b_c / |b|)^2` (eq. 1 of the paper); its gradient with regard to `a` is
-/// written to `v_a`.
+/// Mean over pixels of `sum_c head_c (a_c / |a| - b_c / |b|)^2` (eq. 1 of the paper); its gradient with respect to `a`
+/// is written to `v_a`.
 fn tap_distance<T: Real>(a: &Map<T>, b: &Map<T>, head: &[T], v_a: Option<&mut Map<T>>) -> f64 {
     let count = (a.height * a.width) as f64;
     let row = a.width * a.channels;
@@ -102,13 +102,13 @@ fn tap_distance<T: Real>(a: &Map<T>, b: &Map<T>, head: &[T], v_a: Option<&mut Ma
             })
             .collect(),
     };
-    // In the order of rows, whoever computed them.
+    // Summed in row order, independent of threads.
     sums.iter().sum::<f64>() / count
 }
 
-/// The sum over a row's pixels; `see(pixel, b, [1 / |a|, 1 / |b|, |a|], a)` is told each.
-fn row_distance<T: Real>(a: &[T], b: &[T], head: &[T], mut see: impl FnMut(usize, &[T], [T; 3], &[T])) -> f64 {
-    // The published code adds it to the norm; it decides only where a pixel's features are all zero.
+/// The sum over a row's pixels; calls `visit(pixel, b, [1 / |a|, 1 / |b|, |a|], a)` for each.
+fn row_distance<T: Real>(a: &[T], b: &[T], head: &[T], mut visit: impl FnMut(usize, &[T], [T; 3], &[T])) -> f64 {
+    // As in the published code, added to the norm; it matters only where a pixel's features are all zero.
     let epsilon = T::from_f64(1e-10);
     let pixels = a.chunks_exact(head.len()).zip(b.chunks_exact(head.len()));
     let mut total = 0.0;
@@ -120,13 +120,13 @@ fn row_distance<T: Real>(a: &[T], b: &[T], head: &[T], mut see: impl FnMut(usize
             head[c] * d * d
         });
         total += distance.to_f64();
-        see(pixel, b, [scale_a, scale_b, norm_a], a);
+        visit(pixel, b, [scale_a, scale_b, norm_a], a);
     }
     total
 }
 
-/// With e the gradient by `a / |a|`: `v = (e - (a / |a|) (e . a) / |a|) / |a|`. 0 where all features are: there the
-/// distance has no slope, and ReLU would stop it.
+/// With e the gradient by `a / |a|`: `v = (e - (a / |a|) (e . a) / |a|) / |a|`. 0 where all features are 0: there the
+/// distance has no slope, and ReLU would block the gradient.
 fn pixel_vjp<T: Real>(a: &[T], b: &[T], head: &[T], [scale_a, scale_b, norm_a]: [T; 3], gain: T, v: &mut [T]) {
     if norm_a == T::zero() {
         return;

@@ -1,4 +1,4 @@
-//! Whole networks on made-up weights, against code that has nothing in common with them.
+//! Whole networks with random weights, against independent code.
 
 use super::layers::Map;
 use super::net::LpipsNet;
@@ -11,13 +11,13 @@ use irradia_testkit::differences::directional;
 use std::cell::RefCell;
 use std::collections::BTreeMap;
 
-/// Gives random tensors of whatever shape is asked for, scaled such that features neither fade nor grow (He et al. 2015).
-struct MadeUp {
+/// Provides random tensors of any shape, scaled such that features keep their variance (He et al. 2015).
+struct RandomTensors {
     rng: RefCell<Rng>,
     tensors: RefCell<BTreeMap<String, ImportedTensor>>,
 }
 
-impl Tensors for MadeUp {
+impl Tensors for RandomTensors {
     fn tensor(&self, name: &str, shape: &[usize]) -> Result<Vec<f32>, LpipsError> {
         let mut rng = self.rng.borrow_mut();
         let n: usize = shape.iter().product();
@@ -29,7 +29,7 @@ impl Tensors for MadeUp {
                 .map(|_| match name {
                     _ if name.starts_with("lin") => rng.uniform(),
                     _ if name.ends_with("bias") => 0.1 * rng.normal(),
-                    // As wide and as deep as a normal number, a tenth of its cost: VGG has 15 million.
+                    // Uniform with the variance of a normal variate at a tenth of its cost: VGG has 15 million weights.
                     _ => 1.7 * scale * rng.range(-1.0, 1.0),
                 })
                 .collect(),
@@ -38,8 +38,8 @@ impl Tensors for MadeUp {
     }
 }
 
-fn made_up(net: LpipsNet) -> BTreeMap<String, ImportedTensor> {
-    let made_up = MadeUp {
+fn random_tensors(net: LpipsNet) -> BTreeMap<String, ImportedTensor> {
+    let made_up = RandomTensors {
         rng: RefCell::new(Rng::new(4, 0)),
         tensors: RefCell::default(),
     };
@@ -48,10 +48,10 @@ fn made_up(net: LpipsNet) -> BTreeMap<String, ImportedTensor> {
     made_up.tensors.into_inner()
 }
 
-/// What [`MadeUp`] made.
-struct Made<'a>(&'a BTreeMap<String, ImportedTensor>);
+/// Tensors made by [`RandomTensors`].
+struct Stored<'a>(&'a BTreeMap<String, ImportedTensor>);
 
-impl Tensors for Made<'_> {
+impl Tensors for Stored<'_> {
     fn tensor(&self, name: &str, _: &[usize]) -> Result<Vec<f32>, LpipsError> {
         Ok(self.0[name].values.clone())
     }
@@ -104,7 +104,7 @@ fn halved(planes: &Planes) -> Planes {
         .collect()
 }
 
-/// The features of VGG16 as its paper's table of configuration D has them, after the last ReLU of each of five groups.
+/// The features of VGG16, configuration D of its paper, after the last ReLU of each of five groups.
 fn vgg(tensors: &BTreeMap<String, ImportedTensor>, image: &Image) -> Vec<Planes> {
     let (mean, deviation) = ([-0.030, -0.088, -0.188], [0.458, 0.448, 0.450]);
     let (width, height) = (image.width as usize, image.height as usize);
@@ -149,8 +149,8 @@ fn distance(tensors: &BTreeMap<String, ImportedTensor>, a: &[Planes], b: &[Plane
 }
 
 #[test]
-fn vgg_is_what_plain_loops_compute() {
-    let tensors = made_up(LpipsNet::Vgg);
+fn vgg_matches_plain_loops() {
+    let tensors = random_tensors(LpipsNet::Vgg);
     let (net, bytes) = to_weights_file(&tensors).unwrap();
     assert_eq!((net, tensors.len()), (LpipsNet::Vgg, 2 * 13 + 5));
     let folder = tempfile::tempdir().unwrap();
@@ -158,23 +158,23 @@ fn vgg_is_what_plain_loops_compute() {
     std::fs::write(&path, bytes).unwrap();
     let lpips = Lpips::load(&path).unwrap();
     assert_eq!(lpips.net(), LpipsNet::Vgg);
-    // The least that four poolings leave something of, and sides that they do not divide.
+    // The smallest side for four poolings, and sides that they do not divide.
     for (width, height) in [(16, 16), (23, 17)] {
         let (a, b) = (image(width, height, 1), image(width, height, 2));
         let want = distance(&tensors, &vgg(&tensors, &a), &vgg(&tensors, &b));
         let got = lpips.distance(&a, &b).unwrap();
         // Thirteen layers in single precision.
-        assert!((got / want - 1.0).abs() < 1e-4, "{got} and not {want}");
+        assert!((got / want - 1.0).abs() < 1e-4, "{got}, expected {want}");
     }
     let small = lpips.distance(&image(40, 15, 1), &image(40, 15, 2)).unwrap_err();
     assert!(small.to_string().contains("at least 16 pixels"), "{small}");
 }
 
 #[test]
-fn finite_differences_hold_alex_and_vgg() {
+fn alex_and_vgg_gradients_match_finite_differences() {
     for (net, width, height) in [(LpipsNet::Alex, 37, 31), (LpipsNet::Vgg, 17, 16)] {
-        let tensors = made_up(net);
-        let network = Network::<f64>::from_weights(net, &Made(&tensors)).unwrap();
+        let tensors = random_tensors(net);
+        let network = Network::<f64>::from_weights(net, &Stored(&tensors)).unwrap();
         let wide = |image: &Image| {
             let map = map_of(image);
             Map {
@@ -191,29 +191,29 @@ fn finite_differences_hold_alex_and_vgg() {
             let data = data.to_vec();
             network.distance(Map { data, ..a }, b.clone())
         };
-        // Between kinks the distance is smooth; a step of 1e-7 meets next to none of them.
+        // Between kinks the distance is smooth; a step of 1e-7 crosses almost none.
         directional(&a.data, &v.data, moved, 1e-7, 1e-5);
     }
 }
 
 #[test]
-fn what_does_not_make_a_network_is_not_imported() {
+fn importing_incomplete_networks_fails() {
     let refused = |tensors: &BTreeMap<String, ImportedTensor>, part: &str| {
         let line = to_weights_file(tensors).unwrap_err().to_string();
         assert!(line.contains(part) && !line.contains('\n'), "{line}");
     };
     refused(&BTreeMap::new(), "no features of SqueezeNet");
-    let whole = made_up(LpipsNet::Squeeze);
+    let whole = random_tensors(LpipsNet::Squeeze);
     let mut tensors = whole.clone();
     tensors.remove("lin6.model.1.weight");
     refused(&tensors, "lin6.model.1.weight is missing");
     let mut tensors = whole.clone();
     tensors.get_mut("features.0.bias").unwrap().shape = vec![8, 8];
-    refused(&tensors, "features.0.bias is [8, 8] and not [64]");
+    refused(&tensors, "features.0.bias is [8, 8], expected [64]");
     let mut tensors = whole.clone();
     tensors.get_mut("features.0.bias").unwrap().values[3] = f32::INFINITY;
     refused(&tensors, "features.0.bias has values that are not finite");
-    // A classifier is left out.
+    // The classifier is skipped.
     let mut more = whole.clone();
     let extra = ImportedTensor {
         shape: vec![1],

@@ -1,4 +1,4 @@
-//! The weights file, checked before anything is taken from it, and how one is made of what the networks' authors publish.
+//! The LPIPS weights file: validated reading, and conversion from the files that the networks' authors publish.
 
 use super::backbone::{Backbone, tap_channels};
 use super::net::LpipsNet;
@@ -17,10 +17,10 @@ pub enum LpipsError {
     Read {
         /// The file.
         path: PathBuf,
-        /// What the system says.
+        /// The system's error.
         source: std::io::Error,
     },
-    /// It is not the file it should be.
+    /// The file does not hold valid weights.
     #[error(
         "{} holds no LPIPS weights: {reason}; make the file with `irradia lpips --import FEATURES HEADS`",
         .path.display()
@@ -28,33 +28,33 @@ pub enum LpipsError {
     Weights {
         /// The file.
         path: PathBuf,
-        /// What is wrong with it.
+        /// What is wrong.
         reason: String,
     },
-    /// What is to be imported does not make a network.
+    /// The tensors to import do not form a network.
     #[error(
         "{reason}; give the features of torchvision's SqueezeNet 1.1, AlexNet or VGG16 and the LPIPS v0.1 heads of the same network"
     )]
     Import {
-        /// What is wrong with it.
+        /// What is wrong.
         reason: String,
     },
-    /// The network's poolings would leave no pixel.
+    /// The image is too small for the network's poolings.
     #[error("an image of {width}x{height} is too small for LPIPS; use sides of at least {least} pixels")]
     TooSmall {
         /// Pixels.
         width: usize,
         /// Pixels.
         height: usize,
-        /// Pixels, by the network.
+        /// Smallest side for this network, pixels.
         least: u32,
     },
 }
 
-/// VGG's weights, the largest, take 59 MB; a file far beyond that is another file, and is not read whole to find out.
+/// VGG's weights, the largest, take 59 MB; a far larger file is rejected without reading it.
 const MAX_BYTES: u64 = 80 << 20;
 
-/// The file's bytes.
+/// Reads the file.
 pub(super) fn read(path: &Path) -> Result<Vec<u8>, LpipsError> {
     let unreadable = |source| LpipsError::Read {
         path: path.to_owned(),
@@ -72,13 +72,13 @@ pub(super) fn read(path: &Path) -> Result<Vec<u8>, LpipsError> {
     Ok(bytes)
 }
 
-/// Where a network's tensors come from.
+/// A source of a network's tensors.
 pub(super) trait Tensors {
     /// The values of tensor `name`, which must be of `shape` and finite.
     fn tensor(&self, name: &str, shape: &[usize]) -> Result<Vec<f32>, LpipsError>;
 }
 
-/// The tensors of our file.
+/// The tensors of a weights file.
 pub(super) struct Weights<'a> {
     path: &'a Path,
     tensors: SafeTensors<'a>,
@@ -88,12 +88,12 @@ impl<'a> Weights<'a> {
     pub(super) fn parse(path: &'a Path, bytes: &'a [u8]) -> Result<Self, LpipsError> {
         let tensors = SafeTensors::deserialize(bytes).map_err(|error| LpipsError::Weights {
             path: path.to_owned(),
-            reason: format!("it is no whole safetensors file ({error})"),
+            reason: format!("it is not a complete safetensors file ({error})"),
         })?;
         Ok(Self { path, tensors })
     }
 
-    /// The network whose features these are.
+    /// The network these features belong to.
     pub(super) fn net(&self) -> Result<LpipsNet, LpipsError> {
         LpipsNet::recognise(|name| self.tensors.tensor(name).is_ok())
             .ok_or_else(|| self.wrong("it has no features of SqueezeNet, AlexNet or VGG16".to_owned()))
@@ -113,7 +113,7 @@ impl Tensors for Weights<'_> {
         let tensor = self.tensors.tensor(name).map_err(missing)?;
         if tensor.dtype() != Dtype::F32 || tensor.shape() != shape {
             let (dtype, found) = (tensor.dtype(), tensor.shape());
-            return Err(self.wrong(format!("tensor {name} is {dtype:?} {found:?} and not F32 {shape:?}")));
+            return Err(self.wrong(format!("tensor {name} is {dtype:?} {found:?}, expected F32 {shape:?}")));
         }
         let (values, _) = tensor.data().as_chunks::<4>();
         let values: Vec<f32> = values.iter().map(|bytes| f32::from_le_bytes(*bytes)).collect();
@@ -136,16 +136,16 @@ pub(super) fn heads(net: LpipsNet, weights: &dyn Tensors) -> Result<Vec<Vec<f32>
     channels.iter().enumerate().map(head).collect()
 }
 
-/// A tensor of a file that is imported.
+/// A tensor to import.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ImportedTensor {
     /// Sizes, outermost first.
     pub shape: Vec<usize>,
-    /// Row by row.
+    /// Row-major values.
     pub values: Vec<f32>,
 }
 
-/// Tensors by name, and which of them were asked for.
+/// Tensors by name, and those requested so far.
 struct Imported<'a> {
     tensors: &'a BTreeMap<String, ImportedTensor>,
     used: RefCell<BTreeMap<String, &'a ImportedTensor>>,
@@ -157,7 +157,10 @@ impl Tensors for Imported<'_> {
         let tensor = self.tensors.get(name);
         let tensor = tensor.ok_or_else(|| wrong(format!("tensor {name} is missing")))?;
         if tensor.shape != shape || tensor.values.len() != shape.iter().product::<usize>() {
-            return Err(wrong(format!("tensor {name} is {:?} and not {shape:?}", tensor.shape)));
+            return Err(wrong(format!(
+                "tensor {name} is {:?}, expected {shape:?}",
+                tensor.shape
+            )));
         }
         if tensor.values.iter().any(|v| !v.is_finite()) {
             return Err(wrong(format!("tensor {name} has values that are not finite")));
@@ -167,8 +170,8 @@ impl Tensors for Imported<'_> {
     }
 }
 
-/// The network that `tensors`, features and heads by the names that torchvision and LPIPS give them, are of, and the bytes
-/// of its weights file. Other tensors are left out.
+/// Recognises the network of `tensors`, features and heads under the names of torchvision and LPIPS, and returns it with the
+/// bytes of its weights file. Other tensors are skipped.
 ///
 /// # Errors
 /// When a tensor of the network is missing, of another shape or not finite.
@@ -192,7 +195,7 @@ pub fn to_weights_file(tensors: &BTreeMap<String, ImportedTensor>) -> Result<(Lp
         })
         .collect();
     let views = bytes.iter().map(|(name, shape, bytes)| {
-        let view = TensorView::new(Dtype::F32, shape.to_vec(), bytes).expect("as many bytes as the shape says");
+        let view = TensorView::new(Dtype::F32, shape.to_vec(), bytes).expect("the length matches the shape");
         (name, view)
     });
     let file = safetensors::serialize(views, None).map_err(|error| wrong(error.to_string()))?;

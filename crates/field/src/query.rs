@@ -1,4 +1,4 @@
-//! Looking at a trained field: densities and colours at points, and the occupancy grid's memory of them.
+//! Queries of a field: densities and colours at points, and updates of the occupancy grid.
 
 use crate::config::Sampler;
 use crate::field::Field;
@@ -7,16 +7,16 @@ use crate::net::{Block, get3, set3};
 use crate::pass::{Colors, Density};
 use crate::space::Outside;
 use crate::state::FieldState;
-use crate::train::STREAM_LOOK;
+use crate::train::STREAM_OCCUPANCY;
 use irradia_compute::Level;
 use irradia_scene::Rng;
 use rayon::prelude::*;
 
-/// Points of one task.
+/// Points per task.
 const CHUNK: usize = 1024;
 
-/// Looks at the cells of the occupancy grid again: all of them, or those that are occupied and a share `1 / one_in` of the
-/// others. Does nothing for other samplers.
+/// Updates cells of the occupancy grid: all of them, or the occupied ones and a random fraction `1 / one_in` of the others.
+/// Does nothing for other samplers.
 pub fn update_occupancy(state: &mut FieldState, all: bool, one_in: u32, seed: u64) {
     let field = &mut state.field;
     let Sampler::Occupancy(options) = field.config.sampler else {
@@ -25,23 +25,23 @@ pub fn update_occupancy(state: &mut FieldState, all: bool, one_in: u32, seed: u6
     let Some(mut grid) = field.occupancy.take() else {
         return;
     };
-    let mut rng = Rng::new(seed, (state.step << 8) + STREAM_LOOK);
-    let (cells, points) = grid.choose(all, one_in, &mut rng);
+    let mut rng = Rng::new(seed, (state.step << 8) + STREAM_OCCUPANCY);
+    let (cells, points) = grid.sample_cells(all, one_in, &mut rng);
     let mut densities = vec![0.0; points.len()];
-    look(field, &points, &mut densities, |block, _, to| {
+    query(field, &points, &mut densities, |block, _, to| {
         to.copy_from_slice(&block.density[..to.len()])
     });
-    grid.remember(&cells, &densities, options.decay);
+    grid.update(&cells, &densities, options.decay);
     field.occupancy = Some(grid);
     field.mark_occupied();
 }
 
-/// Densities at world points, one over world units (one over field units in normalised device coordinates); 0 where the field
-/// does not reach.
+/// Densities at world points, in inverse world units (inverse field units in normalised device coordinates); 0 outside the
+/// field.
 pub fn density_at(field: &Field, points: &[[f32; 3]]) -> Vec<f32> {
     let (units, inside) = units(field, points);
     let mut densities = vec![0.0; points.len()];
-    look(field, &units, &mut densities, |block, _, to| {
+    query(field, &units, &mut densities, |block, _, to| {
         to.copy_from_slice(&block.density[..to.len()])
     });
     let scale = field.space.scale;
@@ -52,13 +52,13 @@ pub fn density_at(field: &Field, points: &[[f32; 3]]) -> Vec<f32> {
         .collect()
 }
 
-/// Colours at world points seen along unit `directions` (one a point), sRGB in \[0, 1\], with a photograph's appearance or the
-/// mean one.
+/// Colours at world points viewed along unit `directions` (one per point), sRGB in \[0, 1\], with the appearance code of
+/// `image` or the mean code.
 pub fn color_at(field: &Field, points: &[[f32; 3]], directions: &[[f32; 3]], image: Option<u32>) -> Vec<[f32; 3]> {
     let (units, _) = units(field, points);
     let last = field.nets.len() - 1;
     let mut colors = vec![[0.0; 3]; points.len()];
-    look(field, &units, &mut colors, |block, begin, to| {
+    query(field, &units, &mut colors, |block, begin, to| {
         let panels = block.panels();
         block.directions.clear();
         block.directions.resize(panels * 3 * PANEL, 0.0);
@@ -67,7 +67,7 @@ pub fn color_at(field: &Field, points: &[[f32; 3]], directions: &[[f32; 3]], ima
                 set3(&mut block.directions, i, *direction);
             }
         }
-        block.share_code(&field.code(image));
+        block.fill_code(&field.code(image));
         Level::detect().run(Colors {
             net: &field.nets[last],
             parameters: &field.parameters[last],
@@ -80,19 +80,19 @@ pub fn color_at(field: &Field, points: &[[f32; 3]], directions: &[[f32; 3]], ima
     colors
 }
 
-/// World points in the unit cube, and whether the field reaches there.
+/// Maps world points to the unit cube, with flags for those inside the field.
 pub(crate) fn units(field: &Field, points: &[[f32; 3]]) -> (Vec<[f32; 3]>, Vec<bool>) {
     let unit = |world: &[f32; 3]| {
         let at = field.space.from_world(*world).unwrap_or([f32::NAN; 3]);
-        let everywhere = field.space.outside == Outside::Contracted;
-        let inside = at.iter().all(|v| v.is_finite() && (everywhere || v.abs() <= 1.0));
+        let unbounded = field.space.outside == Outside::Contracted;
+        let inside = at.iter().all(|v| v.is_finite() && (unbounded || v.abs() <= 1.0));
         (if inside { field.space.unit(at) } else { [0.5; 3] }, inside)
     };
     points.iter().map(unit).unzip()
 }
 
-/// Has `read` take what it wants of blocks of the last network's densities at points of the unit cube.
-fn look<T: Send>(
+/// Evaluates the last network's densities at points of the unit cube in blocks and passes each block to `read`.
+fn query<T: Send>(
     field: &Field,
     points: &[[f32; 3]],
     to: &mut [T],

@@ -5,10 +5,9 @@
 //! What edits single splats (density control, first splats, files) takes the state with [`Engine::state_mut`], rarely.
 
 use crate::densify::mcmc;
-use crate::regularize::{self, Regularizers};
+use crate::regularize::{self, Regularized, Regularizers};
 use crate::render::{CameraGradient, FramePlanes, OutputGradient, RenderOptions, Renderer, SplatGradients, ViewParams};
-use crate::{Rates, SplatState, Splats, Statistics, Surface};
-use irradia_compute::adam::AdamStep;
+use crate::{Optimizer, Rates, SplatState, Splats, Statistics, Surface};
 use irradia_scene::{Camera, sh};
 
 /// The state of splats in training with the renderer and the gradients of the last frame, on this machine's processor.
@@ -42,16 +41,18 @@ pub struct Update {
     pub statistics: Option<Statistics>,
     /// Losses of the splats themselves.
     pub regularizers: Regularizers,
-    /// Size of the scene, world units: the regularisers' unit of length.
-    pub extent: f32,
+    /// Of which splats they are a mean.
+    pub regularized: Regularized,
+    /// Their unit of length, world units.
+    pub regularizer_unit: f32,
     /// Fraction of the visible splats whose place and shape are trained, the largest first.
     pub trained_fraction: f32,
     /// Learning rates; that of the means in world units.
     pub rates: Rates,
     /// SH bands that are trained.
     pub sh_degree: u32,
-    /// Adam's constants.
-    pub adam: AdamStep,
+    /// What makes a step of gradients.
+    pub optimizer: Optimizer,
     /// Noise on the means of faint splats.
     pub noise: Option<Noise>,
     /// Largest condition number of a covariance.
@@ -189,20 +190,30 @@ impl Engine {
             self.state
                 .gather_statistics(statistics, gradients, width, height, extent);
         }
-        if !update.regularizers.is_zero() {
+        // Without weights there is no gradient that splats out of view could have.
+        let regularizers = (!update.regularizers.is_zero()).then_some(&update.regularizers);
+        if let Some(weights) = regularizers {
             regularize::add_gradients(
                 level,
                 &self.state.splats,
-                &update.regularizers,
-                update.extent,
+                weights,
+                update.regularized,
+                update.regularizer_unit,
                 gradients,
             );
         }
         if update.trained_fraction < 1.0 {
             regularize::rest_small(&self.state.splats, update.trained_fraction, gradients);
         }
-        self.state
-            .step(level, gradients, &update.rates, update.sh_degree, update.adam);
+        let regularized = regularizers.map_or(Regularized::Visible, |_| update.regularized);
+        self.state.step(
+            level,
+            gradients,
+            regularized,
+            &update.rates,
+            update.sh_degree,
+            update.optimizer,
+        );
         if let Some(Noise { amount, seed, step }) = update.noise {
             mcmc::add_noise(&mut self.state, amount, seed, step);
         }

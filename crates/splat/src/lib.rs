@@ -16,4 +16,4 @@ pub use render::{
     CameraGradient, FramePlanes, Gather, OutputGradient, RenderOptions, Renderer, SplatGradients, ViewParams,
 };
 pub use splats::{COLUMN_NAMES, Splats, Surface, logit, sigmoid};
-pub use state::{Rates, SplatState, Statistics};
+pub use state::{Optimizer, Rates, SplatState, Statistics};

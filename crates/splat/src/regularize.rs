@@ -1,7 +1,7 @@
 //! Losses of the splats themselves, whatever they look like, and their gradients.
 //!
-//! Symbols: `o` opacity, `s` standard deviations in units of the scene's extent, each a mean over the splats that the
-//! frame saw: `opacity o + opacity_square o^2 + scale mean(s) + covariance |Sigma|_F^2`. The first and third are those of 3DGS-MCMC
+//! Symbols: `o` opacity, `s` standard deviations in a unit of length, each a mean over the splats that the frame saw or over
+//! all: `opacity o + opacity_square o^2 + scale mean(s) + covariance |Sigma|_F^2`. The first and third are those of 3DGS-MCMC
 //! (Kheradmand et al. 2024, eq. 10), the others CurriculumGS's (`|Sigma|_F^2` is the sum of `s^4`).
 
 use crate::{SplatGradients, Splats};
@@ -28,63 +28,79 @@ impl Regularizers {
     }
 }
 
-/// Adds the gradients of the active splats to `gradients`; returns the loss. `extent` is the scene's, world units.
+/// Of which splats the parts are a mean.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Regularized {
+    /// Those that the frame saw.
+    #[default]
+    Visible,
+    /// All: those that it did not see have these gradients alone (3DGS-MCMC).
+    All,
+}
+
+/// Adds the gradients to `gradients`. `unit` is that of length, world units. Of splats that the frame did
+/// not see, [`Regularized::All`] writes the gradients of ln scales and opacity logits, which were unspecified; the other
+/// columns stay so, and the splats inactive.
 pub fn add_gradients(
     level: Level,
     splats: &Splats,
     weights: &Regularizers,
-    extent: f32,
+    of: Regularized,
+    unit: f32,
     gradients: &mut SplatGradients,
-) -> f64 {
-    let active = gradients.active.iter().filter(|a| **a != 0.0).count();
-    if active == 0 {
-        return 0.0;
+) {
+    let counted = match of {
+        Regularized::Visible => gradients.active.iter().filter(|a| **a != 0.0).count(),
+        Regularized::All => splats.len(),
+    };
+    if counted == 0 {
+        return;
     }
     level.run(AddGradients {
         splats,
         weights,
-        extent,
-        share: 1.0 / active as f64,
+        of,
+        unit,
+        share: 1.0 / counted as f64,
         gradients,
-    })
+    });
 }
 
 struct AddGradients<'a> {
     splats: &'a Splats,
     weights: &'a Regularizers,
-    extent: f32,
+    of: Regularized,
+    unit: f32,
     share: f64,
     gradients: &'a mut SplatGradients,
 }
 
 impl Kernel for AddGradients<'_> {
-    type Output = f64;
+    type Output = ();
 
     #[inline(always)]
-    fn run<S: Simd>(self, simd: S) -> f64
+    fn run<S: Simd>(self, simd: S)
     where
         S::F: Lanes<Scalar = f32>,
     {
-        let weights = WeightLanes::new(simd, self.weights, f64::from(self.extent), self.share);
+        let weights = WeightLanes::new(simd, self.weights, f64::from(self.unit), self.share);
         let zero = simd.splat(0.0);
-        let mut total = 0.0f64;
+        let all = self.of == Regularized::All;
         for at in (0..self.splats.len()).step_by(S::LANES) {
             let active = zero.lt(simd.load(&self.gradients.active[at..]));
-            if active.none() {
+            if active.none() && !all {
                 continue;
             }
             let log_scale = unroll!(c in 3 => simd.load(&self.splats.log_scales.plane(c)[at..]));
             let logit = simd.load(&self.splats.opacity_logits.plane(0)[at..]);
-            let (value, v_log_scale, v_logit) = regularizer(&weights, log_scale, logit);
-            total += f64::from(value.masked(active).sum());
+            let (_, v_log_scale, v_logit) = regularizer(&weights, log_scale, logit);
             for c in 0..3 {
                 let to = &mut self.gradients.splats.log_scales.plane_mut(c)[at..];
-                (simd.load(to) + v_log_scale[c]).store(to);
+                (simd.load(to).masked(active) + v_log_scale[c]).store(to);
             }
             let to = &mut self.gradients.splats.opacity_logits.plane_mut(0)[at..];
-            (simd.load(to) + v_logit).store(to);
+            (simd.load(to).masked(active) + v_logit).store(to);
         }
-        total
     }
 }
 
@@ -97,12 +113,12 @@ struct WeightLanes<F> {
 
 impl<F: Lanes> WeightLanes<F> {
     #[inline(always)]
-    fn new<S: Simd<F = F>>(simd: S, weights: &Regularizers, extent: f64, share: f64) -> Self {
+    fn new<S: Simd<F = F>>(simd: S, weights: &Regularizers, unit: f64, share: f64) -> Self {
         Self {
             opacity: simd.splat(f64::from(weights.opacity) * share),
             opacity_square: simd.splat(f64::from(weights.opacity_square) * share),
-            scale: simd.splat(f64::from(weights.scale) * share / (3.0 * extent)),
-            covariance: simd.splat(f64::from(weights.covariance) * share / extent.powi(4)),
+            scale: simd.splat(f64::from(weights.scale) * share / (3.0 * unit)),
+            covariance: simd.splat(f64::from(weights.covariance) * share / unit.powi(4)),
         }
     }
 }
@@ -195,6 +211,47 @@ mod tests {
             };
             let value = |x: &[f64]| regularizer(&w, [x[0], x[1], x[2]], x[3]).0;
             differences.check(&format!("{weights:?}"), &x, &gradient, 0..4, value);
+        }
+    }
+
+    #[test]
+    fn splats_that_the_frame_did_not_see_are_regularised_only_where_all_are() {
+        let weights = Regularizers {
+            opacity: 1.0,
+            scale: 3.0,
+            ..Regularizers::default()
+        };
+        let n = 21;
+        let splats = Splats::zeros(n, 0);
+        for level in Level::all() {
+            for (of, counted) in [(Regularized::Visible, 7.0), (Regularized::All, 21.0)] {
+                let mut gradients = SplatGradients {
+                    splats: Splats::zeros(n, 0),
+                    active: vec![0.0; splats.stride()],
+                    ..Default::default()
+                };
+                // What was not seen holds whatever an earlier frame left.
+                gradients.splats.log_scales.as_mut_slice().fill(f32::NAN);
+                gradients.splats.opacity_logits.as_mut_slice().fill(f32::NAN);
+                for i in (0..n).step_by(3) {
+                    gradients.active[i] = 1.0;
+                    gradients.splats.opacity_logits.set(0, i, 0.5);
+                    (0..3).for_each(|c| gradients.splats.log_scales.set(c, i, 0.5));
+                }
+                add_gradients(level, &splats, &weights, of, 2.0, &mut gradients);
+                for i in (0..n).filter(|i| i % 3 == 0 || of == Regularized::All) {
+                    // Opacity 1/2, whose slope is 1/4; s = 1, in units of 2 and by 3 axes: 1/2.
+                    let own = if i % 3 == 0 { 0.5 } else { 0.0 };
+                    let (logit, log_scale) = (own + 0.25 / counted, own + 0.5 / counted);
+                    assert!(
+                        (gradients.splats.opacity_logits.get(0, i) - logit).abs() < 1e-6,
+                        "{of:?} {i}"
+                    );
+                    let got = gradients.splats.log_scales.get(1, i);
+                    assert!((got - log_scale).abs() < 1e-6, "{of:?} {i}: {got}");
+                    assert_eq!(gradients.active[i] != 0.0, i % 3 == 0, "seen or not, as before");
+                }
+            }
         }
     }
 

@@ -1,6 +1,7 @@
+use crate::regularize::Regularized;
 use crate::{SplatGradients, Splats};
 use irradia_compute::Planes;
-use irradia_compute::adam::{AdamStep, adam};
+use irradia_compute::adam::{Active, AdamStep, adam};
 use irradia_compute::simd::Level;
 use rayon::prelude::*;
 
@@ -27,6 +28,16 @@ pub enum Statistics {
     AbsoluteGradient,
     /// The norm of the screen gradient, the error shown and the weight.
     Error,
+}
+
+/// Adam in one step.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Optimizer {
+    /// Its constants.
+    pub step: AdamStep,
+    /// Splats without a gradient, those out of view first of all, step with a gradient of zero (3DGS); otherwise they keep
+    /// parameters and moments.
+    pub dense: bool,
 }
 
 /// Learning rates of one step.
@@ -125,8 +136,17 @@ impl SplatState {
         self.gather(&order);
     }
 
-    /// One Adam step with `gradients`, on the splats that were active. SH bands above `sh_degree` rest.
-    pub fn step(&mut self, level: Level, gradients: &SplatGradients, rates: &Rates, sh_degree: u32, step: AdamStep) {
+    /// One Adam step with `gradients`. SH bands above `sh_degree` rest. `regularized` says of which splats the gradients of
+    /// ln scales and opacity logits are: of the active ones, or of all.
+    pub fn step(
+        &mut self,
+        level: Level,
+        gradients: &SplatGradients,
+        regularized: Regularized,
+        rates: &Rates,
+        sh_degree: u32,
+        optimizer: Optimizer,
+    ) {
         let mut sh = vec![0.0; self.splats.sh.count()];
         for (plane, rate) in sh
             .iter_mut()
@@ -135,12 +155,18 @@ impl SplatState {
         {
             *rate = if plane < 3 { rates.sh_dc } else { rates.sh_rest };
         }
-        let rates = [
-            vec![rates.means; 3],
-            vec![rates.quats; 4],
-            vec![rates.log_scales; 3],
-            vec![rates.opacities],
-            sh,
+        let active = &gradients.active[..];
+        let all: Vec<f32> = match regularized {
+            Regularized::Visible => Vec::new(),
+            Regularized::All => (0..active.len()).map(|i| f32::from(u8::from(i < self.len()))).collect(),
+        };
+        let shape_active = if all.is_empty() { active } else { &all[..] };
+        let rules = [
+            (vec![rates.means; 3], active),
+            (vec![rates.quats; 4], active),
+            (vec![rates.log_scales; 3], shape_active),
+            (vec![rates.opacities], shape_active),
+            (sh, active),
         ];
         let [first, second] = &mut self.moments;
         let columns = self
@@ -149,10 +175,15 @@ impl SplatState {
             .into_iter()
             .zip(first.columns_mut())
             .zip(second.columns_mut());
-        for (((parameters, first), second), (g, rates)) in
-            columns.zip(gradients.splats.columns().into_iter().zip(rates))
+        for (((parameters, first), second), (g, (rates, active))) in
+            columns.zip(gradients.splats.columns().into_iter().zip(rules))
         {
-            adam(level, parameters, g, [first, second], &rates, &gradients.active, step);
+            let active = if optimizer.dense {
+                Active::Dense(active)
+            } else {
+                Active::Sparse(active)
+            };
+            adam(level, parameters, g, [first, second], &rates, active, optimizer.step);
         }
     }
 

@@ -3,6 +3,7 @@
 
 pub mod checkpoint;
 pub mod compare;
+mod edges;
 pub mod eval;
 pub mod event;
 pub mod field_file;

@@ -1,5 +1,6 @@
 //! What a frame is compared by: every loss of the plan, added up with its gradients.
 
+use crate::edges::{edges, unit_range};
 use crate::photos::Prepared;
 use crate::recipe::Param;
 use crate::schedule::StepPlan;
@@ -32,6 +33,7 @@ pub struct Objective {
     v_alpha: Vec<f32>,
     v_depth: Vec<f32>,
     error: Vec<f32>,
+    edges: Vec<f32>,
     has: Has,
 }
 
@@ -77,6 +79,7 @@ impl Objective {
             v_alpha: Vec::new(),
             v_depth: Vec::new(),
             error: Vec::new(),
+            edges: Vec::new(),
             has: Has::default(),
         }
     }
@@ -192,6 +195,19 @@ impl Objective {
                 };
             }
         });
+    }
+
+    /// Mixes the photograph's edges into what [`Objective::error`] left, as the saliency of Taming 3DGS has them: each from
+    /// its least to its largest, `share` of edges to 1 - `share` of error.
+    pub fn add_edges(&mut self, photo: &Prepared, share: f32) {
+        edges(photo, &mut self.edges);
+        let (of_error, of_edges) = (unit_range(&self.error), unit_range(&self.edges));
+        for (i, (error, edge)) in self.error.iter_mut().zip(&self.edges).enumerate() {
+            let counts = photo.mask.as_ref().is_none_or(|mask| mask[i] != 0);
+            let mixed =
+                (1.0 - share) * (*error - of_error[0]) * of_error[1] + share * (edge - of_edges[0]) * of_edges[1];
+            *error = if counts { mixed } else { 0.0 };
+        }
     }
 
     /// The mean of what [`Objective::error`] left.

@@ -6,7 +6,7 @@ use crate::half_fit::HalfFit;
 use crate::model::Model;
 use crate::objective::{Objective, Reference};
 use crate::photos::{PhotoCache, Prepared};
-use crate::recipe::{Density, Param, Recipe};
+use crate::recipe::{AdamKind, Density, LengthUnit, Param, Recipe};
 use crate::schedule::{Clock, Round, Signal, StepPlan, coming_views, plan};
 use crate::socket::{Residual, Sockets};
 use cpu_time::ProcessTime;
@@ -17,7 +17,8 @@ use irradia_scene::{Camera, Dataset, LoadError, PointCloud, Rng, View, sh};
 use irradia_splat::densify::{DensityChange, classic, fast, mcmc, merge, taming};
 use irradia_splat::init::{self, InitOptions, Look};
 use irradia_splat::{
-    Engine, FramePlanes, Gather, Noise, RenderOptions, SplatState, Splats, Statistics, Update, ViewParams, filter,
+    Engine, FramePlanes, Gather, Noise, Optimizer, RenderOptions, SplatState, Splats, Statistics, Update, ViewParams,
+    filter,
 };
 use std::borrow::Cow;
 use std::collections::HashMap;
@@ -323,6 +324,9 @@ impl Trainer {
         let loss = self.objective.evaluate(frame, &reference, &plan, &mut rng);
         if plan.gathers == Some(Statistics::Error) {
             self.objective.error(frame.color, &photo, background.is_some());
+            if plan.edge_share > 0.0 {
+                self.objective.add_edges(&photo, plan.edge_share);
+            }
         }
         self.sockets
             .step_after_blending(&self.engine, view, self.objective.v_color_mut(), &plan);
@@ -377,15 +381,22 @@ impl Trainer {
         Update {
             statistics: plan.gathers,
             regularizers: plan.regularizers(),
-            extent: self.extent,
+            regularized: self.recipe.regularizers.of.into(),
+            regularizer_unit: match self.recipe.regularizers.unit {
+                LengthUnit::Extent => self.extent,
+                LengthUnit::World => 1.0,
+            },
             trained_fraction: plan.value(Param::TrainedShare),
             rates,
             sh_degree: plan.sh_degree,
-            adam: AdamStep {
-                beta1: adam.beta1,
-                beta2: adam.beta2,
-                epsilon: adam.epsilon,
-                step: self.clock.step + 1,
+            optimizer: Optimizer {
+                step: AdamStep {
+                    beta1: adam.beta1,
+                    beta2: adam.beta2,
+                    epsilon: adam.epsilon,
+                    step: self.clock.step + 1,
+                },
+                dense: adam.kind == AdamKind::Dense,
             },
             noise: (noise > 0.0).then_some(Noise {
                 amount: noise * rates.means,
@@ -428,7 +439,8 @@ impl Trainer {
             Density::Mcmc(knobs) => mcmc::densify(state, &knobs.options(self.pace, limit), &mut rng),
             Density::Taming(knobs) => {
                 let target = taming::next_count(state.len(), limit, round.share);
-                taming::densify(state, &knobs.options(self.extent, target), &mut rng)
+                let options = knobs.options(self.extent, round.prune_large, round.number, target);
+                taming::densify(state, &options, &mut rng)
             }
             Density::Fast(knobs) => fast::densify(state, &knobs.options(self.pace, limit)),
         }

@@ -2,8 +2,8 @@
 //! scene is not covered well; small splats there are cloned, large ones split; faint and oversized ones go.
 
 use super::DensityChange;
-use super::split::{is_finite, largest_scale, random_halves, rebuild};
-use crate::{SplatState, logit, sigmoid};
+use super::split::{is_finite, largest_scale, random_halves, rebuild, without};
+use crate::{SplatState, logit};
 use irradia_scene::Rng;
 
 /// Knobs, with the Inria code's names and defaults in the docs.
@@ -15,10 +15,9 @@ pub struct ClassicOptions {
     pub small: f32,
     /// Opacity below which a splat is removed; 0.005.
     pub min_opacity: f32,
-    /// Half size on screen in pixels above which a splat is removed; `None` until opacities were reset once; 20 (pixels of radius).
-    pub max_extent: Option<f32>,
-    /// World size above which a splat is removed when `max_extent` acts; 0.1 times the scene's extent.
-    pub max_scale: f32,
+    /// World size above which a splat is removed; `None` until opacities were reset once; 0.1 times the scene's extent. The Inria
+    /// code means to prune by size on screen too, but zeroes those sizes before it compares them.
+    pub max_scale: Option<f32>,
     /// Never more splats than this; the strongest gradients are served first.
     pub max_splats: usize,
     /// Give the copies of a clone the opacity 1 - sqrt(1 - o), so that the two together are as opaque as the one was
@@ -54,34 +53,33 @@ pub fn densify(state: &mut SplatState, options: &ClassicOptions, rng: &mut Rng) 
         .map(|i| logit((1.0 - (1.0 - splats.opacity(*i as usize)).sqrt()).max(1e-4)))
         .collect();
 
-    let mut removed = vec![false; n];
-    for i in &split {
-        removed[*i as usize] = true;
-    }
-    let mut pruned = 0;
-    for (i, removed) in removed.iter_mut().enumerate().filter(|(_, removed)| !**removed) {
-        let faint = sigmoid(splats.opacity_logits.get(0, i)) < options.min_opacity;
-        let huge = options.max_extent.is_some_and(|limit| {
-            state.statistics.get(SplatState::EXTENT, i) > limit || largest_scale(splats, i) > options.max_scale
-        });
-        if faint || huge || !is_finite(splats, i) {
-            *removed = true;
-            pruned += 1;
-        }
-    }
     if options.revised_opacity {
         for (copy, (i, logit)) in clone.iter().zip(&shared).enumerate() {
             clones.opacity_logits.set(0, copy, *logit);
             state.splats.opacity_logits.set(0, *i as usize, *logit);
         }
     }
-    let kept: Vec<u32> = (0..n as u32).filter(|i| !removed[*i as usize]).collect();
-    rebuild(state, &kept, &[&clones, &halves]);
+    let left = without(n, &split);
+    rebuild(state, &left, &[&clones, &halves]);
     DensityChange {
         cloned: clone.len(),
         split: split.len(),
-        pruned,
+        pruned: prune(state, options),
     }
+}
+
+/// Removes what is faint or oversized, new splats too; returns how many.
+fn prune(state: &mut SplatState, options: &ClassicOptions) -> usize {
+    let (n, splats) = (state.len(), &state.splats);
+    let stays = |i: usize| {
+        let oversized = options.max_scale.is_some_and(|limit| largest_scale(splats, i) > limit);
+        splats.opacity(i) >= options.min_opacity && !oversized && is_finite(splats, i)
+    };
+    let kept: Vec<u32> = (0..n as u32).filter(|i| stays(*i as usize)).collect();
+    if kept.len() < n {
+        state.gather(&kept);
+    }
+    n - kept.len()
 }
 
 /// Lowers every opacity to at most `ceiling` (0.01 in the Inria code) and forgets its moments: what the images need comes
@@ -106,8 +104,7 @@ mod tests {
             gradient_threshold: 1.0,
             small: 0.1,
             min_opacity: 0.005,
-            max_extent: None,
-            max_scale: 1.0,
+            max_scale: None,
             max_splats: 1000,
             revised_opacity: false,
         }
@@ -149,6 +146,20 @@ mod tests {
         let halves = scales.iter().filter(|v| (**v + 1.6f32.ln()).abs() < 1e-6).count();
         assert_eq!((halves, scales.iter().filter(|v| **v == -5.0).count()), (2, 2));
         assert!(s.statistics.as_slice().iter().all(|v| *v == 0.0));
+    }
+
+    #[test]
+    fn the_oversized_go_new_ones_too_and_what_lies_large_on_the_screen_stays() {
+        let items = [(0.0, 0.5, 0.0), (2.0, 0.5, 0.0), (1.0, 2.0, 0.0), (0.6, 2.0, 0.0)];
+        let limit = Some(1.2);
+        for (max_scale, pruned, left) in [(None, 0, 6), (limit, 1 + 2, 3)] {
+            let mut s = state(&items);
+            (0..4).for_each(|i| s.statistics.set(SplatState::EXTENT, i, 1e4));
+            let options = ClassicOptions { max_scale, ..options() };
+            let change = densify(&mut s, &options, &mut Rng::new(1, 1));
+            // Halves are smaller by 1.6: of e 1.70, of e^0.6 1.14.
+            assert_eq!((change.split, change.pruned, s.len()), (2, pruned, left));
+        }
     }
 
     #[test]

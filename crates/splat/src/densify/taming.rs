@@ -9,33 +9,42 @@ use irradia_scene::Rng;
 /// Knobs.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct TamingOptions {
-    /// How many splats there shall be after this round.
+    /// How many splats there shall be after this round, before it removes any.
     pub target: usize,
+    /// Mean screen gradient (normalised device coordinates) from which a splat may be densified; 0.0002.
+    pub gradient_threshold: f32,
     /// World size that divides what is cloned from what is split.
     pub small: f32,
-    /// Opacity below which a splat is removed; 0.005.
+    /// Opacity below which a splat may be removed; 0.005.
     pub min_opacity: f32,
+    /// World size above which a splat may be removed; `None` until opacities were reset once; 0.1 times the scene's extent.
+    pub max_scale: Option<f32>,
+    /// Whether the round removes splats; the authors' first 27 do.
+    pub prunes: bool,
     /// Weights of the score.
     pub weights: ScoreWeights,
 }
 
-/// How much each part of a splat's score counts, each part relative to its median over all splats. Defaults are the
-/// authors' for the parts that exist here; their saliency maps and view-space depth spread are left out.
+/// How much each part of a splat's score counts, each part relative to its median over the splats that have it. The authors'
+/// depth, distance and number of pixels are left out.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ScoreWeights {
-    /// Mean screen gradient; 50.
+    /// Mean screen gradient; 25.
     pub gradient: f32,
-    /// Mean error shown; 50, their "loss".
+    /// Mean error shown; 10, their "loss".
     pub error: f32,
-    /// Pixels covered, weighted; 0.1.
-    pub pixels: f32,
+    /// Mean blending weight; 50.
+    pub weight: f32,
     /// Opacity; 100.
     pub opacity: f32,
-    /// Half size on screen; 10.
+    /// Half size on screen; 10, their "radii".
     pub extent: f32,
-    /// World size; 25.
-    pub scale: f32,
+    /// Product of the standard deviations; 25, their "scale".
+    pub volume: f32,
 }
+
+/// Added to scores before they are inverted, so that those of zero can be.
+const SCORE_FLOOR: f32 = 1e-6;
 
 /// How many splats there shall be after a round: on the parabola that rises fastest at first and has its vertex at `last`
 /// when the stage ends (eq. 2), from `now` on. `share` is how much of the stage lies behind, now and at the round before.
@@ -45,28 +54,65 @@ pub fn next_count(now: usize, last: usize, share: [f64; 2]) -> usize {
     (last as f64 - room * (left / left_before.max(1e-9)).min(1.0)).round() as usize
 }
 
-/// Removes what is faint, then adds up to the target by score; clears the statistics and restores Morton order.
+/// Adds up to the target by score, then removes some of what is faint or oversized; clears the statistics and restores
+/// Morton order. What is not finite always goes.
 pub fn densify(state: &mut SplatState, options: &TamingOptions, rng: &mut Rng) -> DensityChange {
     let n = state.len();
-    let kept: Vec<u32> = (0..n as u32)
-        .filter(|i| state.splats.opacity(*i as usize) >= options.min_opacity && is_finite(&state.splats, *i as usize))
+    let finite: Vec<u32> = (0..n as u32)
+        .filter(|i| is_finite(&state.splats, *i as usize))
         .collect();
-    state.gather(&kept);
+    state.gather(&finite);
     let scores = scores(state, &options.weights);
-    let wanted = options.target.saturating_sub(state.len());
-    let chosen = draw_distinct(&scores, wanted, rng);
-    let (clone, split): (Vec<u32>, Vec<u32>) = chosen
-        .iter()
-        .partition(|i| largest_scale(&state.splats, **i as usize) <= options.small);
+    let [clone, split] = chosen(state, options, &scores, rng);
+    let mut removed = removed(state, options, &scores, rng);
+    // What is split is gone already.
+    removed.retain(|i| split.binary_search(i).is_err());
     let halves = random_halves(&state.splats, &split, rng);
     let clones = state.splats.gather(&clone);
-    let left = without(state.len(), &split);
+    let mut gone = [&split[..], &removed[..]].concat();
+    gone.sort_unstable();
+    let left = without(state.len(), &gone);
     rebuild(state, &left, &[&clones, &halves]);
     DensityChange {
         cloned: clone.len(),
         split: split.len(),
-        pruned: n - kept.len(),
+        pruned: n - finite.len() + removed.len(),
     }
+}
+
+/// What is cloned and what is split, ascending: the same share of the small and of the large that qualify, drawn by score.
+fn chosen(state: &SplatState, options: &TamingOptions, scores: &[f32], rng: &mut Rng) -> [Vec<u32>; 2] {
+    let qualifies = |i: usize| state.mean_statistic(SplatState::GRADIENT, i) >= options.gradient_threshold;
+    let is_small = |i: usize| largest_scale(&state.splats, i) <= options.small;
+    let qualified: Vec<usize> = (0..state.len()).filter(|i| qualifies(*i)).collect();
+    let room = options.target.saturating_sub(state.len()).min(qualified.len());
+    [true, false].map(|small| {
+        let mut weights = vec![0.0; state.len()];
+        let mut count = 0;
+        for i in qualified.iter().filter(|i| is_small(**i) == small) {
+            weights[*i] = scores[*i];
+            count += 1;
+        }
+        draw_distinct(&weights, room * count / qualified.len().max(1), rng)
+    })
+}
+
+/// What is removed, ascending: half as many as are faint or oversized are drawn of all, low scores first, and those of them
+/// go that are faint or oversized.
+fn removed(state: &SplatState, options: &TamingOptions, scores: &[f32], rng: &mut Rng) -> Vec<u32> {
+    if !options.prunes {
+        return Vec::new();
+    }
+    let splats = &state.splats;
+    let useless = |i: usize| {
+        splats.opacity(i) < options.min_opacity
+            || options.max_scale.is_some_and(|limit| largest_scale(splats, i) > limit)
+    };
+    let count = (0..state.len()).filter(|i| useless(*i)).count() / 2;
+    let weights: Vec<f32> = scores.iter().map(|score| 1.0 / (SCORE_FLOOR + score)).collect();
+    let mut drawn = draw_distinct(&weights, count, rng);
+    drawn.retain(|i| useless(*i as usize));
+    drawn
 }
 
 /// The weighted sum of the parts, each over its median; zero for what no frame has seen.
@@ -87,10 +133,12 @@ fn scores(state: &SplatState, weights: &ScoreWeights) -> Vec<f32> {
     };
     add(weights.gradient, &|i| state.mean_statistic(SplatState::GRADIENT, i));
     add(weights.error, &|i| state.mean_statistic(SplatState::ERROR, i));
-    add(weights.pixels, &|i| state.mean_statistic(SplatState::WEIGHT, i));
+    add(weights.weight, &|i| state.mean_statistic(SplatState::WEIGHT, i));
     add(weights.opacity, &|i| state.splats.opacity(i));
     add(weights.extent, &|i| state.statistics.get(SplatState::EXTENT, i));
-    add(weights.scale, &|i| largest_scale(&state.splats, i));
+    add(weights.volume, &|i| {
+        (0..3).map(|c| state.splats.log_scales.get(c, i)).sum::<f32>().exp()
+    });
     for (i, score) in scores.iter_mut().enumerate() {
         if state.statistics.get(SplatState::SEEN, i) == 0.0 {
             *score = 0.0;
@@ -104,12 +152,33 @@ mod tests {
     use super::*;
     use crate::{Splats, logit};
 
-    #[test]
-    fn the_count_is_exact_and_the_unseen_are_not_copied() {
+    fn options(target: usize) -> TamingOptions {
+        TamingOptions {
+            target,
+            gradient_threshold: 2.0,
+            small: 0.5,
+            min_opacity: 0.005,
+            max_scale: None,
+            prunes: false,
+            weights: ScoreWeights {
+                gradient: 25.0,
+                error: 10.0,
+                weight: 50.0,
+                opacity: 100.0,
+                extent: 10.0,
+                volume: 25.0,
+            },
+        }
+    }
+
+    /// 40 splats on the x axis, the first four faint, every second one large; a gradient of x, but no frame saw the last ten.
+    fn state() -> SplatState {
         let mut splats = Splats::zeros(40, 0);
         for i in 0..40 {
             splats.means.set(0, i, i as f32);
             splats.quats.set(0, i, 1.0);
+            let size = if i % 2 == 0 { 1.0f32 } else { 0.1 };
+            (0..3).for_each(|c| splats.log_scales.set(c, i, size.ln()));
             splats.opacity_logits.set(0, i, logit(if i < 4 { 0.001 } else { 0.5 }));
         }
         let mut s = SplatState::new(splats);
@@ -117,26 +186,48 @@ mod tests {
             let x = s.splats.means.get(0, i);
             if x < 30.0 {
                 s.statistics.set(SplatState::SEEN, i, 2.0);
-                s.statistics.set(SplatState::GRADIENT, i, x);
+                s.statistics.set(SplatState::GRADIENT, i, 2.0 * x);
             }
         }
-        let options = TamingOptions {
-            target: 50,
-            small: 0.5,
-            min_opacity: 0.005,
-            weights: ScoreWeights {
-                gradient: 50.0,
-                error: 50.0,
-                pixels: 0.1,
-                opacity: 100.0,
-                extent: 10.0,
-                scale: 25.0,
-            },
+        s
+    }
+
+    #[test]
+    fn the_count_is_exact_and_only_steep_gradients_are_densified() {
+        let mut s = state();
+        let change = densify(&mut s, &options(50), &mut Rng::new(1, 1));
+        // Of the 28 that qualify, x from 2 to 29, half are small and half are large.
+        assert_eq!((s.len(), change.cloned, change.split, change.pruned), (50, 5, 5, 0));
+        let mut s = state();
+        densify(&mut s, &options(500), &mut Rng::new(1, 1));
+        assert_eq!(s.len(), 40 + 28, "no more than qualify");
+        let small = |s: &SplatState, x: f32| (0..s.len()).filter(|i| s.splats.means.get(0, *i) == x).count();
+        assert_eq!([1.0, 3.0, 29.0, 31.0].map(|x| small(&s, x)), [1, 2, 2, 1]);
+    }
+
+    #[test]
+    fn half_of_the_useless_are_drawn_the_lowest_scores_first() {
+        let prunes = TamingOptions {
+            max_scale: Some(0.5),
+            prunes: true,
+            ..options(0)
         };
-        let change = densify(&mut s, &options, &mut Rng::new(1, 1));
-        assert_eq!((s.len(), change.pruned, change.cloned + change.split), (50, 4, 14));
-        let unseen = (0..50).filter(|i| s.splats.means.get(0, *i) > 33.5).count();
-        assert_eq!(unseen, 6, "those that no frame saw are left as they are");
+        let mut s = state();
+        let change = densify(&mut s, &prunes, &mut Rng::new(1, 1));
+        // 22 are faint or large, so eleven are drawn; the ten unseen, whose score is 0, come first, and five of them are large.
+        assert!((5..=6).contains(&change.pruned), "{change:?}");
+        assert_eq!(s.len(), 40 - change.pruned);
+        let unseen = (0..s.len()).filter(|i| s.splats.means.get(0, *i) > 29.5).count();
+        assert_eq!(unseen, 5);
+        let none = densify(
+            &mut state(),
+            &TamingOptions {
+                prunes: false,
+                ..prunes
+            },
+            &mut Rng::new(1, 1),
+        );
+        assert_eq!(none.pruned, 0);
     }
 
     #[test]

@@ -96,7 +96,7 @@ fn intermediate<F: Lanes>(view: &ViewLanes<F>, g: &Geometry<F>, filter: Option<F
     let two = view.near.splat(2.0);
     let x = unroll!(i in 3 => dot(view.r[i], g.mean) + view.t[i]);
     let inv_z = one / x[2];
-    let tangent = unroll!(i in 2 => (x[i] * inv_z).min(view.limit[i]).max(-view.limit[i]));
+    let tangent = unroll!(i in 2 => (x[i] * inv_z).min(view.limits[i][1]).max(view.limits[i][0]));
     let inv_q_norm =
         one / (g.quat[0] * g.quat[0] + g.quat[1] * g.quat[1] + g.quat[2] * g.quat[2] + g.quat[3] * g.quat[3]).sqrt();
     let q = unroll!(n in 4 => g.quat[n] * inv_q_norm);
@@ -320,7 +320,8 @@ pub(super) fn project_vjp<F: Lanes>(
         v_x[2] -= v_j_scale * j_scale * at.inv_z;
         let v_tangent = -j_scale * dot(v_jr[r], view.r[2]);
         let tangent = at.x[r] * at.inv_z;
-        let v_tangent = v_tangent.masked(tangent.abs().lt(view.limit[r]));
+        let [least, largest] = view.limits[r];
+        let v_tangent = v_tangent.masked(least.lt(tangent).and(tangent.lt(largest)));
         // The pixel position moves with the tangent too, unclamped.
         let v_free = v_tangent + v_out.xy[r] * view.f[r];
         v_x[r] += v_free * at.inv_z;

@@ -63,21 +63,27 @@ impl ViewParams {
         CameraGradient { rotation, translation }
     }
 
-    /// `|X / Z|` beyond which J is evaluated at the limit: Inria's 1.3 tan(fov / 2), about the axis.
-    pub fn tangent_limit(&self) -> [f64; 2] {
-        let size = [self.width, self.height];
-        std::array::from_fn(|i| 1.3 * 0.5 * f64::from(size[i]) / self.focal[i])
+    /// The least and the largest `X / Z` and `Y / Z`; beyond them J is evaluated at the limit. They lie 0.3 tan(fov / 2)
+    /// outside the image's borders wherever the principal point is (gsplat); Inria's lie about the axis, which is the same
+    /// where it is centred.
+    pub fn tangent_limits(&self) -> [[f64; 2]; 2] {
+        let size = [self.width, self.height].map(f64::from);
+        std::array::from_fn(|i| {
+            let (focal, principal) = (self.focal[i], self.principal[i]);
+            let margin = 0.3 * 0.5 * size[i] / focal;
+            [-(principal / focal + margin), (size[i] - principal) / focal + margin]
+        })
     }
 
     #[inline(always)]
     pub(super) fn lanes<S: Simd>(&self, simd: S) -> ViewLanes<S::F> {
-        let (limit, center) = (self.tangent_limit(), self.center());
+        let (limits, center) = (self.tangent_limits(), self.center());
         ViewLanes {
             r: unroll!(i in 3 => unroll!(j in 3 => simd.splat(self.rotation[i][j]))),
             t: unroll!(i in 3 => simd.splat(self.translation[i])),
             f: unroll!(i in 2 => simd.splat(self.focal[i])),
             c: unroll!(i in 2 => simd.splat(self.principal[i])),
-            limit: unroll!(i in 2 => simd.splat(limit[i])),
+            limits: unroll!(i in 2 => unroll!(j in 2 => simd.splat(limits[i][j]))),
             size: [simd.splat(f64::from(self.width)), simd.splat(f64::from(self.height))],
             center: unroll!(i in 3 => simd.splat(center[i])),
             near: simd.splat(self.near),
@@ -91,7 +97,7 @@ pub(super) struct ViewLanes<F> {
     pub t: [F; 3],
     pub f: [F; 2],
     pub c: [F; 2],
-    pub limit: [F; 2],
+    pub limits: [[F; 2]; 2],
     pub size: [F; 2],
     pub center: [F; 3],
     pub near: F,

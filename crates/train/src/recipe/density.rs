@@ -38,7 +38,17 @@ impl Density {
     pub fn reset(&self) -> Option<(u64, f32)> {
         match self {
             Density::Classic(knobs) => (knobs.reset_every > 0).then_some((knobs.reset_every, knobs.reset_to)),
-            Density::Mcmc(_) | Density::Taming(_) | Density::Fast(_) => None,
+            Density::Taming(knobs) => (knobs.reset_every > 0).then_some((knobs.reset_every, knobs.reset_to)),
+            Density::Mcmc(_) | Density::Fast(_) => None,
+        }
+    }
+
+    /// Whether its statistics begin in the stage before, as those of the 3DGS code begin with the run and not with
+    /// `densify_from_iter`.
+    pub fn gathers_ahead(&self) -> bool {
+        match self {
+            Density::Classic(_) | Density::Taming(_) => true,
+            Density::Mcmc(_) | Density::Fast(_) => false,
         }
     }
 
@@ -47,6 +57,14 @@ impl Density {
         match self {
             Density::Fast(_) => pace.max(1.0).powf(-0.5),
             Density::Classic(_) | Density::Mcmc(_) | Density::Taming(_) => 1.0,
+        }
+    }
+
+    /// Share of the photograph's edges in the error that is gathered for it.
+    pub fn edge_share(&self) -> f32 {
+        match self {
+            Density::Taming(knobs) => knobs.edge_share,
+            Density::Classic(_) | Density::Mcmc(_) | Density::Fast(_) => 0.0,
         }
     }
 
@@ -79,8 +97,6 @@ documented! {
         pub small: f32,
         /// Opacity below which a splat is removed.
         pub min_opacity: f32,
-        /// Half size on screen above which a splat is removed, pixels, once opacities were reset.
-        pub max_extent: f32,
         /// World size above which a splat is removed, in units of the scene's extent, once opacities were reset.
         pub max_scale: f32,
         /// Steps (of the run, not stretched) between resets of the opacities; 0 for never.
@@ -97,8 +113,7 @@ impl ClassicKnobs {
             gradient_threshold: self.gradient_threshold,
             small: self.small * extent,
             min_opacity: self.min_opacity,
-            max_extent: prune_large.then_some(self.max_extent),
-            max_scale: self.max_scale * extent,
+            max_scale: prune_large.then_some(self.max_scale * extent),
             max_splats,
             revised_opacity: self.revised_opacity,
         }
@@ -137,39 +152,54 @@ documented! {
     pub struct TamingKnobs {
         /// Steps (of the run, not stretched) between rounds, at least 1.
         pub every: u64,
+        /// Mean screen gradient, normalised device coordinates, from which a splat may be densified.
+        pub gradient_threshold: f32,
         /// Size that divides what is cloned from what is split, in units of the scene's extent.
         pub small: f32,
-        /// Opacity below which a splat is removed.
+        /// Opacity below which a splat may be removed.
         pub min_opacity: f32,
+        /// World size above which a splat may be removed, in units of the scene's extent, once opacities were reset.
+        pub max_scale: f32,
+        /// Rounds, from the stage's first, that remove splats.
+        pub prune_rounds: u64,
+        /// Steps (of the run, not stretched) between resets of the opacities; 0 for never.
+        pub reset_every: u64,
+        /// Opacity that a reset leaves at most.
+        pub reset_to: f32,
+        /// Share of the photograph's edges in the error that pixels give to the score, 0 to 1; the rest is the absolute difference.
+        pub edge_share: f32,
         /// Weight of the mean screen gradient in the score.
         pub score_gradient: f32,
         /// Weight of the mean error shown in the score.
         pub score_error: f32,
-        /// Weight of the pixels covered in the score.
-        pub score_pixels: f32,
+        /// Weight of the mean blending weight in the score.
+        pub score_weight: f32,
         /// Weight of the opacity in the score.
         pub score_opacity: f32,
         /// Weight of the half size on screen in the score.
         pub score_extent: f32,
-        /// Weight of the world size in the score.
-        pub score_scale: f32,
+        /// Weight of the volume in the score.
+        pub score_volume: f32,
     }
 }
 
 impl TamingKnobs {
-    /// With sizes in world units.
-    pub fn options(&self, extent: f32, target: usize) -> TamingOptions {
+    /// With sizes in world units, for round number `round` of the stage, from 1.
+    pub fn options(&self, extent: f32, prune_large: bool, round: u64, target: usize) -> TamingOptions {
         TamingOptions {
             target,
+            gradient_threshold: self.gradient_threshold,
             small: self.small * extent,
             min_opacity: self.min_opacity,
+            max_scale: prune_large.then_some(self.max_scale * extent),
+            prunes: round <= self.prune_rounds,
             weights: ScoreWeights {
                 gradient: self.score_gradient,
                 error: self.score_error,
-                pixels: self.score_pixels,
+                weight: self.score_weight,
                 opacity: self.score_opacity,
                 extent: self.score_extent,
-                scale: self.score_scale,
+                volume: self.score_volume,
             },
         }
     }

@@ -4,7 +4,7 @@
 use super::edit_distance;
 use super::{
     AdamKnobs, ClassicKnobs, Exit, FastKnobs, FieldKnobs, Group, Ingredients, InitKnobs, McmcKnobs, MergeKnobs, Param,
-    Recipe, RenderKnobs, ResidualKnobs, Stage, TamingKnobs,
+    Recipe, RegularizerKnobs, RenderKnobs, ResidualKnobs, Stage, TamingKnobs,
 };
 use std::collections::BTreeSet;
 
@@ -104,7 +104,7 @@ impl Documented {
             "u32" | "u64" | "usize" => "whole number",
             "String" => "text",
             "[f32; 3]" => "three numbers",
-            "FieldSpace" | "Represents" => "one word",
+            "AdamKind" | "FieldSpace" | "LengthUnit" | "RegularizedKind" | "Represents" => "one word",
             "Vec<Stage>" => "tables",
             _ => "table",
         };
@@ -113,7 +113,10 @@ impl Documented {
             (true, "bool") if self.serde.contains("\"on\"") => "true",
             (true, "bool") => "false",
             (true, "f32" | "u32" | "u64" | "usize") => "0",
+            (true, "AdamKind") => "sparse",
             (true, "FieldSpace") => "auto",
+            (true, "LengthUnit") => "extent",
+            (true, "RegularizedKind") => "visible",
             (true, "Represents") => "splats",
             (true, _) => "absent",
         };
@@ -162,11 +165,16 @@ impl Param {
 /// All keys, section by section.
 pub fn keys() -> Vec<Key> {
     let density = "stage.STAGE.density";
-    let tables: [(&str, &str, &[Documented]); 13] = [
+    let tables: [(&str, &str, &[Documented]); 14] = [
         ("The recipe", "", Recipe::KEYS),
         ("Rendering", "render", RenderKnobs::KEYS),
         ("First splats", "init", InitKnobs::KEYS),
         ("Adam", "adam", AdamKnobs::KEYS),
+        (
+            "Losses on the splats themselves",
+            "regularizers",
+            RegularizerKnobs::KEYS,
+        ),
         ("Ingredients of a curriculum", "ingredients", Ingredients::KEYS),
         ("Stages", "stage.STAGE", Stage::KEYS),
         ("Density control, `strategy = \"classic\"`", density, ClassicKnobs::KEYS),

@@ -10,6 +10,7 @@ mod table;
 pub use ablation::Ingredients;
 pub use density::{ClassicKnobs, Density, FastKnobs, McmcKnobs, MergeKnobs, TamingKnobs};
 pub use field::{FieldKnobs, FieldSpace, ResidualKnobs};
+use irradia_splat::regularize::Regularized;
 use keys::documented;
 use param::check_knob;
 pub use param::{Knob, Params, Shape, Values};
@@ -17,10 +18,11 @@ use serde::{Deserialize, Serialize};
 pub use table::{Group, Param, Row};
 
 /// The recipes that come with the program: name and text.
-pub const BUILT_IN: [(&str, &str); 11] = [
+pub const BUILT_IN: [(&str, &str); 12] = [
     ("classic", include_str!("../../recipes/classic.toml")),
     ("absgrad", include_str!("../../recipes/absgrad.toml")),
     ("mcmc", include_str!("../../recipes/mcmc.toml")),
+    ("mcmc-tuned", include_str!("../../recipes/mcmc-tuned.toml")),
     ("taming", include_str!("../../recipes/taming.toml")),
     ("fast", include_str!("../../recipes/fast.toml")),
     ("curriculum", include_str!("../../recipes/curriculum.toml")),
@@ -84,6 +86,9 @@ documented! {
         pub init: InitKnobs,
         /// Adam's constants.
         pub adam: AdamKnobs,
+        /// What the losses on the splats themselves are taken over.
+        #[serde(default, skip_serializing_if = "RegularizerKnobs::is_default")]
+        pub regularizers: RegularizerKnobs,
         /// What of a curriculum is in force.
         #[serde(default, skip_serializing_if = "Ingredients::are_all")]
         pub ingredients: Ingredients,
@@ -149,7 +154,79 @@ documented! {
         pub beta2: f32,
         /// Added to the root of the second moment.
         pub epsilon: f32,
+        /// `dense`: every splat steps, with a gradient of zero where the frame did not see it, as in 3DGS. `sparse`: those that
+        /// the frame did not see keep parameters and moments.
+        #[serde(default, skip_serializing_if = "AdamKind::is_sparse")]
+        pub kind: AdamKind,
     }
+}
+
+/// Which splats Adam steps.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum AdamKind {
+    /// Those with a gradient.
+    #[default]
+    Sparse,
+    /// All.
+    Dense,
+}
+
+impl AdamKind {
+    fn is_sparse(&self) -> bool {
+        *self == Self::Sparse
+    }
+}
+
+documented! {
+    /// What the losses on the splats themselves are taken over.
+    #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+    #[serde(deny_unknown_fields)]
+    pub struct RegularizerKnobs {
+        /// The splats of which they are a mean: `visible`, those that the frame saw, or `all`.
+        #[serde(default)]
+        pub of: RegularizedKind,
+        /// The unit of sizes: `extent`, the scene's, or `world`, the dataset's own.
+        #[serde(default)]
+        pub unit: LengthUnit,
+    }
+}
+
+impl RegularizerKnobs {
+    fn is_default(&self) -> bool {
+        *self == Self::default()
+    }
+}
+
+/// Splats that are regularised.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum RegularizedKind {
+    /// Those that the frame saw.
+    #[default]
+    Visible,
+    /// All.
+    All,
+}
+
+impl From<RegularizedKind> for Regularized {
+    fn from(kind: RegularizedKind) -> Self {
+        match kind {
+            RegularizedKind::Visible => Self::Visible,
+            RegularizedKind::All => Self::All,
+        }
+    }
+}
+
+/// A unit of length.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum LengthUnit {
+    /// The scene's extent.
+    #[default]
+    Extent,
+    /// The dataset's own.
+    World,
 }
 
 documented! {
@@ -341,6 +418,14 @@ impl Recipe {
             {
                 return Err(format!(
                     "stage.{}: density.every and merge.every must be at least 1",
+                    stage.name
+                ));
+            }
+            if let Some(Density::Taming(knobs)) = &stage.density
+                && !(0.0..=1.0).contains(&knobs.edge_share)
+            {
+                return Err(format!(
+                    "stage.{}.density.edge_share must lie between 0 and 1",
                     stage.name
                 ));
             }

@@ -1,6 +1,8 @@
 //! Everything that depends on time. [`plan`] is pure: what one step does. [`Clock::tick`] moves on by one step.
 
 mod outline;
+#[cfg(test)]
+mod published;
 mod watch;
 
 pub use outline::{Ahead, Moment, ahead, outline};
@@ -61,6 +63,8 @@ pub struct StepPlan {
     pub values: Values,
     /// Density statistics to gather.
     pub gathers: Option<Statistics>,
+    /// Share of the photograph's edges in the error that is gathered.
+    pub edge_share: f32,
     /// A round of density control, after the step.
     pub densify: Option<Round>,
     /// Adjacent splats are merged, after the step.
@@ -86,6 +90,8 @@ pub struct Round {
     pub density: Density,
     /// Whether oversized splats go too.
     pub prune_large: bool,
+    /// Which round of the stage it is, from 1.
+    pub number: u64,
     /// Splats there may be, as a share of the cap.
     pub count_share: f64,
     /// How much of the stage lies behind, now and at the round before.
@@ -260,12 +266,15 @@ pub fn plan(recipe: &Recipe, clock: &Clock) -> StepPlan {
     // Counted as people do: after the step that makes it the n-th.
     let in_stage = clock.step + 1 - clock.stage_step;
     let density = stage.density;
+    let next = recipe.stage.get(clock.stage + 1).and_then(|stage| stage.density);
+    let gathers = density.or(next.filter(Density::gathers_ahead));
     let measured = matches!(stage.exit, Some(Exit::Threshold { .. } | Exit::Relative { .. }));
     StepPlan {
         image_scale: values[Param::ImageScale] as f32,
         sh_degree: values[Param::ShDegree] as u32,
         values,
-        gathers: density.map(|density| density.statistics()),
+        gathers: gathers.map(|density| density.statistics()),
+        edge_share: gathers.map_or(0.0, |density| density.edge_share()),
         densify: density
             .filter(|density| in_stage.is_multiple_of(density.every()))
             .map(|density| {
@@ -275,6 +284,7 @@ pub fn plan(recipe: &Recipe, clock: &Clock) -> StepPlan {
                 Round {
                     density,
                     prune_large: clock.was_reset,
+                    number: in_stage / density.every(),
                     count_share: values[Param::CountShare],
                     share: [share, before],
                 }
@@ -359,7 +369,6 @@ mod tests {
             gradient_threshold = 1.0
             small = 0.01
             min_opacity = 0.005
-            max_extent = 20
             max_scale = 0.1
             reset_every = 6
             reset_to = 0.01
@@ -413,7 +422,10 @@ mod tests {
             .map(|i| i + 1)
             .collect();
         assert_eq!(resets, [12, 18]);
-        assert!(p[9].gathers.is_none() && p[10].gathers.is_some());
+        assert!(
+            p.iter().all(|plan| plan.gathers.is_some()),
+            "statistics begin in the stage before"
+        );
         assert_eq!(
             (0..20).filter(|i| p[*i].evaluate).map(|i| i + 1).collect::<Vec<_>>(),
             [7, 14]

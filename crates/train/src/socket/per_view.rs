@@ -1,7 +1,7 @@
 //! Adam for a few numbers of each view: a view's numbers move only in the steps that show it.
 
 use crate::tensor_file::{NamedTensor, TensorSource};
-use irradia_compute::adam::{AdamStep, adam};
+use irradia_compute::adam::{Active, AdamStep, adam};
 use irradia_compute::{Level, Planes};
 
 /// Adam's constants as published (Kingma and Ba 2015).
@@ -54,7 +54,7 @@ impl<const N: usize> PerViewAdam<N> {
             &gradient,
             [&mut first, &mut second],
             &rates,
-            &active,
+            Active::Sparse(&active),
             step,
         );
         for (moments, new) in self.moments.iter_mut().zip([&first, &second]) {

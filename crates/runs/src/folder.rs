@@ -130,6 +130,12 @@ impl RunFolder {
         Ok((run, record))
     }
 
+    /// `run.json` of the run that the scene `path`, a file or a run's folder, lies in; `None` where it lies in none.
+    pub fn around(path: &Path) -> Option<RunRecord> {
+        let folder = if path.is_dir() { path } else { path.parent()? };
+        serde_json::from_slice(&fs::read(folder.join("run.json")).ok()?).ok()
+    }
+
     /// Removes the temporary files that a killed process could not remove.
     fn remove_leftovers(&self) -> Result<(), RunError> {
         for folder in FOLDERS.map(|folder| self.file(folder)).iter().chain([&self.0]) {

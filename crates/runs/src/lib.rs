@@ -37,6 +37,7 @@
 //! [`scene`] the plain types and their conventions.
 #![forbid(unsafe_code)]
 
+mod background;
 mod describe;
 mod error;
 mod evaluate;
@@ -50,9 +51,10 @@ mod scene_file;
 mod snapshot;
 mod synth_files;
 
+pub use background::Background;
 pub use describe::describe;
 pub use error::RunError;
-pub use evaluate::{evaluate, file_stem};
+pub use evaluate::{distinct, evaluate, file_stem, file_stems, unmeasured};
 pub use folder::{FIELD, RESIDUAL, RunFolder, RunRecord, SCENE};
 pub use irradia_formats as formats;
 pub use irradia_scene as scene;
@@ -73,7 +75,7 @@ pub mod prelude {
     pub use crate::train::event::{Event, Observer, Signal};
     pub use crate::train::{Recipe, Trainer};
     pub use crate::{
-        Finished, Reading, Run, RunError, RunFolder, Scene, Snapshot, Snapshots, TrainInput, TrainRequest, describe,
-        evaluate, write_image, write_synth_dataset,
+        Background, Finished, Reading, Run, RunError, RunFolder, Scene, Snapshot, Snapshots, TrainInput, TrainRequest,
+        describe, evaluate, write_image, write_synth_dataset,
     };
 }

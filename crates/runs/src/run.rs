@@ -3,7 +3,7 @@
 use crate::folder::RunRecord;
 use crate::journal::Journal;
 use crate::snapshot::{SnapshotServer, Snapshots};
-use crate::{RunError, RunFolder, TrainRequest};
+use crate::{RunError, RunFolder, TrainRequest, background};
 use irradia_measure::Lpips;
 use irradia_scene::Dataset;
 use irradia_train::event::Observer;
@@ -67,7 +67,14 @@ impl Run {
     ///
     /// # Errors
     /// Those of [`Run::begin`].
-    pub fn begin_on(request: TrainRequest, dataset: Dataset) -> Result<Self, RunError> {
+    pub fn begin_on(mut request: TrainRequest, dataset: Dataset) -> Result<Self, RunError> {
+        if dataset.test.is_empty()
+            && let Some(psnr) = request.input.until_psnr
+        {
+            let message = "no view is held out, so that nothing can be measured";
+            return Err(RunError::setting("until_psnr", psnr, message));
+        }
+        request.choose_background(&dataset)?;
         let out = &request.input.out;
         RunFolder::check_free(out, request.input.overwrite)?;
         let options = train_options(&request)?;
@@ -129,6 +136,11 @@ impl Run {
     /// What was asked for.
     pub fn request(&self) -> &TrainRequest {
         &self.request
+    }
+
+    /// What it trains over and is scored over, for people.
+    pub fn background(&self) -> String {
+        background::in_words(&self.trainer.recipe)
     }
 
     /// The folder.

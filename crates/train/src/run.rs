@@ -1,6 +1,6 @@
 //! The loop around [`Trainer::step`]: when to stop, when to look, whom to tell.
 
-use crate::eval::{EvalOptions, Metrics, evaluate_views};
+use crate::eval::{EvalOptions, Metrics, evaluate_views, mean};
 use crate::event::{Event, Observer, Signal, StepReport};
 use crate::forecast::Forecast;
 use crate::half_fit::HalfFit;
@@ -87,13 +87,15 @@ pub fn run(
         if looks && !trainer.dataset.test.is_empty() {
             let (step, seconds, splats) = (trainer.clock.step, trainer.seconds, trainer.engine.len());
             let psnr = held_out_psnr(trainer)?;
-            events.push(Event::Evaluated {
-                step,
-                seconds,
-                psnr,
-                splats,
-                parameters: trainer.parameters(),
-            });
+            if !psnr.is_nan() {
+                events.push(Event::Evaluated {
+                    step,
+                    seconds,
+                    psnr,
+                    splats,
+                    parameters: trainer.parameters(),
+                });
+            }
             if limits.until_psnr.is_some_and(|limit| psnr >= limit) {
                 reason = Some("held-out PSNR reached");
             }
@@ -172,22 +174,22 @@ fn wait_while_paused(
     wishes.stop |= tell(trainer, events, observers).stop;
 }
 
-/// Mean PSNR over the held-out views, with the SH bands in use now.
+/// Mean PSNR over the held-out views, with the SH bands in use now; NaN where none could be measured.
 fn held_out_psnr(trainer: &Trainer) -> Result<f64, TrainError> {
     let options = EvalOptions {
         render: trainer.render_options(plan(&trainer.recipe, &trainer.clock).sh_degree),
         metrics: Metrics::Psnr,
         half_fit: HalfFit::default(),
     };
-    let mut psnr = Vec::new();
+    let mut metrics = Vec::new();
     evaluate_views(
         &trainer.scene(),
         &trainer.dataset,
         &trainer.dataset.test,
         &options,
         |view| {
-            psnr.push(view.metrics.psnr);
+            metrics.push(view.metrics);
         },
     )?;
-    Ok(psnr.iter().sum::<f64>() / psnr.len() as f64)
+    Ok(mean(&metrics).psnr)
 }

@@ -15,8 +15,8 @@ use irradia_runs::formats::write_atomic;
 use irradia_runs::train::compare::{
     Comparison, Figures, PictureRow, Render, Run, Scene, overall, picture, to_html, to_markdown, to_text,
 };
-use irradia_runs::train::report::{Report, machine};
-use irradia_runs::{RunFolder, file_stem, logged_errors, read_recipe};
+use irradia_runs::train::report::{Report, ViewReport, machine};
+use irradia_runs::{Background, RunFolder, distinct, file_stem, logged_errors, read_recipe};
 use serde::{Deserialize, Serialize};
 use std::fs::{self, File};
 use std::path::{Path, PathBuf};
@@ -61,6 +61,10 @@ pub struct Args {
     /// LPIPS weights: a file, or a folder of them; see irradia lpips
     #[arg(long, value_name = "PATH")]
     pub lpips: Option<PathBuf>,
+    /// white, black or random (trained over random colours, scored over white): what photographs with alpha are laid over;
+    /// white for Blender scenes and the recipe's own for others when absent
+    #[arg(long, value_name = "COLOR")]
+    pub background: Option<Background>,
     #[command(flatten)]
     pub reading: DataArgs,
 }
@@ -106,7 +110,7 @@ pub fn run(args: &Args) -> Result<()> {
     if let Some(data) = args.data.iter().find(|data| !data.exists()) {
         return Err(Usage(format!("{} does not exist: give a dataset's folder", data.display())).into());
     }
-    let names = distinct(args.data.iter().map(|data| folder_name(data)).collect());
+    let names = distinct(args.data.iter().map(|data| folder_name(data)));
     if !args.overwrite {
         check_earlier(args, &ways, &names)?;
     }
@@ -214,7 +218,7 @@ fn ways(args: &Args) -> Result<Vec<Way>> {
             folder: folder_name(Path::new(text)),
         });
     }
-    let folders = distinct(ways.iter().map(|way| way.folder.clone()).collect());
+    let folders = distinct(ways.iter().map(|way| way.folder.clone()));
     for (way, folder) in ways.iter_mut().zip(folders) {
         way.folder = folder;
     }
@@ -229,19 +233,6 @@ fn folder_name(path: &Path) -> String {
     // `file_stem` would take what stands behind a dot in a change for an extension.
     let name = file_stem(&format!("{name}.x"));
     if name.is_empty() { "scene".into() } else { name }
-}
-
-/// The same names, those that came before with a number.
-fn distinct(names: Vec<String>) -> Vec<String> {
-    let mut taken: Vec<String> = Vec::new();
-    for name in names {
-        let numbered = (2..).map(|n| format!("{name}_{n}"));
-        let free = std::iter::once(name.clone())
-            .chain(numbered)
-            .find(|n| !taken.contains(n));
-        taken.extend(free);
-    }
-    taken
 }
 
 fn request(args: &Args, data: &Path, way: &Way, seed: u64) -> Request {
@@ -263,10 +254,13 @@ fn request(args: &Args, data: &Path, way: &Way, seed: u64) -> Request {
     option("--threads", args.threads.map(|n| n.to_string()));
     option("--lpips", args.lpips.as_ref().map(|path| path.display().to_string()));
     option("--format", args.reading.format.clone());
-    match args.reading.max_side {
+    let reading = args.reading.reading();
+    match reading.max_side {
         Some(side) => option("--max-side", Some(side.to_string())),
-        None => option("--downscale", Some(args.reading.downscale.to_string())),
+        None => option("--downscale", Some(reading.downscale.to_string())),
     }
+    option("--holdout", reading.holdout);
+    option("--background", args.background.map(|b| b.name().to_owned()));
     Request {
         arguments,
         recipe_hash: way.hash.clone(),
@@ -374,7 +368,8 @@ fn held_out_view(out: &Path, trained: &[Vec<Trained>]) -> Option<PictureRow> {
         .map(|runs| first(runs).and_then(|i| Some((&runs[i].run, runs[i].report.as_ref()?))))
         .collect();
     let (run, report) = firsts.iter().flatten().next()?;
-    let mut views: Vec<_> = report.views.iter().filter(|view| !view.truth.is_empty()).collect();
+    let measured = |view: &&ViewReport| !view.truth.is_empty() && !view.psnr.is_nan();
+    let mut views: Vec<_> = report.views.iter().filter(measured).collect();
     views.sort_by(|a, b| a.psnr.total_cmp(&b.psnr));
     let view = views.get(views.len() / 2)?;
     let embedded = |run: &Run, file: &str| {
@@ -416,14 +411,17 @@ fn conditions(args: &Args) -> Vec<String> {
         (None, Some(seconds)) => format!("{seconds} s of training"),
         (None, None) => "whole recipes".into(),
     };
-    let size = match args.reading.max_side {
+    let reading = args.reading.reading();
+    let size = match reading.max_side {
         Some(side) => Some(format!("images of at most {side} px")),
-        None if args.reading.downscale > 1.0 => Some(format!("images downscaled by {}", args.reading.downscale)),
+        None if reading.downscale > 1.0 => Some(format!("images downscaled by {}", reading.downscale)),
         None => None,
     };
+    let background = args.background.map(|b| format!("background {}", b.name()));
+    let holdout = reading.holdout.map(|holdout| format!("held out: {holdout}"));
     let seeds = format!("{} seed{}", args.seeds, if args.seeds == 1 { "" } else { "s" });
     let splats = args.max_splats.map(|n| format!("at most {n} splats"));
-    [Some(length), size, splats, Some(seeds)]
+    [Some(length), size, holdout, background, splats, Some(seeds)]
         .into_iter()
         .flatten()
         .collect()
@@ -455,13 +453,13 @@ mod tests {
             "my/own.toml:a.b=1",
             "/",
         ];
-        let names = distinct(names.iter().map(|name| folder_name(Path::new(name))).collect());
+        let names = distinct(names.iter().map(|name| folder_name(Path::new(name))));
         assert_eq!(
             names,
             ["room", "room_2", "curriculum_params.coarse_0", "own_a.b_1", "scene"]
         );
         assert_eq!(
-            distinct(vec!["a".into(), "a_2".into(), "a".into()]),
+            distinct(["a", "a_2", "a"].map(str::to_owned).into_iter()),
             ["a", "a_2", "a_3"]
         );
     }

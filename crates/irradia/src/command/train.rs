@@ -7,7 +7,7 @@ use crate::interrupt::stop_flag;
 use crate::terminal::{note, one_line, say};
 use anyhow::{Result, anyhow};
 use clap::builder::RangedU64ValueParser;
-use irradia_runs::{DEFAULT_RECIPE, Finished, Run, RunFolder, TrainInput};
+use irradia_runs::{Background, DEFAULT_RECIPE, Finished, Run, RunFolder, TrainInput};
 use std::path::{Path, PathBuf};
 
 #[derive(clap::Args)]
@@ -43,7 +43,7 @@ pub struct Args {
     #[arg(long, value_name = "TIME", value_parser = parse_seconds)]
     pub budget: Option<f64>,
     /// Go on with an interrupted run, from its newest checkpoint; the result is that of an unbroken run
-    #[arg(long, value_name = "RUN", conflicts_with_all = ["out", "overwrite", "downscale", "max_side", "format"])]
+    #[arg(long, value_name = "RUN", conflicts_with_all = ["out", "overwrite", "downscale", "max_side", "full_size", "holdout", "format"])]
     pub resume: Option<PathBuf>,
     /// Replace the run that --out holds
     #[arg(long)]
@@ -51,6 +51,10 @@ pub struct Args {
     /// LPIPS weights: a file, or a folder of them; see irradia lpips
     #[arg(long, value_name = "PATH")]
     pub lpips: Option<PathBuf>,
+    /// white, black or random (trained over random colours, scored over white): what photographs with alpha are laid over;
+    /// white for Blender scenes and the recipe's own for others when absent
+    #[arg(long, value_name = "COLOR", conflicts_with = "resume")]
+    pub background: Option<Background>,
     #[command(flatten)]
     pub reading: DataArgs,
 }
@@ -90,6 +94,7 @@ fn input(args: &Args) -> Result<TrainInput> {
         seed: args.seed,
         lpips: lpips_path(args.lpips.as_ref())?,
         reading: args.reading.reading(),
+        background: args.background,
         overwrite: args.overwrite,
         ..TrainInput::new(given(&args.data), given(&args.out))
     })
@@ -102,7 +107,9 @@ pub fn begin(input: TrainInput) -> Result<()> {
     let dataset = request.read_dataset()?;
     warn(&dataset.warnings);
     warn(&request.warnings());
-    finish(Run::begin_on(request, dataset)?)
+    let run = Run::begin_on(request, dataset)?;
+    note(format_args!("background: {}", run.background()));
+    finish(run)
 }
 
 fn resume(folder: &Path, args: &Args) -> Result<()> {
@@ -154,14 +161,29 @@ fn finish(mut run: Run) -> Result<()> {
 
 fn tell(finished: &Finished) -> Result<()> {
     let (report, folder) = (&finished.report, &finished.folder);
+    let figures = if report.psnr.is_nan() {
+        "nothing was evaluated: no view is held out that could be measured".to_owned()
+    } else {
+        format!(
+            "held-out PSNR {:.2} dB, SSIM {:.4}{}{}",
+            report.psnr,
+            report.ssim,
+            in_words(report.lpips, report.lpips_net.as_deref()),
+            report.half_fit_psnr.map_or(String::new(), |psnr| format!(
+                ", {psnr:.2} dB on right halves fitted on left ones"
+            )),
+        )
+    };
+    warn(
+        &report
+            .warnings
+            .iter()
+            .filter(|line| line.contains("not measured"))
+            .cloned()
+            .collect::<Vec<_>>(),
+    );
     say(format_args!(
-        "held-out PSNR {:.2} dB, SSIM {:.4}{}{}; {}, {:.1} s of training",
-        report.psnr,
-        report.ssim,
-        in_words(report.lpips, report.lpips_net.as_deref()),
-        report.half_fit_psnr.map_or(String::new(), |psnr| format!(
-            ", {psnr:.2} dB on right halves fitted on left ones"
-        )),
+        "{figures}; {}, {:.1} s of training",
         size_in_words(report.splats, report.parameters),
         report.seconds
     ))?;

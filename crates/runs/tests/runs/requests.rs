@@ -160,6 +160,7 @@ fn what_was_asked_for_is_read_back() {
             format: Some("blender".into()),
             downscale: 1.5,
             max_side: None,
+            holdout: Some("5".into()),
         },
         ..input(folder.path(), "run", 4)
     };
@@ -193,6 +194,8 @@ fn an_old_run_json_is_read() {
     let record: RunRecord = serde_json::from_str(text).expect("an old record");
     assert_eq!(record.input.data, Path::new("/photos"));
     assert_eq!((record.input.seed, record.input.reading.downscale), (3, 2.0));
+    // It had no usual size.
+    assert_eq!(record.input.reading.max_side, None);
     assert_eq!((record.input.lpips, record.complete), (None, false));
 
     let folder = folder();

@@ -48,11 +48,14 @@ pub struct Report {
     pub parameters: Option<u64>,
     /// Most memory the process ever held, bytes; 0 where the system does not say.
     pub peak_rss_bytes: u64,
-    /// Mean over the held-out views, dB.
-    #[serde(deserialize_with = "or_nan")]
+    /// What it was trained over and is scored over, for people.
+    #[serde(default)]
+    pub background: String,
+    /// Mean over the held-out views, dB; NaN, and absent from files, where none could be measured.
+    #[serde(default = "nan", deserialize_with = "or_nan", skip_serializing_if = "is_nan")]
     pub psnr: f64,
-    /// Mean over the held-out views.
-    #[serde(deserialize_with = "or_nan")]
+    /// Mean over the held-out views, likewise.
+    #[serde(default = "nan", deserialize_with = "or_nan", skip_serializing_if = "is_nan")]
     pub ssim: f64,
     /// Mean over the held-out views; `None` without the network's weights.
     pub lpips: Option<f64>,
@@ -83,11 +86,11 @@ pub struct Report {
 pub struct ViewReport {
     /// Name within the dataset.
     pub name: String,
-    /// dB.
-    #[serde(deserialize_with = "or_nan")]
+    /// dB; NaN, and absent from files, where the view's mask leaves no pixel.
+    #[serde(default = "nan", deserialize_with = "or_nan", skip_serializing_if = "is_nan")]
     pub psnr: f64,
-    /// Structural similarity.
-    #[serde(deserialize_with = "or_nan")]
+    /// Structural similarity, likewise.
+    #[serde(default = "nan", deserialize_with = "or_nan", skip_serializing_if = "is_nan")]
     pub ssim: f64,
     /// Perceptual distance, where there are weights.
     pub lpips: Option<f64>,
@@ -124,13 +127,22 @@ pub struct CurvePoint {
     /// Wall-clock seconds of the loop so far.
     #[serde(deserialize_with = "or_nan")]
     pub seconds: f64,
-    /// Training loss.
-    #[serde(deserialize_with = "or_nan")]
+    /// Training loss; NaN, and absent from files, where only PSNR was measured.
+    #[serde(default = "nan", deserialize_with = "or_nan", skip_serializing_if = "is_nan")]
     pub loss: f64,
     /// PSNR in dB, where it was measured at this step.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
     pub psnr: Option<f64>,
     /// Gaussians.
     pub splats: u64,
+}
+
+fn nan() -> f64 {
+    f64::NAN
+}
+
+fn is_nan(value: &f64) -> bool {
+    value.is_nan()
 }
 
 fn or_nan<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f64, D::Error> {

@@ -174,6 +174,7 @@
     ["Training", `${duration(report.seconds)} (${duration(report.cpu_seconds)} of processor time)`],
     ["All included", duration(report.total_seconds)],
     ["Per step", known(report.seconds) && report.steps ? `${((1e3 * report.seconds) / report.steps).toFixed(1)} ms` : "–"],
+    ["Background", report.background],
     ["Seed", String(report.seed)],
     ["Version", report.version],
   ]) at("machine").append(make("dt", label), make("dd", value || "–"));

@@ -6,12 +6,13 @@ use irradia_scene::Dataset;
 use irradia_train::eval::{EvalOptions, EvaluatedView, evaluate_views, mean};
 use irradia_train::model::Model;
 use std::collections::HashSet;
+use std::ops::ControlFlow;
 
 /// Renders `model` from the views `indices` of `dataset` and measures each as `options` say. Every view is handed to `see` when it is done; returned is the mean over
 /// all that could be measured, NaN where there are none.
 ///
 /// # Errors
-/// When a photograph cannot be read; the first error of `see`.
+/// When a photograph cannot be read; the error of `see`, with which it ends.
 pub fn evaluate<E: From<RunError>>(
     model: &Model,
     dataset: &Dataset,
@@ -22,10 +23,13 @@ pub fn evaluate<E: From<RunError>>(
     let mut metrics: Vec<Evaluation> = Vec::new();
     let mut outcome = Ok(());
     evaluate_views(model, dataset, indices, options, |view| {
-        if outcome.is_ok() {
-            outcome = see(&view);
-        }
+        outcome = see(&view);
         metrics.push(view.metrics);
+        if outcome.is_err() {
+            ControlFlow::Break(())
+        } else {
+            ControlFlow::Continue(())
+        }
     })
     .map_err(RunError::from)?;
     outcome?;

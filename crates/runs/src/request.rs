@@ -3,9 +3,10 @@
 use crate::{Background, RunError, RunFolder};
 use irradia_formats::{DatasetFormat, DatasetOptions, Holdout, USUAL_MAX_SIDE, read_dataset};
 use irradia_scene::Dataset;
+use irradia_train::Recipe;
+use irradia_train::paces::Paces;
 use irradia_train::recipe::Param;
 use irradia_train::schedule::{Moment, outline};
-use irradia_train::{Recipe, RunLimits};
 use serde::{Deserialize, Serialize};
 use std::fmt::Display;
 use std::path::{Path, PathBuf};
@@ -146,6 +147,9 @@ pub struct TrainInput {
     pub steps: Option<u64>,
     /// Seconds of training into which the recipe is fitted; not together with `steps`.
     pub budget: Option<f64>,
+    /// The folder of a run whose steps are repeated at the pace that they had; with neither `steps` nor `budget`.
+    #[serde(default)]
+    pub replay: Option<PathBuf>,
     /// Held-out PSNR at which to stop, dB.
     pub until_psnr: Option<f64>,
     /// Random seed.
@@ -179,6 +183,7 @@ impl TrainInput {
             max_splats: None,
             steps: None,
             budget: None,
+            replay: None,
             until_psnr: None,
             seed: 0,
             lpips: None,
@@ -206,6 +211,22 @@ impl TrainInput {
             input.steps = None;
         }
         Ok(input)
+    }
+
+    /// Repeats the run in the folder `run` into the folder `out`: the same data, recipe and seed, each step at the pace that it
+    /// had, so that the scene has the same bytes, also where a budget set the pace by the clock.
+    ///
+    /// # Errors
+    /// Those of [`TrainInput::of_run`].
+    pub fn replay_of(run: impl AsRef<Path>, out: impl Into<PathBuf>) -> Result<Self, RunError> {
+        let run = run.as_ref();
+        Ok(Self {
+            out: out.into(),
+            steps: None,
+            budget: None,
+            replay: Some(std::path::absolute(run).unwrap_or_else(|_| run.to_owned())),
+            ..Self::of_run(run)?
+        })
     }
 
     /// The validated request: every setting in its range, the recipe read and resolved. The dataset and the run's folder
@@ -319,10 +340,9 @@ impl TrainRequest {
         Ok(())
     }
 
-    pub(crate) fn limits(&self) -> RunLimits {
-        RunLimits {
-            until_psnr: self.input.until_psnr,
-            budget: self.input.budget,
-        }
+    /// The paces of the run that this one repeats.
+    pub(crate) fn paces(&self) -> Result<Option<Paces>, RunError> {
+        let run = self.input.replay.as_deref();
+        run.map(|run| RunFolder::open(run)?.0.paces()).transpose()
     }
 }

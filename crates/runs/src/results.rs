@@ -8,8 +8,11 @@ use irradia_scene::{Image, sh};
 use irradia_train::eval::{EvalOptions, EvaluatedView, Metrics};
 use irradia_train::field_file;
 use irradia_train::model::Model;
-use irradia_train::report::{Report, ViewReport, machine, peak_rss_bytes, schedule, to_html};
+use irradia_train::report::{
+    Beside, Breakdown, Inside, Report, ViewReport, machine, peak_rss_bytes, schedule, to_html,
+};
 use std::path::Path;
+use std::time::Instant;
 
 const NOTHING_HELD_OUT: &str = "no view is held out";
 
@@ -33,7 +36,9 @@ impl Run {
     }
 
     /// Measures the held-out views, writes their pictures, and sums up the run.
-    pub(crate) fn report(&self) -> Result<Report, RunError> {
+    ///
+    /// `finishing` is when the run began to finish; `stop`, asked after each view, ends it all.
+    pub(crate) fn report(&self, finishing: Instant, stop: &dyn Fn() -> bool) -> Result<Report, RunError> {
         let (trainer, input, journal) = (&self.trainer, &self.request.input, &self.journal);
         let names = trainer.dataset.views.iter().map(|view| view.name.as_str());
         let stems = file_stems(names);
@@ -51,7 +56,11 @@ impl Run {
             |view| {
                 let stem = stems.next().expect("one for each view");
                 views.push(write_view(&self.folder, stem, view)?);
-                Ok::<(), RunError>(())
+                if stop() {
+                    Err(RunError::EvaluationStopped)
+                } else {
+                    Ok(())
+                }
             },
         )?;
         let mut warnings = journal.all_warnings();
@@ -74,7 +83,15 @@ impl Run {
             recipe_toml: trainer.recipe.to_toml(),
             seed: trainer.options.seed,
             steps: trainer.clock.step,
-            seconds: trainer.seconds,
+            seconds: trainer.times.wall,
+            training_seconds: trainer.seconds,
+            breakdown: Breakdown {
+                inside: Inside::of(&trainer.times, trainer.seconds),
+                beside: Beside {
+                    preparing: self.preparing.unwrap_or(0.0),
+                    finishing: finishing.elapsed().as_secs_f64(),
+                },
+            },
             cpu_seconds: trainer.cpu_seconds,
             total_seconds: self.request.started.elapsed().as_secs_f64(),
             splats: trainer.engine.len() as u64,

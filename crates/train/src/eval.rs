@@ -8,6 +8,7 @@ use irradia_measure::{Evaluation, Lpips, evaluate, psnr_masked};
 use irradia_scene::{Camera, Dataset, Image, Photo, View};
 use irradia_splat::Renderer;
 use irradia_splat::init::camera_extent;
+use std::ops::ControlFlow;
 
 /// The PSNR, in dB, above which views are not told apart: that of equal images, whose own is infinite. A frame of 8 bits in
 /// which one value in 2,000 is off by one has 81 dB.
@@ -54,7 +55,7 @@ pub struct EvalOptions<'a> {
     pub half_fit: HalfFit,
 }
 
-/// Looks at `model` from the views `indices` of `dataset` and compares; each is given to `see` when it is done.
+/// Renders `model` from the views `indices` of `dataset` and compares; each is given to `see` when it is done, which may end it.
 ///
 /// # Errors
 /// When a photograph cannot be read.
@@ -63,7 +64,7 @@ pub fn evaluate_views(
     dataset: &Dataset,
     indices: &[usize],
     options: &EvalOptions,
-    mut see: impl FnMut(EvaluatedView),
+    mut see: impl FnMut(EvaluatedView) -> ControlFlow<()>,
 ) -> Result<(), TrainError> {
     let mut renderer = Renderer::new();
     let cameras: Vec<Camera> = dataset.train.iter().map(|i| dataset.views[*i].camera).collect();
@@ -98,13 +99,16 @@ pub fn evaluate_views(
         }
         metrics.psnr = metrics.psnr.min(MOST_PSNR);
         metrics.half_fit_psnr = metrics.half_fit_psnr.map(|psnr| psnr.min(MOST_PSNR));
-        see(EvaluatedView {
+        let seen = see(EvaluatedView {
             name: view.name.clone(),
             metrics,
             truth,
             render,
             mask: photo.mask,
         });
+        if seen.is_break() {
+            break;
+        }
     }
     Ok(())
 }
@@ -204,7 +208,11 @@ mod tests {
             };
             let data = dataset();
             views.clear();
-            evaluate_views(&model, &data, &data.test, &options, |view| views.push(view)).unwrap();
+            let see = |view| {
+                views.push(view);
+                ControlFlow::Continue(())
+            };
+            evaluate_views(&model, &data, &data.test, &options, see).unwrap();
             let measured: Vec<bool> = views.iter().map(EvaluatedView::is_measured).collect();
             assert_eq!(measured, [true, false, true]);
             let metrics: Vec<Evaluation> = views.iter().map(|view| view.metrics).collect();

@@ -103,6 +103,8 @@ pub struct StepReport {
     pub seconds: f64,
     /// Seconds of training still to come, as far as is known.
     pub seconds_left: f64,
+    /// Recipe steps that went by in it.
+    pub pace: f64,
     /// Index of the view in the dataset.
     pub view: usize,
     /// The loss, weighted.
@@ -152,6 +154,11 @@ pub enum Signal {
 pub trait Observer {
     /// Sees `event`; `trainer` is as it stands after it.
     fn on_event(&mut self, event: &Event, trainer: &crate::Trainer) -> Signal;
+
+    /// Whether the run is to end; asked between views while held-out views are evaluated, where no event comes.
+    fn wants_stop(&self) -> bool {
+        false
+    }
 
     /// Asked several times a second while the run is paused, whoever paused it.
     fn while_paused(&mut self, _trainer: &crate::Trainer) -> Signal {

@@ -136,6 +136,7 @@ impl Trainer {
             step: self.clock.step + 1,
             seconds: self.seconds,
             seconds_left: 0.0,
+            pace: self.pace,
             view: chosen[0],
             loss: loss.total,
             mse: loss.color,

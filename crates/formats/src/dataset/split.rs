@@ -170,11 +170,14 @@ fn declared(splits: &[Option<Split>]) -> Indices {
     }
 }
 
-/// A view's name as lists may write it: whole, below the folder of images, and both without the extension.
+/// A view's name as lists may write it: whole or below the folder of images, each with and without the extension, or its last
+/// part alone without it.
 fn names_of(name: &str) -> impl Iterator<Item = &str> {
     let below = name.split_once('/').map_or(name, |(_, below)| below);
     let stem = |name| Path::new(name).file_stem().and_then(|s| s.to_str()).unwrap_or(name);
-    [name, below, stem(below)].into_iter()
+    let bare = name.rsplit_once('.').map_or(name, |(bare, _)| bare);
+    let bare_below = below.rsplit_once('.').map_or(below, |(bare, _)| bare);
+    [name, below, bare, bare_below, stem(below)].into_iter()
 }
 
 fn read_list(root: &Path, files: [&str; 2]) -> Option<List> {
@@ -205,7 +208,7 @@ mod tests {
 
     #[test]
     fn lists_name_images_with_and_without_folder_and_extension() {
-        for line in ["images/2.png", "2.png", "2", "./2.png\n"] {
+        for line in ["images/2.png", "2.png", "images/2", "2", "./2.png\n"] {
             let root = tempfile::tempdir().unwrap();
             std::fs::write(root.path().join("test.txt"), format!("# held out\n{line}\n")).unwrap();
             assert_eq!(of(Holdout::AsDeclared, root.path()), (vec![0, 1, 3], vec![2]));

@@ -4,7 +4,7 @@
 //! one run stays there.
 
 use super::train::parse_seconds;
-use super::{DataArgs, thread_count};
+use super::{DataArgs, by_option, thread_count};
 use crate::Usage;
 use crate::interrupt::stop_flag;
 use crate::terminal::{note, one_line, say};
@@ -16,7 +16,9 @@ use irradia_runs::train::compare::{
     Comparison, Figures, PictureRow, Render, Run, Scene, overall, picture, to_html, to_markdown, to_text,
 };
 use irradia_runs::train::report::{Report, ViewReport, machine};
-use irradia_runs::{Background, RunFolder, distinct, file_stem, logged_errors, read_recipe};
+use irradia_runs::{
+    Background, RunFolder, data_fingerprint, distinct, file_stem, logged_errors, program_fingerprint, read_recipe,
+};
 use serde::{Deserialize, Serialize};
 use std::fs::{self, File};
 use std::path::{Path, PathBuf};
@@ -89,6 +91,35 @@ struct Request {
     /// Of `irradia`, without `--out`.
     arguments: Vec<String>,
     recipe_hash: String,
+    /// Of this program's file; empty where an earlier version wrote it.
+    #[serde(default)]
+    program: String,
+    /// Of the dataset; empty where it could not be read, or an earlier version wrote it.
+    #[serde(default)]
+    data: String,
+}
+
+impl Request {
+    /// Why a run that was made for `self` cannot stand for one that is made for `wanted`.
+    fn misfit(&self, wanted: &Self) -> Option<&'static str> {
+        let same = (&self.arguments, &self.recipe_hash) == (&wanted.arguments, &wanted.recipe_hash);
+        match (same, self.program == wanted.program, self.data == wanted.data) {
+            (false, ..) => Some("under other conditions"),
+            (true, _, false) => Some("on data that changed since"),
+            (true, false, true) => Some("by another build of this program"),
+            (true, true, true) => None,
+        }
+    }
+}
+
+/// A dataset as it takes part.
+struct Source {
+    /// As the user wrote it.
+    data: PathBuf,
+    /// Name of its folder.
+    name: String,
+    /// Of what it holds; empty where it cannot be read, which its runs then say.
+    fingerprint: String,
 }
 
 const REQUEST: &str = "request.json";
@@ -110,9 +141,10 @@ pub fn run(args: &Args) -> Result<()> {
     if let Some(data) = args.data.iter().find(|data| !data.exists()) {
         return Err(Usage(format!("{} does not exist: give a dataset's folder", data.display())).into());
     }
-    let names = distinct(args.data.iter().map(|data| folder_name(data)));
+    let sources = sources(args)?;
+    let program = program_fingerprint().context("cannot read this program's file")?;
     if !args.overwrite {
-        check_earlier(args, &ways, &names)?;
+        check_earlier(args, &program, &ways, &sources)?;
     }
     fs::create_dir_all(&args.out).with_context(|| format!("cannot make {}; give another --out", args.out.display()))?;
     let stop = stop_flag();
@@ -120,7 +152,8 @@ pub fn run(args: &Args) -> Result<()> {
     let total = args.data.len() * ways.len() * args.seeds as usize;
     let (mut scenes, mut number) = (Vec::new(), 0);
     let (mut device, mut done) = (String::new(), 0);
-    for (data, name) in args.data.iter().zip(&names) {
+    for source in &sources {
+        let name = &source.name;
         let mut trained: Vec<Vec<Trained>> = ways.iter().map(|_| Vec::new()).collect();
         // Recipes within seeds: what else the machine does meanwhile falls on all of them alike.
         for seed in 0..args.seeds {
@@ -128,7 +161,8 @@ pub fn run(args: &Args) -> Result<()> {
                 number += 1;
                 let what = format!("[{number}/{total}] {name}, {}, seed {seed}", way.text);
                 let folder = format!("{name}/{}/seed_{seed}", way.folder);
-                let outcome = one_run(args, data, way, seed, &args.out.join(&folder), &what, &stop)?;
+                let request = request(args, &program, source, way, seed);
+                let outcome = one_run(request, &args.out.join(&folder), &what, &stop)?;
                 let (error, report) = match outcome {
                     Outcome::Stopped => break,
                     Outcome::Failed(error) => {
@@ -138,7 +172,7 @@ pub fn run(args: &Args) -> Result<()> {
                     Outcome::Done(report) => {
                         note(format_args!(
                             "{what}: {:.2} dB after {:.1} s",
-                            report.psnr, report.seconds
+                            report.psnr, report.training_seconds
                         ));
                         (None, Some(*report))
                     }
@@ -171,7 +205,7 @@ pub fn run(args: &Args) -> Result<()> {
             );
             scenes.push(Scene::new(
                 name.clone(),
-                data.display().to_string(),
+                source.data.display().to_string(),
                 runs.collect(),
                 view,
             ));
@@ -198,6 +232,29 @@ pub fn run(args: &Args) -> Result<()> {
         );
     }
     Ok(())
+}
+
+/// The datasets of the command line; those that can be read must have views that score the runs.
+fn sources(args: &Args) -> Result<Vec<Source>> {
+    let reading = args.reading.reading();
+    reading.check().map_err(by_option)?;
+    let names = distinct(args.data.iter().map(|data| folder_name(data)));
+    let source = |(data, name): (&PathBuf, String)| {
+        let dataset = reading.read(data).ok();
+        if dataset.as_ref().is_some_and(|dataset| dataset.test.is_empty()) {
+            let message = format!(
+                "{}: no view is held out, so that nothing can be compared",
+                data.display()
+            );
+            return Err(Usage(message).into());
+        }
+        Ok(Source {
+            data: data.clone(),
+            name,
+            fingerprint: dataset.map_or(String::new(), |dataset| data_fingerprint(&dataset, data)),
+        })
+    };
+    args.data.iter().zip(names).map(source).collect()
 }
 
 /// The recipes of the command line, each read, so that a mistake in the last one is not found after hours.
@@ -235,8 +292,8 @@ fn folder_name(path: &Path) -> String {
     if name.is_empty() { "scene".into() } else { name }
 }
 
-fn request(args: &Args, data: &Path, way: &Way, seed: u64) -> Request {
-    let data = std::path::absolute(data).unwrap_or_else(|_| data.to_owned());
+fn request(args: &Args, program: &str, source: &Source, way: &Way, seed: u64) -> Request {
+    let data = std::path::absolute(&source.data).unwrap_or_else(|_| source.data.clone());
     let mut arguments = vec!["train".to_owned(), data.display().to_string()];
     let mut option = |name: &str, value: Option<String>| {
         if let Some(value) = value {
@@ -264,6 +321,8 @@ fn request(args: &Args, data: &Path, way: &Way, seed: u64) -> Request {
     Request {
         arguments,
         recipe_hash: way.hash.clone(),
+        program: program.to_owned(),
+        data: source.fingerprint.clone(),
     }
 }
 
@@ -277,15 +336,19 @@ fn finished(folder: &Path) -> Option<(Report, Option<Request>)> {
 }
 
 /// Refuses, before anything is trained, finished runs that were asked for something else.
-fn check_earlier(args: &Args, ways: &[Way], names: &[String]) -> Result<()> {
-    for (data, name) in args.data.iter().zip(names) {
+fn check_earlier(args: &Args, program: &str, ways: &[Way], sources: &[Source]) -> Result<()> {
+    for source in sources {
         for way in ways {
             for seed in 0..args.seeds {
-                let folder = args.out.join(format!("{name}/{}/seed_{seed}", way.folder));
-                let wanted = request(args, data, way, seed);
-                if finished(&folder).is_some_and(|(_, request)| request != Some(wanted)) {
+                let folder = args.out.join(format!("{}/{}/seed_{seed}", source.name, way.folder));
+                let Some((_, earlier)) = finished(&folder) else {
+                    continue;
+                };
+                let wanted = request(args, program, source, way, seed);
+                let misfit = earlier.map_or(Some("under other conditions"), |earlier| earlier.misfit(&wanted));
+                if let Some(how) = misfit {
                     let message = format!(
-                        "{} holds a run made under other conditions: give another --out, or --overwrite to repeat such runs",
+                        "{} holds a run made {how}: give another --out, or --overwrite to repeat such runs",
                         folder.display()
                     );
                     return Err(Usage(message).into());
@@ -297,16 +360,7 @@ fn check_earlier(args: &Args, ways: &[Way], names: &[String]) -> Result<()> {
 }
 
 /// Reads the run in `folder` if it is what is asked for, makes it otherwise.
-fn one_run(
-    args: &Args,
-    data: &Path,
-    way: &Way,
-    seed: u64,
-    folder: &Path,
-    what: &str,
-    stop: &AtomicBool,
-) -> Result<Outcome> {
-    let request = request(args, data, way, seed);
+fn one_run(request: Request, folder: &Path, what: &str, stop: &AtomicBool) -> Result<Outcome> {
     if let Some((report, earlier)) = finished(folder)
         && earlier.as_ref() == Some(&request)
     {

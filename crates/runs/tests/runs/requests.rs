@@ -184,6 +184,24 @@ fn what_was_asked_for_is_read_back() {
     assert_eq!(request.recipe().hash(), recipe.hash());
 }
 
+#[test]
+fn what_died_before_its_run_had_begun_is_no_run() {
+    let folder = folder();
+    let run = folder.path().join("run");
+    fs::create_dir(&run).expect("a folder");
+    fs::write(run.join("recipe.toml"), "somebody's own").expect("written");
+    let again = || Run::begin_on(input(folder.path(), "run", 2).check().expect("a request"), dataset());
+    assert!(
+        again()
+            .err()
+            .expect("refused")
+            .to_string()
+            .contains("already holds a run")
+    );
+    fs::write(run.join(".lock"), "4194305").expect("written");
+    again().expect("a run");
+}
+
 /// As 0.1.0's first builds wrote it: no recipe, and `lpips` in later ones only.
 #[test]
 fn an_old_run_json_is_read() {

@@ -61,6 +61,20 @@ pub enum FormatError {
         /// `; ` and what was left out, or nothing.
         reasons: String,
     },
+    /// All usable views are held out.
+    #[error(
+        "{}: no view is left to train on: all {held_out} usable views are held out{reasons}; put the training images back, or \
+         choose another holdout",
+        path.display()
+    )]
+    NothingToTrainOn {
+        /// The dataset.
+        path: PathBuf,
+        /// Views held out.
+        held_out: usize,
+        /// `; ` and what was left out, or nothing.
+        reasons: String,
+    },
     /// An option cannot be meant.
     #[error("{0}")]
     Option(String),

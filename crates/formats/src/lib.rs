@@ -21,7 +21,7 @@ mod tensors;
 mod undistort;
 
 pub use atomic::write_atomic;
-pub use dataset::{DatasetFormat, DatasetOptions, read_dataset};
+pub use dataset::{DatasetFormat, DatasetOptions, Holdout, USUAL_MAX_SIDE, read_dataset};
 pub use describe::{Description, Kind, describe, detect};
 pub use error::{FormatError, Malformed};
 pub use image_file::{Pixels, read_image, write_png, write_png_16};

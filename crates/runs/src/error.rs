@@ -81,6 +81,30 @@ pub enum RunError {
     /// The weights of LPIPS could not be read.
     #[error("LPIPS weights: {0}")]
     Lpips(#[from] LpipsError),
+    /// Another process, or another run of this one, is at work in the folder.
+    #[error("{} is in use by process{holder}, which trains there: wait for it, stop it, or give another --out", folder.display())]
+    InUse {
+        /// The folder.
+        folder: PathBuf,
+        /// A blank and the number of the process, where it is known.
+        holder: String,
+    },
+    /// A run's dataset is not what it was.
+    #[error(
+        "{} cannot go on: its dataset {} changed: {differences}; put it back, or begin anew with another --out",
+        folder.display(), data.display()
+    )]
+    DataChanged {
+        /// The run.
+        folder: PathBuf,
+        /// The dataset.
+        data: PathBuf,
+        /// What differs.
+        differences: String,
+    },
+    /// The evaluation was stopped before its end.
+    #[error("stopped before all held-out views were evaluated; the scene is saved")]
+    EvaluationStopped,
     /// Options that make no ray-traced dataset.
     #[error(transparent)]
     Synth(#[from] SynthError),

@@ -5,11 +5,14 @@ use irradia_measure::Evaluation;
 use irradia_scene::Dataset;
 use irradia_train::eval::{EvalOptions, EvaluatedView, evaluate_views, mean};
 use irradia_train::model::Model;
+use std::collections::HashSet;
+use std::ops::ControlFlow;
 
-/// Renders `model` from the views `indices` of `dataset` and measures each as `options` say. Every view is handed to `see` when it is done; returned is the mean over all, NaN where there are none.
+/// Renders `model` from the views `indices` of `dataset` and measures each as `options` say. Every view is handed to `see` when it is done; returned is the mean over
+/// all that could be measured, NaN where there are none.
 ///
 /// # Errors
-/// When a photograph cannot be read; the first error of `see`.
+/// When a photograph cannot be read; the error of `see`, with which it ends.
 pub fn evaluate<E: From<RunError>>(
     model: &Model,
     dataset: &Dataset,
@@ -20,14 +23,53 @@ pub fn evaluate<E: From<RunError>>(
     let mut metrics: Vec<Evaluation> = Vec::new();
     let mut outcome = Ok(());
     evaluate_views(model, dataset, indices, options, |view| {
-        if outcome.is_ok() {
-            outcome = see(&view);
-        }
+        outcome = see(&view);
         metrics.push(view.metrics);
+        if outcome.is_err() {
+            ControlFlow::Break(())
+        } else {
+            ControlFlow::Continue(())
+        }
     })
     .map_err(RunError::from)?;
     outcome?;
     Ok(mean(&metrics))
+}
+
+/// What is not measured of a scene evaluated on `views`, names and whether they were measured: one line.
+pub fn unmeasured<'a>(views: impl Iterator<Item = (&'a str, bool)>) -> Option<String> {
+    let (mut all, mut blank) = (0, Vec::new());
+    for (name, measured) in views {
+        all += 1;
+        if !measured {
+            blank.push(name);
+        }
+    }
+    (!blank.is_empty()).then(|| {
+        let names = blank.join(", ");
+        format!(
+            "{} of {all} views are not measured, since their masks leave no pixel: {names}",
+            blank.len()
+        )
+    })
+}
+
+/// [`file_stem`] of each name, those that came before with a number: no two are the same, capitals or not.
+pub fn file_stems<'a>(names: impl Iterator<Item = &'a str>) -> Vec<String> {
+    distinct(names.map(file_stem))
+}
+
+/// The same names, those that came before with a number; two that differ in capitals alone are one to some file systems.
+pub fn distinct(names: impl Iterator<Item = String>) -> Vec<String> {
+    let mut taken: HashSet<String> = HashSet::new();
+    let free = |name: String| {
+        let numbered = (2..).map(|n| format!("{name}_{n}"));
+        let mut candidates = std::iter::once(name.clone()).chain(numbered);
+        candidates
+            .find(|name| taken.insert(name.to_lowercase()))
+            .expect("numbers do not end")
+    };
+    names.map(free).collect()
 }
 
 /// A view's name as a file name without extension: folders become underscores.
@@ -45,4 +87,16 @@ pub fn file_stem(name: &str) -> String {
             }
         })
         .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_that_would_be_one_file_become_several() {
+        let names = ["a/b.png", "a_b.png", "1.jpg", "1.png", "1_2.png", "A_B.png"];
+        let stems = file_stems(names.into_iter());
+        assert_eq!(stems, ["a_b", "a_b_2", "1", "1_2", "1_2_2", "A_B_3"]);
+    }
 }

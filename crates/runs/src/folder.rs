@@ -1,9 +1,12 @@
 //! The folder of a run.
 
+use crate::lock::FolderLock;
+use crate::provenance::ViewList;
 use crate::{RunError, TrainInput};
 use glam::{Quat, Vec3};
 use irradia_formats::write_atomic;
-use irradia_scene::{Camera, Intrinsics, Pose};
+use irradia_scene::{Camera, Dataset, Intrinsics, Pose};
+use irradia_train::paces::Paces;
 use irradia_train::{Trainer, socket};
 use serde::{Deserialize, Serialize};
 use std::fs;
@@ -16,9 +19,16 @@ pub const FIELD: &str = "field.safetensors";
 /// What adds to the colours of a run's splats.
 pub const RESIDUAL: &str = socket::FILES[1];
 
+/// The views of a run's dataset.
+pub(crate) const VIEWS: &str = "views.json";
+/// The pace of each step.
+pub(crate) const PACES: &str = "pace.txt";
+
 /// What a run may leave in its folder.
-const FILES: [&str; 11] = [
+const FILES: [&str; 13] = [
     "run.json",
+    VIEWS,
+    PACES,
     "recipe.toml",
     "cameras.json",
     "events.jsonl",
@@ -32,6 +42,16 @@ const FILES: [&str; 11] = [
 ];
 /// The folders in it.
 const FOLDERS: [&str; 2] = ["eval", "checkpoints"];
+
+/// What is written before `run.json`, with which a run has begun.
+const EARLY: [&str; 3] = ["recipe.toml", "cameras.json", VIEWS];
+
+/// Whether there is a run in the folder `path`, or what may be one; not if all is there that a process left which died before
+/// its run had begun.
+fn holds_run(path: &Path) -> bool {
+    let is_early = |file: &&str| EARLY.contains(file) && FolderLock::was_taken(path);
+    FILES.iter().any(|file| path.join(file).exists() && !is_early(file))
+}
 
 /// A run's place on disk.
 #[derive(Clone, Debug)]
@@ -75,7 +95,7 @@ impl RunFolder {
                 path.display()
             )));
         }
-        if !overwrite && FILES.iter().any(|file| path.join(file).exists()) {
+        if !overwrite && holds_run(path) {
             let message = format!(
                 "{} already holds a run: give another --out, --overwrite to replace it, or --resume {0} to go on with it",
                 path.display()
@@ -85,11 +105,25 @@ impl RunFolder {
         Ok(())
     }
 
-    /// Makes the folder for a new run; what an earlier run left there is removed.
+    /// Makes the folder for a new run and locks it; what an earlier run left there is removed.
     ///
     /// # Errors
-    /// When it cannot be made or cleared.
-    pub(crate) fn create(path: &Path) -> Result<Self, RunError> {
+    /// When it cannot be made or cleared, is in use, or came to hold a run that is not to be replaced.
+    pub(crate) fn create(
+        path: &Path,
+        overwrite: bool,
+        held: Option<FolderLock>,
+    ) -> Result<(Self, FolderLock), RunError> {
+        let no_folder = |source| RunError::NoFolder {
+            path: path.to_owned(),
+            source,
+        };
+        fs::create_dir_all(path).map_err(no_folder)?;
+        let lock = match held {
+            Some(lock) => lock,
+            None => FolderLock::take(path)?,
+        };
+        Self::check_free(path, overwrite)?;
         if FILES.iter().any(|file| path.join(file).exists()) {
             for folder in FOLDERS.map(|folder| path.join(folder)) {
                 if folder.exists() {
@@ -108,7 +142,9 @@ impl RunFolder {
                 source,
             })?;
         }
-        Ok(Self(path.to_owned()))
+        let folder = Self(path.to_owned());
+        folder.remove_leftovers()?;
+        Ok((folder, lock))
     }
 
     /// Opens the folder of an earlier run.
@@ -125,13 +161,45 @@ impl RunFolder {
             path: file,
             reason: error.to_string(),
         })?;
-        let run = Self(path.to_owned());
-        run.remove_leftovers()?;
-        Ok((run, record))
+        Ok((Self(path.to_owned()), record))
     }
 
-    /// Removes the temporary files that a killed process could not remove.
-    fn remove_leftovers(&self) -> Result<(), RunError> {
+    /// `run.json` of the run that the scene `path`, a file or a run's folder, lies in; `None` where it lies in none.
+    pub fn around(path: &Path) -> Option<RunRecord> {
+        let folder = if path.is_dir() { path } else { path.parent()? };
+        serde_json::from_slice(&fs::read(folder.join("run.json")).ok()?).ok()
+    }
+
+    /// Keeps which views the run is trained on and scored by.
+    pub(crate) fn write_views(&self, dataset: &Dataset) -> Result<(), RunError> {
+        self.write(VIEWS, &to_json(&ViewList::of(dataset)))
+    }
+
+    /// How `dataset` differs from the one that the run began with; nothing where the run did not keep that.
+    pub(crate) fn changed_views(&self, dataset: &Dataset) -> Result<Vec<String>, RunError> {
+        let path = self.file(VIEWS);
+        let Ok(text) = fs::read_to_string(&path) else {
+            return Ok(Vec::new());
+        };
+        let then: ViewList = serde_json::from_str(&text).map_err(|error| RunError::Damaged {
+            path,
+            reason: error.to_string(),
+        })?;
+        Ok(then.differences(&ViewList::of(dataset)))
+    }
+
+    /// The paces of the run's steps.
+    ///
+    /// # Errors
+    /// When the run kept none, or the file is damaged.
+    pub(crate) fn paces(&self) -> Result<Paces, RunError> {
+        let path = self.file(PACES);
+        let text = fs::read_to_string(&path).map_err(RunError::io("read", &path))?;
+        Paces::parse(&text).map_err(|reason| RunError::Damaged { path, reason })
+    }
+
+    /// Removes the temporary files that a killed process could not remove; only who holds the folder's lock may ask.
+    pub(crate) fn remove_leftovers(&self) -> Result<(), RunError> {
         for folder in FOLDERS.map(|folder| self.file(folder)).iter().chain([&self.0]) {
             let entries = fs::read_dir(folder).map_err(RunError::io("read", folder))?;
             for path in entries.filter_map(|entry| Some(entry.ok()?.path())) {

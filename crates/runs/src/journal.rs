@@ -1,11 +1,13 @@
 //! What a run writes while it goes: `events.jsonl`, checkpoints, and the curves for its report.
 
+use crate::folder::PACES;
 use crate::{RunError, RunFolder};
 use irradia_train::event::{Event, Observer, Signal};
+use irradia_train::paces::Paces;
 use irradia_train::report::{CurvePoint, StageReport};
 use irradia_train::{Trainer, checkpoint};
 use std::fs::{self, File, OpenOptions};
-use std::io::Write;
+use std::io::{self, Write};
 use std::path::Path;
 
 /// Points that a curve has, about: more would not be seen.
@@ -24,6 +26,9 @@ pub struct Journal {
     /// When the present stage began, seconds of training.
     stage_start: f64,
     non_finite: usize,
+    paces: File,
+    /// The last pace written.
+    pace: Option<f64>,
     failed: bool,
     /// What [`Observer::warning`] is to tell.
     warning: Option<String>,
@@ -33,6 +38,21 @@ pub struct Journal {
 fn appended(path: &Path) -> Result<File, RunError> {
     let file = OpenOptions::new().create(true).append(true).open(path);
     file.map_err(RunError::io("write", path))
+}
+
+/// `pace.txt`, to be written behind step `from`: what an interrupted run had written beyond is dropped.
+fn kept_paces(folder: &RunFolder, from: u64) -> Result<File, RunError> {
+    let path = folder.file(PACES);
+    let text = fs::read_to_string(&path).unwrap_or_default();
+    let step = |line: &str| line.split_once(' ').and_then(|(step, _)| step.parse::<u64>().ok());
+    let lines = text.split_inclusive('\n').filter(|line| line.ends_with('\n'));
+    let kept: String = lines
+        .take_while(|line| step(line).is_some_and(|step| step <= from))
+        .collect();
+    if kept.len() < text.len() {
+        folder.write(PACES, kept.as_bytes())?;
+    }
+    appended(&path)
 }
 
 impl Journal {
@@ -47,6 +67,8 @@ impl Journal {
             warnings: Vec::new(),
             stage_start: 0.0,
             non_finite: 0,
+            paces: kept_paces(folder, from)?,
+            pace: None,
             failed: false,
             warning: None,
         };
@@ -128,12 +150,26 @@ impl Journal {
 
     fn write(&mut self, event: &Event) {
         let line = serde_json::to_string(event).expect("an event is plain data") + "\n";
-        if let Err(error) = self.events.write_all(line.as_bytes())
+        let written = self.events.write_all(line.as_bytes());
+        self.check(written, "events.jsonl");
+    }
+
+    /// Keeps the pace of a step, where it is another one than that of the step before.
+    fn keep_pace(&mut self, step: u64, pace: f64) {
+        if self.pace != Some(pace) {
+            self.pace = Some(pace);
+            let written = self.paces.write_all(Paces::line(step, pace).as_bytes());
+            self.check(written, PACES);
+        }
+    }
+
+    /// A full disk must not end the training; one word about it is enough.
+    fn check(&mut self, written: io::Result<()>, file: &str) {
+        if let Err(error) = written
             && !self.failed
         {
-            // A full disk must not end the training; one word about it is enough.
             self.failed = true;
-            let path = self.folder.file("events.jsonl");
+            let path = self.folder.file(file);
             self.warning = Some(format!("cannot write {}: {error}; training goes on", path.display()));
         }
     }
@@ -153,6 +189,7 @@ impl Observer for Journal {
         match event {
             Event::Step(report) => {
                 self.non_finite += report.non_finite;
+                self.keep_pace(report.step, report.pace);
                 let apart = (trainer.total_steps() / CURVE_POINTS).max(1);
                 if self.curve.last().is_some_and(|last| report.step < last.step + apart) {
                     return Signal::Continue;

@@ -37,12 +37,15 @@
 //! [`scene`] the plain types and their conventions.
 #![forbid(unsafe_code)]
 
+mod background;
 mod describe;
 mod error;
 mod evaluate;
 mod folder;
 mod journal;
+mod lock;
 mod orbit;
+mod provenance;
 mod request;
 mod results;
 mod run;
@@ -50,15 +53,17 @@ mod scene_file;
 mod snapshot;
 mod synth_files;
 
+pub use background::Background;
 pub use describe::describe;
 pub use error::RunError;
-pub use evaluate::{evaluate, file_stem};
+pub use evaluate::{distinct, evaluate, file_stem, file_stems, unmeasured};
 pub use folder::{FIELD, RESIDUAL, RunFolder, RunRecord, SCENE};
 pub use irradia_formats as formats;
 pub use irradia_scene as scene;
 pub use irradia_synth as synth;
 pub use irradia_train as train;
 pub use journal::logged_errors;
+pub use provenance::{data_fingerprint, program_fingerprint};
 pub use request::{DEFAULT_RECIPE, HOW_TO_GET_LPIPS, Reading, TrainInput, TrainRequest, read_recipe};
 pub use results::write_image;
 pub use run::{Finished, Run};
@@ -73,7 +78,7 @@ pub mod prelude {
     pub use crate::train::event::{Event, Observer, Signal};
     pub use crate::train::{Recipe, Trainer};
     pub use crate::{
-        Finished, Reading, Run, RunError, RunFolder, Scene, Snapshot, Snapshots, TrainInput, TrainRequest, describe,
-        evaluate, write_image, write_synth_dataset,
+        Background, Finished, Reading, Run, RunError, RunFolder, Scene, Snapshot, Snapshots, TrainInput, TrainRequest,
+        describe, evaluate, write_image, write_synth_dataset,
     };
 }

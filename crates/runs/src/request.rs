@@ -1,11 +1,12 @@
 //! What a training is asked for: raw input, and the validated request.
 
-use crate::{RunError, RunFolder};
-use irradia_formats::{DatasetFormat, DatasetOptions, read_dataset};
+use crate::{Background, RunError, RunFolder};
+use irradia_formats::{DatasetFormat, DatasetOptions, Holdout, USUAL_MAX_SIDE, read_dataset};
 use irradia_scene::Dataset;
+use irradia_train::Recipe;
+use irradia_train::paces::Paces;
 use irradia_train::recipe::Param;
 use irradia_train::schedule::{Moment, outline};
-use irradia_train::{Recipe, RunLimits};
 use serde::{Deserialize, Serialize};
 use std::fmt::Display;
 use std::path::{Path, PathBuf};
@@ -26,18 +27,24 @@ pub struct Reading {
     pub format: Option<String>,
     /// The images' sides are divided by this; 1 or more.
     pub downscale: f32,
-    /// The longer side of an image has at most this many pixels; at least 1, and not together with `downscale`.
+    /// The longer side of an image has at most this many pixels; at least 1, and not together with `downscale`, which takes
+    /// the place of the usual limit. `None`: as large as they are.
     #[serde(default)]
     pub max_side: Option<u32>,
+    /// Which views are held out: every N-th in the order of names (`8`), none (`0`), or those that a file names, one a line.
+    /// `None`: those that the dataset itself holds out, every 8th where it does not say.
+    #[serde(default)]
+    pub holdout: Option<String>,
 }
 
 impl Default for Reading {
-    /// Any format, full size.
+    /// Any format, the dataset's own split, at most [`USUAL_MAX_SIDE`] pixels a side.
     fn default() -> Self {
         Self {
             format: None,
             downscale: 1.0,
-            max_side: None,
+            max_side: Some(USUAL_MAX_SIDE),
+            holdout: None,
         }
     }
 }
@@ -61,14 +68,41 @@ impl Reading {
         if self.max_side == Some(0) {
             return Err(RunError::setting("max_side", 0, "give 1 or more"));
         }
-        if let Some(side) = self.max_side.filter(|_| self.downscale != 1.0) {
+        // A downscale that was asked for takes the place of the usual limit.
+        let max_side = self
+            .max_side
+            .filter(|side| self.downscale == 1.0 || *side != USUAL_MAX_SIDE);
+        if let Some(side) = max_side.filter(|_| self.downscale != 1.0) {
             return Err(RunError::setting("max_side", side, "give it or downscale, not both"));
         }
         Ok(DatasetOptions {
             format,
             downscale: self.downscale,
-            max_side: self.max_side,
+            max_side,
+            holdout: self.holdout()?,
         })
+    }
+
+    fn holdout(&self) -> Result<Holdout, RunError> {
+        let Some(text) = &self.holdout else {
+            return Ok(Holdout::AsDeclared);
+        };
+        let wrong = |message: &str| Err(RunError::setting("holdout", text, message));
+        match text.parse::<usize>() {
+            Ok(0) => Ok(Holdout::Nothing),
+            Ok(1) => wrong("every view would be held out; give 2 or more, or 0 to train on all"),
+            Ok(n) => Ok(Holdout::Every(n)),
+            Err(_) if Path::new(text).is_file() => Ok(Holdout::Listed(text.into())),
+            Err(_) => wrong("give a number, 0 to train on all views, or a file that names the views to hold out"),
+        }
+    }
+
+    /// Lets `holdout` name its file whatever the current folder is.
+    fn with_absolute_paths(mut self) -> Self {
+        if let Ok(Holdout::Listed(file)) = self.holdout() {
+            self.holdout = Some(std::path::absolute(&file).unwrap_or(file).display().to_string());
+        }
+        self
     }
 
     /// Reads the dataset at `path`; its `warnings` are for the caller to show.
@@ -113,6 +147,9 @@ pub struct TrainInput {
     pub steps: Option<u64>,
     /// Seconds of training into which the recipe is fitted; not together with `steps`.
     pub budget: Option<f64>,
+    /// The folder of a run whose steps are repeated at the pace that they had; with neither `steps` nor `budget`.
+    #[serde(default)]
+    pub replay: Option<PathBuf>,
     /// Held-out PSNR at which to stop, dB.
     pub until_psnr: Option<f64>,
     /// Random seed.
@@ -123,6 +160,9 @@ pub struct TrainInput {
     /// How the dataset is read.
     #[serde(flatten)]
     pub reading: Reading,
+    /// What photographs with alpha are laid over. `None`: white for Blender scenes, the recipe's elsewhere.
+    #[serde(default)]
+    pub background: Option<Background>,
     /// Whether a run that `out` holds is replaced.
     #[serde(skip)]
     pub overwrite: bool,
@@ -143,10 +183,12 @@ impl TrainInput {
             max_splats: None,
             steps: None,
             budget: None,
+            replay: None,
             until_psnr: None,
             seed: 0,
             lpips: None,
             reading: Reading::default(),
+            background: None,
             overwrite: false,
         }
     }
@@ -171,6 +213,22 @@ impl TrainInput {
         Ok(input)
     }
 
+    /// Repeats the run in the folder `run` into the folder `out`: the same data, recipe and seed, each step at the pace that it
+    /// had, so that the scene has the same bytes, also where a budget set the pace by the clock.
+    ///
+    /// # Errors
+    /// Those of [`TrainInput::of_run`].
+    pub fn replay_of(run: impl AsRef<Path>, out: impl Into<PathBuf>) -> Result<Self, RunError> {
+        let run = run.as_ref();
+        Ok(Self {
+            out: out.into(),
+            steps: None,
+            budget: None,
+            replay: Some(std::path::absolute(run).unwrap_or_else(|_| run.to_owned())),
+            ..Self::of_run(run)?
+        })
+    }
+
     /// The validated request: every setting in its range, the recipe read and resolved. The dataset and the run's folder
     /// are not touched.
     ///
@@ -189,6 +247,7 @@ impl TrainInput {
         if let Some(psnr) = self.until_psnr.filter(|psnr| !psnr.is_finite()) {
             return Err(RunError::setting("until_psnr", psnr, "give a number of dB"));
         }
+        self.reading = self.reading.with_absolute_paths();
         let reading = self.reading.check()?;
         let mut overrides = self.set.clone();
         overrides.extend(self.max_splats.map(|n| format!("max_splats={n}")));
@@ -265,10 +324,25 @@ impl TrainRequest {
         missing.then(line).into_iter().collect()
     }
 
-    pub(crate) fn limits(&self) -> RunLimits {
-        RunLimits {
-            until_psnr: self.input.until_psnr,
-            budget: self.input.budget,
+    /// Settles what photographs with alpha are laid over, where neither the input nor its changes to the recipe say it.
+    pub(crate) fn choose_background(&mut self, dataset: &Dataset) -> Result<(), RunError> {
+        let is_set = self
+            .input
+            .set
+            .iter()
+            .any(|change| change.starts_with("render.background"));
+        if self.input.background.is_none() && !is_set {
+            self.input.background = Background::usual(dataset)?;
         }
+        if let Some(background) = self.input.background {
+            background.apply_to(&mut self.recipe);
+        }
+        Ok(())
+    }
+
+    /// The paces of the run that this one repeats.
+    pub(crate) fn paces(&self) -> Result<Option<Paces>, RunError> {
+        let run = self.input.replay.as_deref();
+        run.map(|run| RunFolder::open(run)?.0.paces()).transpose()
     }
 }

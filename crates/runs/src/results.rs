@@ -1,15 +1,20 @@
 //! What a run leaves when it is finished: its scene, the held-out views, and the report.
 
 use crate::folder::{FIELD, SCENE, to_json};
-use crate::{Run, RunError, RunFolder, evaluate, file_stem};
+use crate::{Run, RunError, RunFolder, evaluate, file_stems, unmeasured};
 use irradia_compute::Level;
 use irradia_formats::{write_png, write_splats};
 use irradia_scene::{Image, sh};
 use irradia_train::eval::{EvalOptions, EvaluatedView, Metrics};
 use irradia_train::field_file;
 use irradia_train::model::Model;
-use irradia_train::report::{Report, ViewReport, machine, peak_rss_bytes, schedule, to_html};
+use irradia_train::report::{
+    Beside, Breakdown, Inside, Report, ViewReport, machine, peak_rss_bytes, schedule, to_html,
+};
 use std::path::Path;
+use std::time::Instant;
+
+const NOTHING_HELD_OUT: &str = "no view is held out";
 
 impl Run {
     /// Writes the splats with what was trained beside them, or the field.
@@ -31,8 +36,13 @@ impl Run {
     }
 
     /// Measures the held-out views, writes their pictures, and sums up the run.
-    pub(crate) fn report(&self) -> Result<Report, RunError> {
+    ///
+    /// `finishing` is when the run began to finish; `stop`, asked after each view, ends it all.
+    pub(crate) fn report(&self, finishing: Instant, stop: &dyn Fn() -> bool) -> Result<Report, RunError> {
         let (trainer, input, journal) = (&self.trainer, &self.request.input, &self.journal);
+        let names = trainer.dataset.views.iter().map(|view| view.name.as_str());
+        let stems = file_stems(names);
+        let mut stems = trainer.dataset.test.iter().map(|i| &stems[*i]);
         let mut views = Vec::new();
         let mean = evaluate(
             &trainer.scene(),
@@ -44,10 +54,22 @@ impl Run {
                 half_fit: trainer.half_fit(),
             },
             |view| {
-                views.push(write_view(&self.folder, view)?);
-                Ok::<(), RunError>(())
+                let stem = stems.next().expect("one for each view");
+                views.push(write_view(&self.folder, stem, view)?);
+                if stop() {
+                    Err(RunError::EvaluationStopped)
+                } else {
+                    Ok(())
+                }
             },
         )?;
+        let mut warnings = journal.all_warnings();
+        warnings.extend(unmeasured(
+            views.iter().map(|view| (view.name.as_str(), !view.psnr.is_nan())),
+        ));
+        if trainer.dataset.test.is_empty() && !warnings.iter().any(|line| line.contains(NOTHING_HELD_OUT)) {
+            warnings.push(format!("{NOTHING_HELD_OUT}: nothing was evaluated"));
+        }
         Ok(Report {
             version: env!("CARGO_PKG_VERSION").to_owned(),
             device: format!(
@@ -61,12 +83,21 @@ impl Run {
             recipe_toml: trainer.recipe.to_toml(),
             seed: trainer.options.seed,
             steps: trainer.clock.step,
-            seconds: trainer.seconds,
+            seconds: trainer.times.wall,
+            training_seconds: trainer.seconds,
+            breakdown: Breakdown {
+                inside: Inside::of(&trainer.times, trainer.seconds),
+                beside: Beside {
+                    preparing: self.preparing.unwrap_or(0.0),
+                    finishing: finishing.elapsed().as_secs_f64(),
+                },
+            },
             cpu_seconds: trainer.cpu_seconds,
             total_seconds: self.request.started.elapsed().as_secs_f64(),
             splats: trainer.engine.len() as u64,
             parameters: trainer.parameters().map(|n| n as u64),
             peak_rss_bytes: peak_rss_bytes(),
+            background: self.background(),
             psnr: mean.psnr,
             ssim: mean.ssim,
             lpips: mean.lpips,
@@ -87,13 +118,18 @@ impl Run {
             stages: journal.stages.clone(),
             curve: journal.curve.clone(),
             machine: machine(),
-            warnings: journal.all_warnings(),
+            warnings,
         })
     }
 
     /// Writes `report.json` and `report.html`.
     pub(crate) fn write_report(&self, report: &Report) -> Result<(), RunError> {
-        self.folder.write("report.json", &to_json(report))?;
+        let mut json = serde_json::to_value(report).expect("plain data");
+        if let Some(fields) = json.as_object_mut().filter(|_| report.views.is_empty()) {
+            // What cannot be is not written; with held-out views, null says that there was no network.
+            fields.retain(|_, value| !value.is_null());
+        }
+        self.folder.write("report.json", &to_json(&json))?;
         self.folder.write("report.html", to_html(report).as_bytes())
     }
 }
@@ -114,8 +150,7 @@ pub fn write_image(path: impl AsRef<Path>, image: &Image) -> Result<(), RunError
 }
 
 /// Writes truth, render and error of a held-out view under `eval/`.
-fn write_view(folder: &RunFolder, view: &EvaluatedView) -> Result<ViewReport, RunError> {
-    let stem = file_stem(&view.name);
+fn write_view(folder: &RunFolder, stem: &str, view: &EvaluatedView) -> Result<ViewReport, RunError> {
     let path = |what: &str| format!("eval/{stem}.{what}.png");
     let write = |what: &str, image: &Image| -> Result<String, RunError> {
         write_image(folder.file(&path(what)), image)?;

@@ -2,16 +2,19 @@
 
 use crate::folder::RunRecord;
 use crate::journal::Journal;
+use crate::lock::FolderLock;
 use crate::snapshot::{SnapshotServer, Snapshots};
-use crate::{RunError, RunFolder, TrainRequest};
+use crate::{RunError, RunFolder, TrainRequest, background};
 use irradia_measure::Lpips;
 use irradia_scene::Dataset;
 use irradia_train::event::Observer;
+use irradia_train::paces::Paces;
 use irradia_train::report::Report;
-use irradia_train::{TrainOptions, Trainer, checkpoint};
+use irradia_train::{RunLimits, TrainOptions, Trainer, checkpoint};
 use std::fs;
 use std::path::Path;
 use std::sync::Arc;
+use std::time::Instant;
 
 /// A training with its folder. [`Run::train`] makes the steps, [`Run::finish`] writes the scene and the report.
 ///
@@ -38,6 +41,11 @@ pub struct Run {
     pub(crate) trainer: Trainer,
     pub(crate) journal: Journal,
     snapshots: SnapshotServer,
+    /// What is repeated of another run.
+    paces: Option<Paces>,
+    /// Seconds between the request and the first step.
+    pub(crate) preparing: Option<f64>,
+    _lock: FolderLock,
 }
 
 /// How a run ended.
@@ -67,26 +75,38 @@ impl Run {
     ///
     /// # Errors
     /// Those of [`Run::begin`].
-    pub fn begin_on(request: TrainRequest, dataset: Dataset) -> Result<Self, RunError> {
-        let out = &request.input.out;
-        RunFolder::check_free(out, request.input.overwrite)?;
+    pub fn begin_on(mut request: TrainRequest, dataset: Dataset) -> Result<Self, RunError> {
+        if dataset.test.is_empty()
+            && let Some(psnr) = request.input.until_psnr
+        {
+            let message = "no view is held out, so that nothing can be measured";
+            return Err(RunError::setting("until_psnr", psnr, message));
+        }
+        request.choose_background(&dataset)?;
+        let (out, overwrite) = (&request.input.out, request.input.overwrite);
+        RunFolder::check_free(out, overwrite)?;
+        let held = FolderLock::take_existing(out)?;
+        let paces = request.paces()?;
         let options = train_options(&request)?;
         let trainer = Trainer::new(Arc::new(dataset), request.recipe.clone(), options)?;
-        let folder = RunFolder::create(out)?;
+        let (folder, lock) = RunFolder::create(out, overwrite, held)?;
+        folder.write("recipe.toml", trainer.recipe.to_toml().as_bytes())?;
+        folder.write_cameras(&trainer)?;
+        folder.write_views(&trainer.dataset)?;
+        // Last: who finds it finds all that resuming needs.
         folder.write_record(&RunRecord {
             input: request.input.clone(),
             complete: false,
         })?;
-        folder.write("recipe.toml", trainer.recipe.to_toml().as_bytes())?;
-        folder.write_cameras(&trainer)?;
-        Self::new(folder, request, trainer)
+        Self::new(folder, lock, request, trainer, paces)
     }
 
     /// Goes on with the run in the request's folder from its newest checkpoint. The request comes from
     /// [`TrainInput::of_run`](crate::TrainInput::of_run).
     ///
     /// # Errors
-    /// When the folder holds no run, its checkpoint is damaged, or its dataset cannot be read.
+    /// When the folder holds no run or is in use, its checkpoint is damaged, or its dataset cannot be read or has other views than
+    /// those that the steps so far were made on.
     pub fn resume(request: TrainRequest) -> Result<Self, RunError> {
         let dataset = request.read_dataset()?;
         Self::resume_on(request, dataset)
@@ -98,17 +118,37 @@ impl Run {
     /// Those of [`Run::resume`].
     pub fn resume_on(request: TrainRequest, dataset: Dataset) -> Result<Self, RunError> {
         let (folder, _) = RunFolder::open(&request.input.out)?;
+        let lock = FolderLock::take(folder.path())?;
+        folder.remove_leftovers()?;
         let options = train_options(&request)?;
+        let paces = request.paces()?;
         let dataset = Arc::new(dataset);
         let trainer = match folder.newest_checkpoint()? {
-            Some(path) => read_checkpoint(&path, dataset, options)?,
-            // Interrupted before its first checkpoint.
+            Some(path) => {
+                let differences = folder.changed_views(&dataset)?;
+                if !differences.is_empty() {
+                    return Err(RunError::DataChanged {
+                        folder: folder.path().to_owned(),
+                        data: request.input.data.clone(),
+                        differences: differences.join("; "),
+                    });
+                }
+                read_checkpoint(&path, dataset, options)?
+            }
+            // Interrupted before its first checkpoint: nothing was learnt from the data as they were.
             None => Trainer::new(dataset, request.recipe.clone(), options)?,
         };
-        Self::new(folder, request, trainer)
+        folder.write_views(&trainer.dataset)?;
+        Self::new(folder, lock, request, trainer, paces)
     }
 
-    fn new(folder: RunFolder, request: TrainRequest, trainer: Trainer) -> Result<Self, RunError> {
+    fn new(
+        folder: RunFolder,
+        lock: FolderLock,
+        request: TrainRequest,
+        trainer: Trainer,
+        paces: Option<Paces>,
+    ) -> Result<Self, RunError> {
         let mut journal = Journal::open(&folder, trainer.clock.step)?;
         journal.warnings.extend(trainer.dataset.warnings.iter().cloned());
         journal.warnings.extend(request.warnings());
@@ -118,6 +158,9 @@ impl Run {
             trainer,
             journal,
             snapshots: SnapshotServer::new(),
+            paces,
+            preparing: None,
+            _lock: lock,
         })
     }
 
@@ -129,6 +172,11 @@ impl Run {
     /// What was asked for.
     pub fn request(&self) -> &TrainRequest {
         &self.request
+    }
+
+    /// What it trains over and is scored over, for people.
+    pub fn background(&self) -> String {
+        background::in_words(&self.trainer.recipe)
     }
 
     /// The folder.
@@ -147,7 +195,13 @@ impl Run {
     /// # Errors
     /// When a photograph cannot be read; the steps made are saved all the same.
     pub fn train(&mut self, observers: &mut [&mut dyn Observer]) -> Result<String, RunError> {
-        let limits = self.request.limits();
+        let started = self.request.started;
+        self.preparing.get_or_insert_with(|| started.elapsed().as_secs_f64());
+        let limits = RunLimits {
+            until_psnr: self.request.input.until_psnr,
+            budget: self.request.input.budget,
+            paces: self.paces.clone(),
+        };
         let mut all: Vec<&mut dyn Observer> = Vec::with_capacity(observers.len() + 2);
         for observer in observers.iter_mut() {
             all.push(&mut **observer);
@@ -169,11 +223,25 @@ impl Run {
     ///
     /// # Errors
     /// When a file cannot be written or a held-out photograph cannot be read.
-    pub fn finish(mut self) -> Result<Finished, RunError> {
+    pub fn finish(self) -> Result<Finished, RunError> {
+        self.finish_unless(&|| false)
+    }
+
+    /// Likewise, but `stop`, asked after each view, ends the evaluation: [`RunError::EvaluationStopped`]. The run is then saved
+    /// as it is, and resuming it evaluates it again.
+    ///
+    /// # Errors
+    /// Those of [`Run::finish`].
+    pub fn finish_unless(mut self, stop: &dyn Fn() -> bool) -> Result<Finished, RunError> {
+        let finishing = Instant::now();
         let saved = self.save_unfinished();
         self.write_scene()?;
         saved?;
-        let report = self.report()?;
+        let report = self.report(finishing, stop);
+        if matches!(report, Err(RunError::EvaluationStopped)) && self.trainer.finished() {
+            self.journal.save(&self.trainer).map_err(RunError::NotSaved)?;
+        }
+        let report = report?;
         self.write_report(&report)?;
         let complete = self.trainer.finished();
         self.folder.write_record(&RunRecord {

@@ -9,6 +9,7 @@ use crate::field_file;
 use crate::recipe::Recipe;
 use crate::schedule::{Clock, Watch};
 use crate::tensor_file::{NamedTensor, TensorSource};
+use crate::times::Times;
 use crate::trainer::{TrainError, TrainOptions, Trainer};
 use irradia_compute::Planes;
 use irradia_scene::Dataset;
@@ -22,6 +23,8 @@ const FORMAT: &str = "irradia-checkpoint-5";
 const FORMAT_4: &str = "irradia-checkpoint-4";
 /// What the names of a field's tensors begin with.
 const FIELD: &str = "field.";
+/// Where the time went; earlier checkpoints do not have it.
+const TIMES: &str = "times";
 const OWNERS: [&str; 3] = ["splats", "first_moments", "second_moments"];
 
 /// `trainer` as a safetensors file: columns `[components, N]` of splats and moments, statistics, and the clock.
@@ -93,6 +96,13 @@ pub fn to_bytes(trainer: &Trainer) -> Vec<u8> {
         Dtype::F64,
         vec![real.len()],
         real.iter().flat_map(|v| v.to_le_bytes()).collect(),
+    ));
+    let times = trainer.times.to_array();
+    arrays.push((
+        TIMES.into(),
+        Dtype::F64,
+        vec![times.len()],
+        times.iter().flat_map(|v| v.to_le_bytes()).collect(),
     ));
     for (name, value) in carried::named(&clock.carried) {
         arrays.push((name, Dtype::F64, vec![1], value.to_le_bytes().to_vec()));
@@ -230,6 +240,10 @@ pub fn from_bytes(bytes: &[u8], dataset: Arc<Dataset>, options: TrainOptions) ->
         restored.map_err(|why| wrong(format!("{prefix}{why}")))?;
     }
     (trainer.pace, trainer.seconds, trainer.cpu_seconds) = (*pace, *seconds, *cpu_seconds);
+    if let Ok((_, bytes)) = array(TIMES, Dtype::F64) {
+        let times = reals(bytes).try_into();
+        trainer.times = Times::from_array(times.map_err(|_| wrong(format!("{TIMES} has the wrong length")))?);
+    }
     trainer.clock = Clock {
         step: *step,
         time: *time,

@@ -8,12 +8,17 @@ use irradia_measure::{Evaluation, Lpips, evaluate, psnr_masked};
 use irradia_scene::{Camera, Dataset, Image, Photo, View};
 use irradia_splat::Renderer;
 use irradia_splat::init::camera_extent;
+use std::ops::ControlFlow;
+
+/// The PSNR, in dB, above which views are not told apart: that of equal images, whose own is infinite. A frame of 8 bits in
+/// which one value in 2,000 is off by one has 81 dB.
+pub const MOST_PSNR: f64 = 100.0;
 
 /// One view's outcome with its pictures, `[H, W, 3]`.
 pub struct EvaluatedView {
     /// The view's name.
     pub name: String,
-    /// Its metrics.
+    /// Its metrics, PSNR at most [`MOST_PSNR`]; NaN and `None` where its mask leaves no pixel.
     pub metrics: Evaluation,
     /// The photograph over the background.
     pub truth: Image,
@@ -21,6 +26,13 @@ pub struct EvaluatedView {
     pub render: Image,
     /// `[H, W]`, 0 where the photograph does not count.
     pub mask: Option<Vec<u8>>,
+}
+
+impl EvaluatedView {
+    /// Whether there was a pixel to compare.
+    pub fn is_measured(&self) -> bool {
+        !self.metrics.psnr.is_nan()
+    }
 }
 
 /// Which metrics to compute.
@@ -43,7 +55,7 @@ pub struct EvalOptions<'a> {
     pub half_fit: HalfFit,
 }
 
-/// Looks at `model` from the views `indices` of `dataset` and compares; each is given to `see` when it is done.
+/// Renders `model` from the views `indices` of `dataset` and compares; each is given to `see` when it is done, which may end it.
 ///
 /// # Errors
 /// When a photograph cannot be read.
@@ -52,7 +64,7 @@ pub fn evaluate_views(
     dataset: &Dataset,
     indices: &[usize],
     options: &EvalOptions,
-    mut see: impl FnMut(EvaluatedView),
+    mut see: impl FnMut(EvaluatedView) -> ControlFlow<()>,
 ) -> Result<(), TrainError> {
     let mut renderer = Renderer::new();
     let cameras: Vec<Camera> = dataset.train.iter().map(|i| dataset.views[*i].camera).collect();
@@ -63,7 +75,9 @@ pub fn evaluate_views(
         let truth = truth_image(&photo, view, options.render.background);
         let render = model.render(&mut renderer, &view.camera, &options.render).color;
         let mask = photo.mask.as_deref();
+        let blank = mask.is_some_and(|mask| mask.iter().all(|m| *m == 0));
         let mut metrics = match options.metrics {
+            _ if blank => NOT_MEASURED,
             Metrics::All(lpips) => evaluate(&render, &truth, mask, lpips),
             Metrics::Psnr => Evaluation {
                 psnr: psnr_masked(&render.rounded_to_8_bits(), &truth, mask),
@@ -80,14 +94,21 @@ pub fn evaluate_views(
             extent,
         };
         let fit = options.half_fit;
-        metrics.half_fit_psnr = fit.any().then(|| half_fit_psnr(model, &mut renderer, &held_out, fit));
-        see(EvaluatedView {
+        if fit.any() && !blank {
+            metrics.half_fit_psnr = half_fit_psnr(model, &mut renderer, &held_out, fit);
+        }
+        metrics.psnr = metrics.psnr.min(MOST_PSNR);
+        metrics.half_fit_psnr = metrics.half_fit_psnr.map(|psnr| psnr.min(MOST_PSNR));
+        let seen = see(EvaluatedView {
             name: view.name.clone(),
             metrics,
             truth,
             render,
             mask: photo.mask,
         });
+        if seen.is_break() {
+            break;
+        }
     }
     Ok(())
 }
@@ -103,17 +124,105 @@ fn truth_image(photo: &Photo, view: &View, background: [f32; 3]) -> Image {
     )
 }
 
-/// The mean of the metrics over views; LPIPS, and what was measured after a fit, where every view has it. NaN when there are none.
+const NOT_MEASURED: Evaluation = Evaluation {
+    psnr: f64::NAN,
+    ssim: f64::NAN,
+    lpips: None,
+    half_fit_psnr: None,
+};
+
+/// The mean of the metrics over the views that were measured: LPIPS where all of them have it, what was measured after a fit
+/// over those that have it. NaN and `None` when there are none.
 pub fn mean(metrics: &[Evaluation]) -> Evaluation {
-    let n = metrics.len() as f64;
-    let over_all = |of: fn(&Evaluation) -> Option<f64>| {
-        let values: Option<Vec<f64>> = metrics.iter().map(of).collect();
-        values.filter(|v| !v.is_empty()).map(|v| v.iter().sum::<f64>() / n)
-    };
+    let measured: Vec<&Evaluation> = metrics.iter().filter(|m| !m.psnr.is_nan()).collect();
+    let mean = |values: Vec<f64>| (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64);
+    let all = |of: fn(&Evaluation) -> f64| mean(measured.iter().map(|m| of(m)).collect()).unwrap_or(f64::NAN);
+    let lpips: Option<Vec<f64>> = measured.iter().map(|m| m.lpips).collect();
     Evaluation {
-        psnr: metrics.iter().map(|m| m.psnr).sum::<f64>() / n,
-        ssim: metrics.iter().map(|m| m.ssim).sum::<f64>() / n,
-        lpips: over_all(|m| m.lpips),
-        half_fit_psnr: over_all(|m| m.half_fit_psnr),
+        psnr: all(|m| m.psnr),
+        ssim: all(|m| m.ssim),
+        lpips: lpips.and_then(mean),
+        half_fit_psnr: mean(measured.iter().filter_map(|m| m.half_fit_psnr).collect()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use glam::{Quat, Vec3};
+    use irradia_scene::{Intrinsics, Pose};
+    use irradia_splat::Splats;
+    use std::borrow::Cow;
+    use std::sync::Arc;
+
+    /// Three black photographs of nothing: met exactly, masked wholly, and off by a tenth in half of the pixels that count.
+    fn dataset() -> Dataset {
+        let pose = Pose {
+            rotation: Quat::IDENTITY,
+            position: Vec3::ZERO,
+        };
+        let view = |name: &str, data: Vec<u8>, mask: Option<Vec<u8>>| View {
+            name: name.into(),
+            camera: Camera::new(pose, Intrinsics::from_fov_x(16, 16, 1.0)),
+            photo: Arc::new(Photo {
+                width: 16,
+                height: 16,
+                channels: 3,
+                data,
+                mask,
+            }),
+            depth_bounds: None,
+            time: None,
+            points_seen: Vec::new(),
+        };
+        Dataset {
+            views: vec![
+                view("exact", vec![0; 768], None),
+                view("blank", vec![200; 768], Some(vec![0; 256])),
+                view("off", vec![51; 768], None),
+            ],
+            train: vec![0],
+            test: vec![0, 1, 2],
+            ..Dataset::default()
+        }
+    }
+
+    #[test]
+    fn an_exact_frame_and_a_blank_mask_leave_the_mean_finite() {
+        let model = Model::Splats {
+            splats: Cow::Owned(Splats::zeros(0, 0)),
+            residual: None,
+        };
+        let mut views = Vec::new();
+        for half_fit in [
+            HalfFit::default(),
+            HalfFit {
+                exposure: true,
+                pose: false,
+            },
+        ] {
+            let options = EvalOptions {
+                render: RenderOptions::default(),
+                metrics: Metrics::All(None),
+                half_fit,
+            };
+            let data = dataset();
+            views.clear();
+            let see = |view| {
+                views.push(view);
+                ControlFlow::Continue(())
+            };
+            evaluate_views(&model, &data, &data.test, &options, see).unwrap();
+            let measured: Vec<bool> = views.iter().map(EvaluatedView::is_measured).collect();
+            assert_eq!(measured, [true, false, true]);
+            let metrics: Vec<Evaluation> = views.iter().map(|view| view.metrics).collect();
+            // A fifth off everywhere: 20 log10(5) = 13.98 dB.
+            let off = 20.0 * 5f64.log10();
+            let mean = mean(&metrics);
+            assert!((mean.psnr - 0.5 * (MOST_PSNR + off)).abs() < 1e-6, "{mean:?}");
+            assert!(mean.ssim.is_finite() && mean.half_fit_psnr.is_none_or(f64::is_finite));
+            assert_eq!(mean.half_fit_psnr.is_some(), half_fit.any());
+        }
+        assert!(mean(&[NOT_MEASURED]).psnr.is_nan() && mean(&[]).psnr.is_nan());
     }
 }

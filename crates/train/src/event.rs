@@ -105,6 +105,8 @@ pub struct StepReport {
     pub seconds_left: f64,
     /// Between which that lies in nine of ten runs.
     pub seconds_left_range: [f64; 2],
+    /// Recipe steps that went by in it.
+    pub pace: f64,
     /// Index of the view in the dataset.
     pub view: usize,
     /// The loss, weighted.
@@ -154,6 +156,11 @@ pub enum Signal {
 pub trait Observer {
     /// Sees `event`; `trainer` is as it stands after it.
     fn on_event(&mut self, event: &Event, trainer: &crate::Trainer) -> Signal;
+
+    /// Whether the run is to end; asked between views while held-out views are evaluated, where no event comes.
+    fn wants_stop(&self) -> bool {
+        false
+    }
 
     /// Asked several times a second while the run is paused, whoever paused it.
     fn while_paused(&mut self, _trainer: &crate::Trainer) -> Signal {

@@ -137,6 +137,7 @@ impl Trainer {
             seconds: self.seconds,
             seconds_left: 0.0,
             seconds_left_range: [0.0; 2],
+            pace: self.pace,
             view: chosen[0],
             loss: loss.total,
             mse: loss.color,

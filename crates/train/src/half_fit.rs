@@ -46,28 +46,33 @@ pub struct HeldOut<'a> {
     pub extent: f32,
 }
 
-/// PSNR in dB over the right half of a held-out view, after what `fit` says was fitted on its left half.
-pub fn half_fit_psnr(model: &Model, renderer: &mut Renderer, view: &HeldOut, fit: HalfFit) -> f64 {
+/// PSNR in dB over the right half of a held-out view, after what `fit` says was fitted on its left half; `None` where the mask
+/// leaves no pixel of a half.
+pub fn half_fit_psnr(model: &Model, renderer: &mut Renderer, view: &HeldOut, fit: HalfFit) -> Option<f64> {
     let HeldOut {
         truth, mask, options, ..
     } = *view;
+    let width = truth.width as usize;
+    let counts = |i: usize| mask.is_none_or(|mask| mask[i] != 0);
+    let pixels = 0..width * truth.height as usize;
+    if [true, false].map(|left| pixels.clone().any(|i| counts(i) && is_left(i, width) == left)) != [true; 2] {
+        return None;
+    }
     let camera = if fit.pose {
         fitted_pose(model, renderer, view, fit)
     } else {
         *view.camera
     };
     let render = model.render(renderer, &camera, options).color;
-    let width = truth.width as usize;
-    let counts = |i: usize| mask.is_none_or(|mask| mask[i] != 0);
     let render = if fit.exposure {
         Affine::fit(&render, truth, |i| counts(i) && is_left(i, width)).apply_to(&render)
     } else {
         render
     };
-    let right: Vec<u8> = (0..width * truth.height as usize)
+    let right: Vec<u8> = pixels
         .map(|i| u8::from(counts(i) && !is_left(i, width)) * 255)
         .collect();
-    psnr_masked(&render.rounded_to_8_bits(), truth, Some(&right))
+    Some(psnr_masked(&render.rounded_to_8_bits(), truth, Some(&right)))
 }
 
 fn is_left(pixel: usize, width: usize) -> bool {
@@ -194,7 +199,7 @@ mod tests {
                 options: &options,
                 extent: 1.0,
             };
-            half_fit_psnr(&model, &mut renderer, &view, fit)
+            half_fit_psnr(&model, &mut renderer, &view, fit).expect("no mask")
         };
         let [neither, exposure, pose, both] = [
             psnr(false, false),

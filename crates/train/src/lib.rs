@@ -12,6 +12,7 @@ mod forecast;
 pub mod half_fit;
 pub mod model;
 mod objective;
+pub mod paces;
 mod photos;
 pub mod recipe;
 pub mod report;
@@ -19,6 +20,7 @@ mod run;
 pub mod schedule;
 pub mod socket;
 pub mod tensor_file;
+pub mod times;
 mod trainer;
 
 pub use recipe::{Recipe, RecipeError};

@@ -4,6 +4,7 @@ use irradia_scene::{Dataset, LoadError, Photo};
 use rayon::prelude::*;
 use std::collections::HashMap;
 use std::sync::Arc;
+use std::time::Instant;
 
 /// A photograph ready for the loss.
 #[derive(Debug)]
@@ -60,6 +61,8 @@ pub struct PhotoCache {
     bytes: usize,
     /// Size relative to the data's; a change drops everything.
     scale: f32,
+    /// Seconds spent on loading since [`Self::take_seconds`] asked.
+    seconds: f64,
 }
 
 impl PhotoCache {
@@ -72,7 +75,13 @@ impl PhotoCache {
             held: HashMap::new(),
             bytes: 0,
             scale: 1.0,
+            seconds: 0.0,
         }
+    }
+
+    /// Wall-clock seconds that loading took since this was last asked.
+    pub fn take_seconds(&mut self) -> f64 {
+        std::mem::take(&mut self.seconds)
     }
 
     /// View `coming[0]`'s photograph at `scale`. When it must be loaded, those that come next are too, in parallel, as
@@ -90,6 +99,7 @@ impl PhotoCache {
         if let Some(photo) = self.held.get(&view) {
             return Ok(photo.clone());
         }
+        let started = Instant::now();
         let wanted = self.plan_loads(coming);
         let (dataset, background) = (&self.dataset, self.background);
         let loaded: Vec<(usize, Result<Prepared, LoadError>)> = wanted
@@ -101,21 +111,35 @@ impl PhotoCache {
             self.bytes += photo.bytes();
             self.held.insert(view, photo);
         }
+        self.seconds += started.elapsed().as_secs_f64();
         Ok(self.held[&view].clone())
+    }
+
+    /// The largest scale, at most 1, at which all of `views` fit into the budget together.
+    pub fn scale_that_fits(&self, views: &[usize]) -> f32 {
+        let total = |scale: f32| -> usize { views.iter().map(|view| self.size(*view, scale)).sum() };
+        let mut scale = 1.0;
+        // Sides are rounded, so that a second try or a third may be needed; at a pixel each, it stays as it is.
+        while total(scale) > self.budget && scale > 1e-3 {
+            scale *= 0.98 * (self.budget as f32 / total(scale) as f32).sqrt();
+        }
+        scale
+    }
+
+    /// Most bytes that a view's photograph takes at `scale`.
+    fn size(&self, view: usize, scale: f32) -> usize {
+        let k = self.dataset.views[view].camera.intrinsics.scaled(scale);
+        4 * k.width as usize * k.height as usize
     }
 
     /// Which views to load now: as many of the coming ones as fit beside what is needed sooner. Makes the room.
     fn plan_loads(&mut self, coming: &[usize]) -> Vec<usize> {
-        let size = |view: usize| {
-            let k = self.dataset.views[view].camera.intrinsics.scaled(self.scale);
-            4 * k.width as usize * k.height as usize
-        };
         let mut planned = 0;
         let keep: Vec<usize> = coming
             .iter()
             .copied()
             .take_while(|view| {
-                planned += size(*view);
+                planned += self.size(*view, self.scale);
                 planned <= self.budget || *view == coming[0]
             })
             .collect();
@@ -249,6 +273,10 @@ mod tests {
             assert!(cache.bytes <= 2000 && cache.bytes == cache.held.values().map(|p| p.bytes()).sum::<usize>());
         }
         assert!(loads(&sources) >= 35);
+        let all: Vec<usize> = (0..20).collect();
+        let scale = cache.scale_that_fits(&all);
+        assert!(scale < 0.5 && all.iter().map(|view| cache.size(*view, scale)).sum::<usize>() <= 2000);
+        assert_eq!(cache.scale_that_fits(&[0, 1]), 1.0);
         let mut tiny = PhotoCache::new(dataset(3).0, [0.0; 3], 1);
         assert!(tiny.get(&[0, 1, 2], 1.0).is_ok() && tiny.get(&[1, 2, 0], 1.0).is_ok());
     }

@@ -1,20 +1,24 @@
 //! The loop around [`Trainer::step`]: when to stop, when to look, whom to tell.
 
-use crate::eval::{EvalOptions, Metrics, evaluate_views};
+use crate::eval::{EvalOptions, Metrics, evaluate_views, mean};
 use crate::event::{Event, Observer, Signal, StepReport};
 use crate::forecast::{self, Forecast};
 use crate::half_fit::HalfFit;
+use crate::paces::Paces;
 use crate::schedule::{is_due, plan};
 use crate::trainer::{TrainError, Trainer};
-use std::time::Duration;
+use std::ops::ControlFlow;
+use std::time::{Duration, Instant};
 
-/// When a run ends before its recipe does.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
+/// When a run ends before its recipe does, and what sets its pace.
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct RunLimits {
     /// Held-out PSNR in dB at which to stop.
     pub until_psnr: Option<f64>,
     /// Seconds of training into which the whole recipe is to be fitted.
     pub budget: Option<f64>,
+    /// Paces to repeat; they go before a budget.
+    pub paces: Option<Paces>,
 }
 
 /// Steps between looks at the held-out views when `until_psnr` waits for them.
@@ -71,11 +75,17 @@ pub fn run(
     let mut wishes = tell(trainer, &mut events, observers);
     wait_while_paused(trainer, &mut wishes, &mut events, observers);
     let mut reason = None;
+    // What the first splats took to load is not between the steps.
+    trainer.photos.take_seconds();
+    let (began, before) = (Instant::now(), trainer.times.wall);
     while reason.is_none() && !wishes.stop && !trainer.finished() {
         let due = plan(&trainer.recipe, &trainer.clock);
         forecast.observe(trainer, &due, limits.budget.is_some());
         if let Some(budget) = limits.budget {
             trainer.pace = forecast.pace(trainer, budget - trainer.seconds);
+        }
+        if let Some(pace) = limits.paces.as_ref().and_then(|paces| paces.at(trainer.clock.step + 1)) {
+            trainer.pace = pace;
         }
         let looks = due.evaluate || (limits.until_psnr.is_some() && is_due(&trainer.clock, UNTIL_PSNR_EVERY));
         let left = forecast.seconds_left(trainer);
@@ -89,28 +99,39 @@ pub fn run(
             seconds_left_range: range,
             ..trainer.step(&mut events)?
         };
+        trainer.times.loading += trainer.photos.take_seconds();
         events.insert(0, Event::Step(report));
         if looks && !trainer.dataset.test.is_empty() {
             let (step, seconds, splats) = (trainer.clock.step, trainer.seconds, trainer.engine.len());
-            let psnr = held_out_psnr(trainer)?;
-            events.push(Event::Evaluated {
-                step,
-                seconds,
-                psnr,
-                splats,
-                parameters: trainer.parameters(),
-            });
+            let started = Instant::now();
+            let psnr = held_out_psnr(trainer, observers)?;
+            trainer.times.evaluating += started.elapsed().as_secs_f64();
+            if !psnr.is_nan() {
+                events.push(Event::Evaluated {
+                    step,
+                    seconds,
+                    psnr,
+                    splats,
+                    parameters: trainer.parameters(),
+                });
+            }
             if limits.until_psnr.is_some_and(|limit| psnr >= limit) {
                 reason = Some("held-out PSNR reached");
             }
         }
         wishes = tell(trainer, &mut events, observers);
+        trainer.times.wall = before + began.elapsed().as_secs_f64();
         if due.checkpoint || wishes.save || wishes.stop {
+            let started = Instant::now();
             save(trainer, &mut events, observers);
+            trainer.times.saving += started.elapsed().as_secs_f64();
         }
         if reason.is_none() && !trainer.finished() {
+            let started = Instant::now();
             wait_while_paused(trainer, &mut wishes, &mut events, observers);
+            trainer.times.paused += started.elapsed().as_secs_f64();
         }
+        trainer.times.wall = before + began.elapsed().as_secs_f64();
     }
     let stopped = if wishes.stop { "stopped" } else { "recipe complete" };
     let reason = reason.unwrap_or(stopped).to_owned();
@@ -178,22 +199,29 @@ fn wait_while_paused(
     wishes.stop |= tell(trainer, events, observers).stop;
 }
 
-/// Mean PSNR over the held-out views, with the SH bands in use now.
-fn held_out_psnr(trainer: &Trainer) -> Result<f64, TrainError> {
+/// Mean PSNR over the held-out views, with the SH bands in use now; NaN where none could be measured or an
+/// observer wants to stop meanwhile.
+fn held_out_psnr(trainer: &Trainer, observers: &[&mut dyn Observer]) -> Result<f64, TrainError> {
     let options = EvalOptions {
         render: trainer.render_options(plan(&trainer.recipe, &trainer.clock).sh_degree),
         metrics: Metrics::Psnr,
         half_fit: HalfFit::default(),
     };
-    let mut psnr = Vec::new();
+    let (mut metrics, mut stopped) = (Vec::new(), false);
     evaluate_views(
         &trainer.scene(),
         &trainer.dataset,
         &trainer.dataset.test,
         &options,
         |view| {
-            psnr.push(view.metrics.psnr);
+            metrics.push(view.metrics);
+            stopped = observers.iter().any(|observer| observer.wants_stop());
+            if stopped {
+                ControlFlow::Break(())
+            } else {
+                ControlFlow::Continue(())
+            }
         },
     )?;
-    Ok(psnr.iter().sum::<f64>() / psnr.len() as f64)
+    Ok(if stopped { f64::NAN } else { mean(&metrics).psnr })
 }

@@ -9,6 +9,7 @@ use crate::photos::{PhotoCache, Prepared};
 use crate::recipe::{AdamKind, Density, LengthUnit, Param, Recipe};
 use crate::schedule::{Clock, Round, Signal, StepPlan, coming_views, plan};
 use crate::socket::{Residual, Sockets};
+use crate::times::Times;
 use cpu_time::ProcessTime;
 use irradia_compute::adam::AdamStep;
 use irradia_field::{FieldError, FieldState, KnownDepth};
@@ -110,6 +111,8 @@ pub struct Trainer {
     pub seconds: f64,
     /// Processor time likewise, over all threads.
     pub cpu_seconds: f64,
+    /// Wall time between the first step and the last, and where it went.
+    pub times: Times,
     /// Never more splats than this: the recipe's limits for this data.
     pub cap: usize,
     pub(crate) photos: PhotoCache,
@@ -147,6 +150,7 @@ impl Trainer {
             pace: options.steps.map_or(1.0, |steps| total / steps.max(1) as f64),
             seconds: 0.0,
             cpu_seconds: 0.0,
+            times: Times::default(),
             extent: init::camera_extent(&cameras),
             photos: PhotoCache::new(dataset.clone(), recipe.render.background, options.photo_budget),
             cap: cap(&recipe, &cameras),
@@ -211,9 +215,11 @@ impl Trainer {
                 let cameras: Vec<Camera> = views.iter().map(|v| v.camera).collect();
                 let bounds: Vec<Option<[f32; 2]>> = views.iter().map(|v| v.depth_bounds).collect();
                 let mut photos: Vec<Option<Arc<Prepared>>> = vec![None; views.len()];
+                // Colours are taken from all photographs in turn: where they do not fit, from smaller ones.
+                let scale = self.photos.scale_that_fits(&dataset.train);
                 for (i, photo) in photos.iter_mut().enumerate() {
                     let coming: Vec<usize> = dataset.train[i..].to_vec();
-                    *photo = Some(self.photos.get(&coming, 1.0)?);
+                    *photo = Some(self.photos.get(&coming, scale)?);
                 }
                 let mut rng = Rng::new(self.options.seed, STREAM_INIT);
                 let points = init::random_points(
@@ -223,7 +229,10 @@ impl Trainer {
                     &mut rng,
                     |view, pixel| {
                         let photo = photos[view].as_ref().expect("loaded above");
-                        let at = pixel.y as usize * photo.width as usize + pixel.x as usize;
+                        let k = &cameras[view].intrinsics;
+                        let x = pixel.x as usize * photo.width as usize / k.width as usize;
+                        let y = pixel.y as usize * photo.height as usize / k.height as usize;
+                        let at = y * photo.width as usize + x;
                         let zero = |plane: &Option<Vec<u8>>| plane.as_ref().is_some_and(|plane| plane[at] == 0);
                         if zero(&photo.mask) {
                             Look::Masked
@@ -341,9 +350,11 @@ impl Trainer {
         self.sockets
             .step_before_blending(&mut self.engine, view, &camera, self.extent, &plan);
         self.engine.update(&self.update(&plan));
+        let density_started = Instant::now();
         if let Some(change) = self.control_density(&plan) {
             events.push(Event::densified(self.clock.step + 1, change, self.engine.len()));
         }
+        self.times.density += density_started.elapsed().as_secs_f64();
         self.seconds += started.elapsed().as_secs_f64();
         self.cpu_seconds += cpu_started.elapsed().as_secs_f64();
 
@@ -361,6 +372,7 @@ impl Trainer {
             seconds: self.seconds,
             seconds_left: 0.0,
             seconds_left_range: [0.0; 2],
+            pace: self.pace,
             view,
             loss: loss.total,
             mse: loss.mse,

@@ -3,6 +3,7 @@
 
 use super::declared::{Declared, DeclaredView};
 use super::split;
+use super::{DatasetOptions, USUAL_MAX_SIDE};
 use crate::FormatError;
 use crate::image_file::{Header, read_header};
 use crate::photo::PhotoFile;
@@ -50,7 +51,14 @@ struct Probed {
     undistortion: Option<Undistortion>,
 }
 
-pub(super) fn assemble(declared: Declared, max_side: Option<u32>) -> Result<Dataset, FormatError> {
+impl Probed {
+    /// The camera of the photograph as it is trained on, at its real size.
+    fn undistorted(&self) -> Intrinsics {
+        self.undistortion.map_or(self.source, |plan| plan.pinhole())
+    }
+}
+
+pub(super) fn assemble(declared: Declared, options: &DatasetOptions) -> Result<Dataset, FormatError> {
     let Declared {
         kind,
         root,
@@ -79,13 +87,22 @@ pub(super) fn assemble(declared: Declared, max_side: Option<u32>) -> Result<Data
             reasons: reasons.iter().map(|reason| format!("; {reason}")).collect(),
         });
     }
-    warnings.extend(reasons);
-
     let names: Vec<String> = usable.iter().map(|(view, _)| view.name.clone()).collect();
-    let mut splits: Vec<_> = usable.iter().map(|(view, _)| view.split).collect();
-    warnings.extend(split::apply_lists(&root, &names, &mut splits));
-    let (train, test, split_warning) = split::indices(&splits);
-    warnings.extend(split_warning);
+    let splits: Vec<_> = usable.iter().map(|(view, _)| view.split).collect();
+    let indices = split::split(&options.holdout, &root, &names, splits)?;
+    if indices.train.is_empty() {
+        return Err(FormatError::NothingToTrainOn {
+            path: root,
+            held_out: indices.test.len(),
+            reasons: reasons.iter().map(|reason| format!("; {reason}")).collect(),
+        });
+    }
+    warnings.extend(reasons);
+    warnings.extend(indices.warning);
+    let max_side = options.max_side;
+    if max_side == Some(USUAL_MAX_SIDE) {
+        warnings.extend(tell_scaled(&usable));
+    }
 
     let views = usable
         .into_iter()
@@ -93,8 +110,8 @@ pub(super) fn assemble(declared: Declared, max_side: Option<u32>) -> Result<Data
         .collect();
     Ok(Dataset {
         views,
-        train,
-        test,
+        train: indices.train,
+        test: indices.test,
         points: points.filter(|points| !points.is_empty()),
         kind: kind.to_owned(),
         warnings,
@@ -154,8 +171,23 @@ fn usable_bounds([near, far]: [f64; 2]) -> Option<[f32; 2]> {
     (bounds[0] > 0.0 && bounds[1] > bounds[0] && bounds[1].is_finite()).then_some(bounds)
 }
 
+/// What is scaled though nobody may have asked for it.
+fn tell_scaled(usable: &[(DeclaredView, Probed)]) -> Option<String> {
+    let sizes = usable.iter().map(|(_, probed)| probed.undistorted());
+    let large: Vec<Intrinsics> = sizes.filter(|k| k.width.max(k.height) > USUAL_MAX_SIDE).collect();
+    let largest = large.iter().max_by_key(|k| u64::from(k.width) * u64::from(k.height))?;
+    Some(format!(
+        "{} of {} photographs, of up to {}x{} pixels, are scaled to {USUAL_MAX_SIDE} on the longer side, as 3DGS does; ask \
+         for the full size or another one where that is not wanted",
+        large.len(),
+        usable.len(),
+        largest.width,
+        largest.height
+    ))
+}
+
 fn finish(view: DeclaredView, probed: &Probed, downscale: f32, max_side: Option<u32>) -> Option<View> {
-    let undistorted = probed.undistortion.map_or(probed.source, |plan| plan.pinhole());
+    let undistorted = probed.undistorted();
     let longer = undistorted.width.max(undistorted.height) as f32;
     let smaller = max_side.map_or(downscale, |side| downscale.max(longer / side as f32));
     let intrinsics = undistorted.scaled(1.0 / smaller);

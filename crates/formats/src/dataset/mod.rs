@@ -18,6 +18,7 @@ pub(crate) mod transforms;
 use crate::FormatError;
 use declared::Declared;
 use irradia_scene::Dataset;
+pub use split::Holdout;
 use std::fmt;
 use std::path::Path;
 use std::str::FromStr;
@@ -106,7 +107,13 @@ pub struct DatasetOptions {
     pub downscale: f32,
     /// Photographs are made smaller until the longer side has at most this many pixels.
     pub max_side: Option<u32>,
+    /// Which views are held out.
+    pub holdout: Holdout,
 }
+
+/// The longer side, in pixels, to which larger photographs are scaled where the user does not choose a size, as the authors'
+/// code of 3DGS does with its default `--resolution -1` (Kerbl et al. 2023).
+pub const USUAL_MAX_SIDE: u32 = 1600;
 
 impl Default for DatasetOptions {
     fn default() -> Self {
@@ -114,14 +121,15 @@ impl Default for DatasetOptions {
             format: None,
             downscale: 1.0,
             max_side: None,
+            holdout: Holdout::AsDeclared,
         }
     }
 }
 
 /// Reads a dataset: poses, cameras, points and the headers of the images. Pixels are loaded later, view by view.
 ///
-/// Views are sorted by name. Held out are the views that the dataset itself holds out, else every 8th. What had to be
-/// left out (missing images, poses that are none) is told in [`Dataset::warnings`].
+/// Views are sorted by name and split by [`DatasetOptions::holdout`]. What had to be left out (missing images, poses that are
+/// none) is told in [`Dataset::warnings`].
 ///
 /// EXIF orientation: poses belong to the pixels as the tool that made them saw them. Where the declared size has the
 /// shape of the stored image alone, nothing is turned; where it has the shape of the upright image, it is turned; where
@@ -129,13 +137,18 @@ impl Default for DatasetOptions {
 ///
 /// # Errors
 /// When the folder is no dataset (the error says what was looked for), a file is unreadable or malformed, cameras have no
-/// intrinsics or an unknown model, or fewer than 3 views are usable.
+/// intrinsics or an unknown model, fewer than 3 views are usable, or none of them is left to train on.
 pub fn read_dataset(path: &Path, options: &DatasetOptions) -> Result<Dataset, FormatError> {
     if !(options.downscale >= 1.0 && options.downscale.is_finite()) {
         return Err(FormatError::Option(format!(
             "downscale is {}; give 1 or more",
             options.downscale
         )));
+    }
+    if options.holdout == Holdout::Every(0) || options.holdout == Holdout::Every(1) {
+        return Err(FormatError::Option(
+            "every view is held out; hold out every 2nd or fewer".into(),
+        ));
     }
     if options.max_side == Some(0) {
         return Err(FormatError::Option(
@@ -171,5 +184,5 @@ pub fn read_dataset(path: &Path, options: &DatasetOptions) -> Result<Dataset, Fo
         DatasetFormat::Blender => blender::read(path, options.downscale)?,
         DatasetFormat::Llff => llff::read(path, options.downscale)?,
     };
-    assemble::assemble(declared, options.max_side)
+    assemble::assemble(declared, options)
 }

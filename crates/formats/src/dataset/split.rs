@@ -1,9 +1,10 @@
 //! Which views are held out.
 
 use super::declared::Split;
+use crate::FormatError;
 use irradia_scene::every_eighth;
 use std::collections::HashSet;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// Files that list the held-out and the training images, one name a line.
 const TEST_LISTS: [&str; 2] = ["test_images.txt", "test.txt"];
@@ -11,24 +12,124 @@ const TRAIN_LISTS: [&str; 2] = ["train_images.txt", "train.txt"];
 /// Beside the images, or where the Inria code keeps them.
 const FOLDERS: [&str; 2] = ["", "sparse/0"];
 
+/// Which views are held out of training.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub enum Holdout {
+    /// Those that the dataset itself holds out; every 8th view where it does not say.
+    #[default]
+    AsDeclared,
+    /// Every n-th view in the order of names, the first one included; 2 or more. The dataset's own split does not count.
+    Every(usize),
+    /// None: all views are trained on.
+    Nothing,
+    /// Those that this file names, one a line, with or without folder and extension; all others are trained on.
+    Listed(PathBuf),
+}
+
+/// A list of image names.
+struct List {
+    /// Where it was read.
+    file: String,
+    names: HashSet<String>,
+}
+
+impl List {
+    fn parse(file: String, text: &str) -> Self {
+        let lines = text
+            .lines()
+            .map(str::trim)
+            .filter(|line| !line.is_empty() && !line.starts_with('#'));
+        let names = lines
+            .map(|line| line.trim_start_matches("./").replace('\\', "/"))
+            .collect();
+        Self { file, names }
+    }
+
+    fn has(&self, name: &str) -> bool {
+        names_of(name).any(|n| self.names.contains(n))
+    }
+}
+
+/// Indices of the training and of the held-out views.
+#[derive(Debug, Default, PartialEq)]
+pub(super) struct Indices {
+    pub train: Vec<usize>,
+    pub test: Vec<usize>,
+    pub warning: Option<String>,
+}
+
+/// The split of the usable views `names`, of which the dataset in `root` declares `splits`.
+///
+/// # Errors
+/// One line, when the file of [`Holdout::Listed`] fits nothing or cannot be read.
+pub(super) fn split(
+    holdout: &Holdout,
+    root: &Path,
+    names: &[String],
+    mut splits: Vec<Option<Split>>,
+) -> Result<Indices, FormatError> {
+    let by = |held_out: &dyn Fn(usize) -> bool| {
+        let (test, train) = (0..names.len()).partition(|i| held_out(*i));
+        Indices {
+            train,
+            test,
+            warning: None,
+        }
+    };
+    let mut indices = match holdout {
+        Holdout::AsDeclared => {
+            let warning = apply_lists(root, names, &mut splits);
+            let mut declared = declared(&splits);
+            declared.warning = warning.or(declared.warning);
+            declared
+        }
+        Holdout::Every(n) => by(&|i| i.is_multiple_of(*n)),
+        Holdout::Nothing => by(&|_| false),
+        Holdout::Listed(file) => {
+            let text = std::fs::read_to_string(file).map_err(|source| FormatError::Read {
+                path: file.clone(),
+                source,
+            })?;
+            let list = List::parse(file.display().to_string(), &text);
+            let listed = by(&|i| list.has(&names[i]));
+            if listed.test.is_empty() {
+                return Err(FormatError::Option(format!(
+                    "holdout {}: the list names none of the {} views, such as {}",
+                    list.file,
+                    names.len(),
+                    names.first().map_or("", String::as_str)
+                )));
+            }
+            let missing = list.names.len().saturating_sub(listed.test.len());
+            Indices {
+                warning: (missing > 0).then(|| format!("{missing} names in {} are no views of the dataset", list.file)),
+                ..listed
+            }
+        }
+    };
+    if indices.test.is_empty() && *holdout != Holdout::Nothing {
+        let line = "no view is held out, so that nothing is evaluated; holdout can choose some";
+        indices.warning.get_or_insert_with(|| line.into());
+    }
+    Ok(indices)
+}
+
 /// Sets the split of views that have none from lists beside the dataset. Returns a warning when a list fits nothing.
-pub(super) fn apply_lists(root: &Path, names: &[String], splits: &mut [Option<Split>]) -> Option<String> {
+fn apply_lists(root: &Path, names: &[String], splits: &mut [Option<Split>]) -> Option<String> {
     if splits.iter().any(Option::is_some) {
         return None;
     }
     let (test, train) = (read_list(root, TEST_LISTS), read_list(root, TRAIN_LISTS));
-    let is_in = |list: &Option<(String, HashSet<String>)>, name: &str| {
-        list.as_ref()
-            .is_some_and(|(_, listed)| names_of(name).any(|n| listed.contains(n)))
-    };
+    let is_in = |list: &Option<List>, name: &str| list.as_ref().is_some_and(|list| list.has(name));
     let in_test: Vec<bool> = names.iter().map(|name| is_in(&test, name)).collect();
     let in_train: Vec<bool> = names.iter().map(|name| is_in(&train, name)).collect();
     for (list, found) in [(&test, &in_test), (&train, &in_train)] {
-        if let Some((file, _)) = list
+        if let Some(list) = list
             && !found.contains(&true)
         {
             return Some(format!(
-                "{file} names none of the images and is ignored; every 8th view is held out"
+                "{} names none of the images and is ignored; every 8th view is held out",
+                list.file
             ));
         }
     }
@@ -47,48 +148,45 @@ pub(super) fn apply_lists(root: &Path, names: &[String], splits: &mut [Option<Sp
     None
 }
 
-/// Indices of the training and of the held-out views, and a warning where the dataset's own split cannot be used.
-pub(super) fn indices(splits: &[Option<Split>]) -> (Vec<usize>, Vec<usize>, Option<String>) {
+/// The dataset's own split; every 8th view is held out where it has none.
+fn declared(splits: &[Option<Split>]) -> Indices {
     if splits.iter().all(Option::is_none) {
         let (train, test) = every_eighth(splits.len());
-        return (train, test, None);
+        return Indices {
+            train,
+            test,
+            warning: None,
+        };
     }
     let with = |wanted: &[Option<Split>]| {
         (0..splits.len())
             .filter(|i| wanted.contains(&splits[*i]))
             .collect::<Vec<_>>()
     };
-    let (train, test) = (with(&[Some(Split::Train), None]), with(&[Some(Split::Test)]));
-    let why = match (train.is_empty(), test.is_empty()) {
-        (false, false) => return (train, test, None),
-        (true, _) => "the dataset's split leaves no view to train on",
-        (_, true) => "the dataset's split holds out no view",
-    };
-    let (train, test) = every_eighth(splits.len());
-    (train, test, Some(format!("{why}; every 8th view is held out instead")))
+    Indices {
+        train: with(&[Some(Split::Train), None]),
+        test: with(&[Some(Split::Test)]),
+        warning: None,
+    }
 }
 
-/// A view's name as lists may write it: whole, below the folder of images, and both without the extension.
+/// A view's name as lists may write it: whole or below the folder of images, each with and without the extension, or its last
+/// part alone without it.
 fn names_of(name: &str) -> impl Iterator<Item = &str> {
     let below = name.split_once('/').map_or(name, |(_, below)| below);
     let stem = |name| Path::new(name).file_stem().and_then(|s| s.to_str()).unwrap_or(name);
-    [name, below, stem(below)].into_iter()
+    let bare = name.rsplit_once('.').map_or(name, |(bare, _)| bare);
+    let bare_below = below.rsplit_once('.').map_or(below, |(bare, _)| bare);
+    [name, below, bare, bare_below, stem(below)].into_iter()
 }
 
-fn read_list(root: &Path, files: [&str; 2]) -> Option<(String, HashSet<String>)> {
+fn read_list(root: &Path, files: [&str; 2]) -> Option<List> {
     let candidates = FOLDERS
         .iter()
         .flat_map(|folder| files.iter().map(move |file| Path::new(folder).join(file)));
     for candidate in candidates {
         if let Ok(text) = std::fs::read_to_string(root.join(&candidate)) {
-            let lines = text
-                .lines()
-                .map(str::trim)
-                .filter(|line| !line.is_empty() && !line.starts_with('#'));
-            let listed = lines
-                .map(|line| line.trim_start_matches("./").replace('\\', "/"))
-                .collect();
-            return Some((candidate.display().to_string(), listed));
+            return Some(List::parse(candidate.display().to_string(), &text));
         }
     }
     None
@@ -102,28 +200,35 @@ mod tests {
         (0..4).map(|i| format!("images/{i}.png")).collect()
     }
 
+    /// Training and held-out views of four views without a declared split.
+    fn of(holdout: Holdout, root: &Path) -> (Vec<usize>, Vec<usize>) {
+        let indices = split(&holdout, root, &names(), vec![None; 4]).unwrap();
+        (indices.train, indices.test)
+    }
+
     #[test]
     fn lists_name_images_with_and_without_folder_and_extension() {
-        for line in ["images/2.png", "2.png", "2", "./2.png\n"] {
+        for line in ["images/2.png", "2.png", "images/2", "2", "./2.png\n"] {
             let root = tempfile::tempdir().unwrap();
             std::fs::write(root.path().join("test.txt"), format!("# held out\n{line}\n")).unwrap();
-            let mut splits = vec![None; 4];
-            assert_eq!(apply_lists(root.path(), &names(), &mut splits), None);
-            assert_eq!(indices(&splits), (vec![0, 1, 3], vec![2], None));
+            assert_eq!(of(Holdout::AsDeclared, root.path()), (vec![0, 1, 3], vec![2]));
+            let listed = Holdout::Listed(root.path().join("test.txt"));
+            assert_eq!(of(listed, Path::new("elsewhere")), (vec![0, 1, 3], vec![2]));
         }
     }
 
     #[test]
-    fn a_list_of_strangers_is_ignored_and_said() {
+    fn a_list_of_strangers_is_ignored_and_said_or_refused_where_it_was_asked_for() {
         let root = tempfile::tempdir().unwrap();
         std::fs::write(root.path().join("test.txt"), "x.png\n").unwrap();
-        let mut splits = vec![None; 4];
-        assert!(
-            apply_lists(root.path(), &names(), &mut splits)
-                .unwrap()
-                .contains("test.txt")
-        );
-        assert_eq!(indices(&splits).1, [0]);
+        let indices = split(&Holdout::AsDeclared, root.path(), &names(), vec![None; 4]).unwrap();
+        assert_eq!(indices.test, [0]);
+        assert!(indices.warning.unwrap().contains("test.txt"));
+        let listed = Holdout::Listed(root.path().join("test.txt"));
+        let error = split(&listed, root.path(), &names(), vec![None; 4])
+            .unwrap_err()
+            .to_string();
+        assert!(error.contains("test.txt") && error.contains("images/0.png"), "{error}");
     }
 
     #[test]
@@ -131,15 +236,27 @@ mod tests {
         let root = tempfile::tempdir().unwrap();
         std::fs::write(root.path().join("test.txt"), "0").unwrap();
         std::fs::write(root.path().join("train.txt"), "1\n3").unwrap();
-        let mut splits = vec![None; 4];
-        assert_eq!(apply_lists(root.path(), &names(), &mut splits), None);
-        assert_eq!(indices(&splits), (vec![1, 3], vec![0], None));
+        assert_eq!(of(Holdout::AsDeclared, root.path()), (vec![1, 3], vec![0]));
     }
 
     #[test]
-    fn a_split_without_training_views_is_replaced() {
-        let (train, test, warning) = indices(&[Some(Split::Test); 9]);
-        assert_eq!((train.len(), test), (7, vec![0, 8]));
-        assert!(warning.unwrap().contains("no view to train on"));
+    fn what_was_asked_for_counts_before_what_is_declared() {
+        let root = tempfile::tempdir().unwrap();
+        let declared = vec![Some(Split::Train), Some(Split::Test), Some(Split::Left), None];
+        let of = |holdout: Holdout| split(&holdout, root.path(), &names(), declared.clone()).unwrap();
+        let indices = of(Holdout::AsDeclared);
+        assert_eq!((indices.train, indices.test), (vec![0, 3], vec![1]));
+        let indices = of(Holdout::Every(3));
+        assert_eq!((indices.train, indices.test), (vec![1, 2], vec![0, 3]));
+        let indices = of(Holdout::Nothing);
+        assert_eq!((indices.train, indices.warning), (vec![0, 1, 2, 3], None));
+    }
+
+    #[test]
+    fn a_split_without_held_out_views_is_kept() {
+        let root = Path::new("photos");
+        let indices = split(&Holdout::AsDeclared, root, &names(), vec![Some(Split::Train); 4]).unwrap();
+        assert_eq!((indices.train.len(), indices.test.len()), (4, 0));
+        assert!(indices.warning.unwrap().contains("nothing is evaluated"));
     }
 }

@@ -4,7 +4,7 @@
 //! one run stays there.
 
 use super::train::parse_seconds;
-use super::{DataArgs, thread_count};
+use super::{DataArgs, by_option, thread_count};
 use crate::Usage;
 use crate::interrupt::stop_flag;
 use crate::terminal::{note, one_line, say};
@@ -15,8 +15,10 @@ use irradia_runs::formats::write_atomic;
 use irradia_runs::train::compare::{
     Comparison, Figures, PictureRow, Render, Run, Scene, overall, picture, to_html, to_markdown, to_text,
 };
-use irradia_runs::train::report::{Report, machine};
-use irradia_runs::{RunFolder, file_stem, logged_errors, read_recipe};
+use irradia_runs::train::report::{Report, ViewReport, machine};
+use irradia_runs::{
+    Background, RunFolder, data_fingerprint, distinct, file_stem, logged_errors, program_fingerprint, read_recipe,
+};
 use serde::{Deserialize, Serialize};
 use std::fs::{self, File};
 use std::path::{Path, PathBuf};
@@ -61,6 +63,10 @@ pub struct Args {
     /// LPIPS weights: a file, or a folder of them; see irradia lpips
     #[arg(long, value_name = "PATH")]
     pub lpips: Option<PathBuf>,
+    /// white, black or random (trained over random colours, scored over white): what photographs with alpha are laid over;
+    /// white for Blender scenes and the recipe's own for others when absent
+    #[arg(long, value_name = "COLOR")]
+    pub background: Option<Background>,
     #[command(flatten)]
     pub reading: DataArgs,
 }
@@ -85,6 +91,35 @@ struct Request {
     /// Of `irradia`, without `--out`.
     arguments: Vec<String>,
     recipe_hash: String,
+    /// Of this program's file; empty where an earlier version wrote it.
+    #[serde(default)]
+    program: String,
+    /// Of the dataset; empty where it could not be read, or an earlier version wrote it.
+    #[serde(default)]
+    data: String,
+}
+
+impl Request {
+    /// Why a run that was made for `self` cannot stand for one that is made for `wanted`.
+    fn misfit(&self, wanted: &Self) -> Option<&'static str> {
+        let same = (&self.arguments, &self.recipe_hash) == (&wanted.arguments, &wanted.recipe_hash);
+        match (same, self.program == wanted.program, self.data == wanted.data) {
+            (false, ..) => Some("under other conditions"),
+            (true, _, false) => Some("on data that changed since"),
+            (true, false, true) => Some("by another build of this program"),
+            (true, true, true) => None,
+        }
+    }
+}
+
+/// A dataset as it takes part.
+struct Source {
+    /// As the user wrote it.
+    data: PathBuf,
+    /// Name of its folder.
+    name: String,
+    /// Of what it holds; empty where it cannot be read, which its runs then say.
+    fingerprint: String,
 }
 
 const REQUEST: &str = "request.json";
@@ -106,9 +141,10 @@ pub fn run(args: &Args) -> Result<()> {
     if let Some(data) = args.data.iter().find(|data| !data.exists()) {
         return Err(Usage(format!("{} does not exist: give a dataset's folder", data.display())).into());
     }
-    let names = distinct(args.data.iter().map(|data| folder_name(data)).collect());
+    let sources = sources(args)?;
+    let program = program_fingerprint().context("cannot read this program's file")?;
     if !args.overwrite {
-        check_earlier(args, &ways, &names)?;
+        check_earlier(args, &program, &ways, &sources)?;
     }
     fs::create_dir_all(&args.out).with_context(|| format!("cannot make {}; give another --out", args.out.display()))?;
     let stop = stop_flag();
@@ -116,7 +152,8 @@ pub fn run(args: &Args) -> Result<()> {
     let total = args.data.len() * ways.len() * args.seeds as usize;
     let (mut scenes, mut number) = (Vec::new(), 0);
     let (mut device, mut done) = (String::new(), 0);
-    for (data, name) in args.data.iter().zip(&names) {
+    for source in &sources {
+        let name = &source.name;
         let mut trained: Vec<Vec<Trained>> = ways.iter().map(|_| Vec::new()).collect();
         // Recipes within seeds: what else the machine does meanwhile falls on all of them alike.
         for seed in 0..args.seeds {
@@ -124,7 +161,8 @@ pub fn run(args: &Args) -> Result<()> {
                 number += 1;
                 let what = format!("[{number}/{total}] {name}, {}, seed {seed}", way.text);
                 let folder = format!("{name}/{}/seed_{seed}", way.folder);
-                let outcome = one_run(args, data, way, seed, &args.out.join(&folder), &what, &stop)?;
+                let request = request(args, &program, source, way, seed);
+                let outcome = one_run(request, &args.out.join(&folder), &what, &stop)?;
                 let (error, report) = match outcome {
                     Outcome::Stopped => break,
                     Outcome::Failed(error) => {
@@ -134,7 +172,7 @@ pub fn run(args: &Args) -> Result<()> {
                     Outcome::Done(report) => {
                         note(format_args!(
                             "{what}: {:.2} dB after {:.1} s",
-                            report.psnr, report.seconds
+                            report.psnr, report.training_seconds
                         ));
                         (None, Some(*report))
                     }
@@ -167,7 +205,7 @@ pub fn run(args: &Args) -> Result<()> {
             );
             scenes.push(Scene::new(
                 name.clone(),
-                data.display().to_string(),
+                source.data.display().to_string(),
                 runs.collect(),
                 view,
             ));
@@ -196,6 +234,29 @@ pub fn run(args: &Args) -> Result<()> {
     Ok(())
 }
 
+/// The datasets of the command line; those that can be read must have views that score the runs.
+fn sources(args: &Args) -> Result<Vec<Source>> {
+    let reading = args.reading.reading();
+    reading.check().map_err(by_option)?;
+    let names = distinct(args.data.iter().map(|data| folder_name(data)));
+    let source = |(data, name): (&PathBuf, String)| {
+        let dataset = reading.read(data).ok();
+        if dataset.as_ref().is_some_and(|dataset| dataset.test.is_empty()) {
+            let message = format!(
+                "{}: no view is held out, so that nothing can be compared",
+                data.display()
+            );
+            return Err(Usage(message).into());
+        }
+        Ok(Source {
+            data: data.clone(),
+            name,
+            fingerprint: dataset.map_or(String::new(), |dataset| data_fingerprint(&dataset, data)),
+        })
+    };
+    args.data.iter().zip(names).map(source).collect()
+}
+
 /// The recipes of the command line, each read, so that a mistake in the last one is not found after hours.
 fn ways(args: &Args) -> Result<Vec<Way>> {
     let looks = args.look_every.or(args.steps.map(|steps| (steps / 40).max(1)));
@@ -214,7 +275,7 @@ fn ways(args: &Args) -> Result<Vec<Way>> {
             folder: folder_name(Path::new(text)),
         });
     }
-    let folders = distinct(ways.iter().map(|way| way.folder.clone()).collect());
+    let folders = distinct(ways.iter().map(|way| way.folder.clone()));
     for (way, folder) in ways.iter_mut().zip(folders) {
         way.folder = folder;
     }
@@ -231,21 +292,8 @@ fn folder_name(path: &Path) -> String {
     if name.is_empty() { "scene".into() } else { name }
 }
 
-/// The same names, those that came before with a number.
-fn distinct(names: Vec<String>) -> Vec<String> {
-    let mut taken: Vec<String> = Vec::new();
-    for name in names {
-        let numbered = (2..).map(|n| format!("{name}_{n}"));
-        let free = std::iter::once(name.clone())
-            .chain(numbered)
-            .find(|n| !taken.contains(n));
-        taken.extend(free);
-    }
-    taken
-}
-
-fn request(args: &Args, data: &Path, way: &Way, seed: u64) -> Request {
-    let data = std::path::absolute(data).unwrap_or_else(|_| data.to_owned());
+fn request(args: &Args, program: &str, source: &Source, way: &Way, seed: u64) -> Request {
+    let data = std::path::absolute(&source.data).unwrap_or_else(|_| source.data.clone());
     let mut arguments = vec!["train".to_owned(), data.display().to_string()];
     let mut option = |name: &str, value: Option<String>| {
         if let Some(value) = value {
@@ -263,13 +311,18 @@ fn request(args: &Args, data: &Path, way: &Way, seed: u64) -> Request {
     option("--threads", args.threads.map(|n| n.to_string()));
     option("--lpips", args.lpips.as_ref().map(|path| path.display().to_string()));
     option("--format", args.reading.format.clone());
-    match args.reading.max_side {
+    let reading = args.reading.reading();
+    match reading.max_side {
         Some(side) => option("--max-side", Some(side.to_string())),
-        None => option("--downscale", Some(args.reading.downscale.to_string())),
+        None => option("--downscale", Some(reading.downscale.to_string())),
     }
+    option("--holdout", reading.holdout);
+    option("--background", args.background.map(|b| b.name().to_owned()));
     Request {
         arguments,
         recipe_hash: way.hash.clone(),
+        program: program.to_owned(),
+        data: source.fingerprint.clone(),
     }
 }
 
@@ -283,15 +336,19 @@ fn finished(folder: &Path) -> Option<(Report, Option<Request>)> {
 }
 
 /// Refuses, before anything is trained, finished runs that were asked for something else.
-fn check_earlier(args: &Args, ways: &[Way], names: &[String]) -> Result<()> {
-    for (data, name) in args.data.iter().zip(names) {
+fn check_earlier(args: &Args, program: &str, ways: &[Way], sources: &[Source]) -> Result<()> {
+    for source in sources {
         for way in ways {
             for seed in 0..args.seeds {
-                let folder = args.out.join(format!("{name}/{}/seed_{seed}", way.folder));
-                let wanted = request(args, data, way, seed);
-                if finished(&folder).is_some_and(|(_, request)| request != Some(wanted)) {
+                let folder = args.out.join(format!("{}/{}/seed_{seed}", source.name, way.folder));
+                let Some((_, earlier)) = finished(&folder) else {
+                    continue;
+                };
+                let wanted = request(args, program, source, way, seed);
+                let misfit = earlier.map_or(Some("under other conditions"), |earlier| earlier.misfit(&wanted));
+                if let Some(how) = misfit {
                     let message = format!(
-                        "{} holds a run made under other conditions: give another --out, or --overwrite to repeat such runs",
+                        "{} holds a run made {how}: give another --out, or --overwrite to repeat such runs",
                         folder.display()
                     );
                     return Err(Usage(message).into());
@@ -303,16 +360,7 @@ fn check_earlier(args: &Args, ways: &[Way], names: &[String]) -> Result<()> {
 }
 
 /// Reads the run in `folder` if it is what is asked for, makes it otherwise.
-fn one_run(
-    args: &Args,
-    data: &Path,
-    way: &Way,
-    seed: u64,
-    folder: &Path,
-    what: &str,
-    stop: &AtomicBool,
-) -> Result<Outcome> {
-    let request = request(args, data, way, seed);
+fn one_run(request: Request, folder: &Path, what: &str, stop: &AtomicBool) -> Result<Outcome> {
     if let Some((report, earlier)) = finished(folder)
         && earlier.as_ref() == Some(&request)
     {
@@ -374,7 +422,8 @@ fn held_out_view(out: &Path, trained: &[Vec<Trained>]) -> Option<PictureRow> {
         .map(|runs| first(runs).and_then(|i| Some((&runs[i].run, runs[i].report.as_ref()?))))
         .collect();
     let (run, report) = firsts.iter().flatten().next()?;
-    let mut views: Vec<_> = report.views.iter().filter(|view| !view.truth.is_empty()).collect();
+    let measured = |view: &&ViewReport| !view.truth.is_empty() && !view.psnr.is_nan();
+    let mut views: Vec<_> = report.views.iter().filter(measured).collect();
     views.sort_by(|a, b| a.psnr.total_cmp(&b.psnr));
     let view = views.get(views.len() / 2)?;
     let embedded = |run: &Run, file: &str| {
@@ -416,14 +465,17 @@ fn conditions(args: &Args) -> Vec<String> {
         (None, Some(seconds)) => format!("{seconds} s of training"),
         (None, None) => "whole recipes".into(),
     };
-    let size = match args.reading.max_side {
+    let reading = args.reading.reading();
+    let size = match reading.max_side {
         Some(side) => Some(format!("images of at most {side} px")),
-        None if args.reading.downscale > 1.0 => Some(format!("images downscaled by {}", args.reading.downscale)),
+        None if reading.downscale > 1.0 => Some(format!("images downscaled by {}", reading.downscale)),
         None => None,
     };
+    let background = args.background.map(|b| format!("background {}", b.name()));
+    let holdout = reading.holdout.map(|holdout| format!("held out: {holdout}"));
     let seeds = format!("{} seed{}", args.seeds, if args.seeds == 1 { "" } else { "s" });
     let splats = args.max_splats.map(|n| format!("at most {n} splats"));
-    [Some(length), size, splats, Some(seeds)]
+    [Some(length), size, holdout, background, splats, Some(seeds)]
         .into_iter()
         .flatten()
         .collect()
@@ -455,13 +507,13 @@ mod tests {
             "my/own.toml:a.b=1",
             "/",
         ];
-        let names = distinct(names.iter().map(|name| folder_name(Path::new(name))).collect());
+        let names = distinct(names.iter().map(|name| folder_name(Path::new(name))));
         assert_eq!(
             names,
             ["room", "room_2", "curriculum_params.coarse_0", "own_a.b_1", "scene"]
         );
         assert_eq!(
-            distinct(vec!["a".into(), "a_2".into(), "a".into()]),
+            distinct(["a", "a_2", "a"].map(str::to_owned).into_iter()),
             ["a", "a_2", "a_3"]
         );
     }

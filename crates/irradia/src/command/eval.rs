@@ -1,7 +1,7 @@
 //! `irradia eval`
 
 use super::lpips::lpips;
-use super::{DataArgs, Split, thread_count, use_threads};
+use super::{DataArgs, Split, thread_count, use_threads, warn};
 use crate::Usage;
 use crate::terminal::{note, say};
 use anyhow::{Context, Result};
@@ -9,7 +9,9 @@ use irradia_measure::{Evaluation, LpipsNet};
 use irradia_runs::formats::write_atomic;
 use irradia_runs::train::eval::{EvalOptions, EvaluatedView, Metrics};
 use irradia_runs::train::half_fit::HalfFit;
-use irradia_runs::{HOW_TO_GET_LPIPS, Scene, evaluate, file_stem, scene_of, write_image};
+use irradia_runs::{
+    Background, HOW_TO_GET_LPIPS, RunFolder, Scene, evaluate, file_stems, scene_of, unmeasured, write_image,
+};
 use serde_json::json;
 use std::path::PathBuf;
 
@@ -41,6 +43,9 @@ pub struct Args {
     /// Threads; all cores when absent
     #[arg(long, value_parser = thread_count())]
     pub threads: Option<usize>,
+    /// white or black: what is behind the scene; when absent that of its run, or white for Blender scenes with alpha
+    #[arg(long, value_name = "COLOR")]
+    pub background: Option<Background>,
     #[command(flatten)]
     pub reading: DataArgs,
 }
@@ -65,8 +70,21 @@ impl Args {
 
 pub fn run(args: &Args) -> Result<()> {
     use_threads(args.threads)?;
-    let scene = Scene::read(&args.scene)?;
-    let dataset = args.reading.read(&args.data)?;
+    let mut scene = Scene::read(&args.scene)?;
+    let run = RunFolder::around(&args.scene);
+    let mut reading = args.reading.clone();
+    if reading.holdout.is_none() {
+        // Other views than those that the run held out, it was trained on.
+        reading.holdout = run.as_ref().and_then(|record| record.input.reading.holdout.clone());
+    }
+    let dataset = reading.read(&args.data)?;
+    let background = match (args.background, &run) {
+        (None, None) => Background::usual(&dataset)?,
+        (given, _) => given,
+    };
+    if let Some(background) = background {
+        scene.options.background = background.color();
+    }
     let indices = args.split.of(&dataset);
     if indices.is_empty() {
         return Err(Usage(format!("{} has no such views: try --split all", args.data.display())).into());
@@ -83,20 +101,31 @@ pub fn run(args: &Args) -> Result<()> {
         metrics: Metrics::All(lpips.as_ref()),
         half_fit: args.half_fit(),
     };
-    let mut rows = Vec::new();
+    let (mut rows, mut measured) = (Vec::new(), Vec::new());
+    let stems = file_stems(dataset.views.iter().map(|view| view.name.as_str()));
+    let mut stems = indices.iter().map(|i| &stems[*i]);
     let see = |view: &EvaluatedView| -> Result<()> {
         let m = view.metrics;
-        say(figures(&view.name, &m, net))?;
-        rows.push(json!({
-            "name": view.name, "psnr": m.psnr, "ssim": m.ssim, "lpips": m.lpips, "half_fit_psnr": m.half_fit_psnr,
-        }));
+        let stem = stems.next().expect("one for each view");
+        measured.push((view.name.clone(), view.is_measured()));
+        if view.is_measured() {
+            say(figures(&view.name, &m, net))?;
+            rows.push(json!({
+                "name": view.name, "psnr": m.psnr, "ssim": m.ssim, "lpips": m.lpips, "half_fit_psnr": m.half_fit_psnr,
+            }));
+        }
         if let Some(folder) = &args.save_images {
             std::fs::create_dir_all(folder).with_context(|| format!("cannot make {}", folder.display()))?;
-            write_image(folder.join(format!("{}.png", file_stem(&view.name))), &view.render)?;
+            write_image(folder.join(format!("{}.png", stem)), &view.render)?;
         }
         Ok(())
     };
     let mean = evaluate(&scene.model, &dataset, &indices, &options, see)?;
+    let unmeasured = unmeasured(measured.iter().map(|(name, measured)| (name.as_str(), *measured)));
+    if rows.is_empty() {
+        return Err(Usage(unmeasured.unwrap_or_default()).into());
+    }
+    warn(unmeasured.as_slice());
     say(figures(&format!("mean of {}", rows.len()), &mean, net))?;
     if let Some(path) = &args.json {
         let figures = json!({

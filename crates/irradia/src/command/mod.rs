@@ -45,11 +45,17 @@ impl Split {
 #[derive(Clone, Debug, clap::Args)]
 pub struct DataArgs {
     /// Divide the images' sides by this
-    #[arg(long, value_name = "F", default_value_t = 1.0)]
-    pub downscale: f32,
-    /// Shrink images until the longer side has at most so many pixels
+    #[arg(long, value_name = "F")]
+    pub downscale: Option<f32>,
+    /// Scale images whose longer side has more pixels than this; 1600 when no size is asked for
     #[arg(long, value_name = "PX", conflicts_with = "downscale", value_parser = clap::value_parser!(u32).range(1..))]
     pub max_side: Option<u32>,
+    /// Use images as large as they are
+    #[arg(long, conflicts_with_all = ["downscale", "max_side"])]
+    pub full_size: bool,
+    /// Hold out every N-th view by name, none, or those that FILE lists; when absent the dataset's own split, or every 8th
+    #[arg(long, value_name = "N|0|FILE")]
+    pub holdout: Option<String>,
     /// colmap, nerfstudio, blender or llff; recognised from the folder when absent
     #[arg(long)]
     pub format: Option<String>,
@@ -58,10 +64,13 @@ pub struct DataArgs {
 impl DataArgs {
     /// As the library takes it.
     pub fn reading(&self) -> Reading {
+        let usual = Reading::default();
+        let sized = self.downscale.is_some() || self.full_size;
         Reading {
             format: self.format.clone(),
-            downscale: self.downscale,
-            max_side: self.max_side,
+            downscale: self.downscale.unwrap_or(usual.downscale),
+            max_side: self.max_side.or(usual.max_side.filter(|_| !sized)),
+            holdout: self.holdout.clone(),
         }
     }
 

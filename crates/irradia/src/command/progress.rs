@@ -3,6 +3,7 @@
 use crate::terminal::note;
 use indicatif::{HumanDuration, ProgressBar, ProgressStyle};
 use irradia_train::Trainer;
+use irradia_train::eval::MOST_PSNR;
 use irradia_train::event::{Event, Observer, Signal, StepReport};
 use std::io::IsTerminal;
 use std::sync::Arc;
@@ -67,7 +68,7 @@ impl Progress {
         let message = format!(
             "loss {:.4} psnr {:.2} dB{held_out} {} {rate:.1} steps/s {}",
             report.loss,
-            -10.0 * mse.log10(),
+            (-10.0 * mse.log10()).min(MOST_PSNR),
             size_in_words(report.splats as u64, report.parameters.map(|n| n as u64)),
             self.stage
         );
@@ -142,6 +143,10 @@ impl Observer for Progress {
             Event::Densified { .. } | Event::Saved { .. } => {}
         }
         self.signal()
+    }
+
+    fn wants_stop(&self) -> bool {
+        self.stop.load(Ordering::Relaxed)
     }
 
     fn while_paused(&mut self, _trainer: &Trainer) -> Signal {

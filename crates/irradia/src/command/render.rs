@@ -5,7 +5,7 @@ use crate::Usage;
 use crate::terminal::say;
 use anyhow::{Context, Result};
 use irradia_runs::scene::{Camera, Image};
-use irradia_runs::{Scene, file_stem, write_image};
+use irradia_runs::{Scene, file_stems, write_image};
 use irradia_splat::Renderer;
 use std::path::PathBuf;
 
@@ -57,10 +57,11 @@ pub fn run(args: &Args) -> Result<()> {
     let cameras: Vec<(String, Camera)> = match (&args.data, args.orbit) {
         (Some(data), _) => {
             let dataset = args.reading.read(data)?;
+            let stems = file_stems(dataset.views.iter().map(|view| view.name.as_str()));
             let views = args.split.of(&dataset);
             views
                 .iter()
-                .map(|i| (file_stem(&dataset.views[*i].name), dataset.views[*i].camera))
+                .map(|i| (stems[*i].clone(), dataset.views[*i].camera))
                 .collect()
         }
         (None, Some(frames)) => {

@@ -7,13 +7,14 @@ use crate::interrupt::stop_flag;
 use crate::terminal::{note, one_line, say};
 use anyhow::{Result, anyhow};
 use clap::builder::RangedU64ValueParser;
-use irradia_runs::{DEFAULT_RECIPE, Finished, Run, RunFolder, TrainInput};
+use irradia_runs::{Background, DEFAULT_RECIPE, Finished, Run, RunError, RunFolder, TrainInput};
 use std::path::{Path, PathBuf};
+use std::sync::atomic::Ordering;
 
 #[derive(clap::Args)]
 pub struct Args {
-    /// Folder of posed photographs (COLMAP, nerfstudio, Blender, LLFF); with --resume the run knows it
-    #[arg(required_unless_present = "resume")]
+    /// Folder of posed photographs (COLMAP, nerfstudio, Blender, LLFF); with --resume and --replay the run knows it
+    #[arg(required_unless_present_any = ["resume", "replay"])]
     pub data: Option<PathBuf>,
     /// Folder for the run
     #[arg(long, value_name = "RUN", required_unless_present = "resume")]
@@ -39,18 +40,26 @@ pub struct Args {
     /// Stop when the held-out views reach this
     #[arg(long, value_name = "DB")]
     pub until_psnr: Option<f64>,
-    /// Fit the recipe into a time of training, such as 90s or 5m
+    /// Fit the recipe into a time of training, such as 90s or 5m. How far it comes depends on the clock, and so do the bytes of
+    /// the scene; --replay makes the same ones again
     #[arg(long, value_name = "TIME", value_parser = parse_seconds)]
     pub budget: Option<f64>,
     /// Go on with an interrupted run, from its newest checkpoint; the result is that of an unbroken run
-    #[arg(long, value_name = "RUN", conflicts_with_all = ["out", "overwrite", "downscale", "max_side", "format"])]
+    #[arg(long, value_name = "RUN", conflicts_with_all = ["out", "overwrite", "downscale", "max_side", "full_size", "holdout", "format"])]
     pub resume: Option<PathBuf>,
+    /// Train as RUN was, each step at the pace that it had, into --out: the same bytes, also of a run with a --budget
+    #[arg(long, value_name = "RUN", conflicts_with_all = ["resume", "recipe", "set", "steps", "max_splats", "seed", "until_psnr", "budget", "downscale", "max_side", "full_size", "holdout", "format", "background"])]
+    pub replay: Option<PathBuf>,
     /// Replace the run that --out holds
     #[arg(long)]
     pub overwrite: bool,
     /// LPIPS weights: a file, or a folder of them; see irradia lpips
     #[arg(long, value_name = "PATH")]
     pub lpips: Option<PathBuf>,
+    /// white, black or random (trained over random colours, scored over white): what photographs with alpha are laid over;
+    /// white for Blender scenes and the recipe's own for others when absent
+    #[arg(long, value_name = "COLOR", conflicts_with = "resume")]
+    pub background: Option<Background>,
     #[command(flatten)]
     pub reading: DataArgs,
 }
@@ -71,10 +80,29 @@ pub fn parse_seconds(text: &str) -> Result<f64, String> {
 
 pub fn run(args: &Args) -> Result<()> {
     use_threads(args.threads)?;
-    match &args.resume {
-        Some(run) => resume(run, args),
-        None => begin(input(args)?),
+    match (&args.resume, &args.replay) {
+        (Some(run), _) => resume(run, args),
+        (None, Some(run)) => begin(replay(run, args)?),
+        (None, None) => begin(input(args)?),
     }
+}
+
+/// `run` again.
+fn replay(run: &Path, args: &Args) -> Result<TrainInput> {
+    let out = args.out.clone().expect("clap asks for it");
+    let mut input = TrainInput::replay_of(run, out)?;
+    if let Some(data) = &args.data {
+        input.data.clone_from(data);
+    }
+    input.lpips = lpips_for(input.lpips, args)?;
+    input.overwrite = args.overwrite;
+    Ok(input)
+}
+
+/// The weights that a run began with, where they still lie: a perceptual loss without them would train another scene.
+fn lpips_for(kept: Option<PathBuf>, args: &Args) -> Result<Option<PathBuf>> {
+    let kept = kept.filter(|path| path.exists());
+    lpips_path(args.lpips.as_ref().or(kept.as_ref()))
 }
 
 /// A new run as the command line asks for it.
@@ -90,6 +118,7 @@ fn input(args: &Args) -> Result<TrainInput> {
         seed: args.seed,
         lpips: lpips_path(args.lpips.as_ref())?,
         reading: args.reading.reading(),
+        background: args.background,
         overwrite: args.overwrite,
         ..TrainInput::new(given(&args.data), given(&args.out))
     })
@@ -102,7 +131,9 @@ pub fn begin(input: TrainInput) -> Result<()> {
     let dataset = request.read_dataset()?;
     warn(&dataset.warnings);
     warn(&request.warnings());
-    finish(Run::begin_on(request, dataset)?)
+    let run = Run::begin_on(request, dataset).map_err(by_option)?;
+    note(format_args!("background: {}", run.background()));
+    finish(run)
 }
 
 fn resume(folder: &Path, args: &Args) -> Result<()> {
@@ -123,9 +154,7 @@ fn resume(folder: &Path, args: &Args) -> Result<()> {
         (input.budget, input.steps) = (args.budget, None);
     }
     input.until_psnr = args.until_psnr.or(input.until_psnr);
-    // Those it began with, where they still lie: a perceptual loss without them would train another scene.
-    let kept = input.lpips.filter(|path| path.exists());
-    input.lpips = lpips_path(args.lpips.as_ref().or(kept.as_ref()))?;
+    input.lpips = lpips_for(input.lpips, args)?;
     let request = input.check().map_err(by_option)?;
     let dataset = request.read_dataset()?;
     warn(&dataset.warnings);
@@ -141,8 +170,20 @@ fn finish(mut run: Run) -> Result<()> {
     if let (Some(lpips), Some(path)) = (&run.trainer().options.lpips, &run.request().input().lpips) {
         lpips::tell(lpips, path);
     }
-    let trained = run.train(&mut [&mut Progress::new(stop_flag())]);
-    let finished = trained.and_then(|_| run.finish()).map_err(|error| {
+    let stop = stop_flag();
+    let trained = run.train(&mut [&mut Progress::new(stop.clone())]);
+    // A Ctrl-C that ended the steps is obeyed by then; the evaluation ends by one of its own.
+    let stopped = stop.load(Ordering::Relaxed);
+    let stop = || !stopped && stop.load(Ordering::Relaxed);
+    let finished = trained.and_then(|_| run.finish_unless(&stop));
+    if matches!(finished, Err(RunError::EvaluationStopped)) {
+        return say(format_args!(
+            "{}; evaluate it with: irradia train --resume {}",
+            RunError::EvaluationStopped,
+            folder.display()
+        ));
+    }
+    let finished = finished.map_err(|error| {
         anyhow!(
             "{}; when that is put right, go on with: irradia train --resume {}",
             one_line(&error.into()),
@@ -154,16 +195,31 @@ fn finish(mut run: Run) -> Result<()> {
 
 fn tell(finished: &Finished) -> Result<()> {
     let (report, folder) = (&finished.report, &finished.folder);
+    let figures = if report.psnr.is_nan() {
+        "nothing was evaluated: no view is held out that could be measured".to_owned()
+    } else {
+        format!(
+            "held-out PSNR {:.2} dB, SSIM {:.4}{}{}",
+            report.psnr,
+            report.ssim,
+            in_words(report.lpips, report.lpips_net.as_deref()),
+            report.half_fit_psnr.map_or(String::new(), |psnr| format!(
+                ", {psnr:.2} dB on right halves fitted on left ones"
+            )),
+        )
+    };
+    warn(
+        &report
+            .warnings
+            .iter()
+            .filter(|line| line.contains("not measured"))
+            .cloned()
+            .collect::<Vec<_>>(),
+    );
     say(format_args!(
-        "held-out PSNR {:.2} dB, SSIM {:.4}{}{}; {}, {:.1} s of training",
-        report.psnr,
-        report.ssim,
-        in_words(report.lpips, report.lpips_net.as_deref()),
-        report.half_fit_psnr.map_or(String::new(), |psnr| format!(
-            ", {psnr:.2} dB on right halves fitted on left ones"
-        )),
+        "{figures}; {}, {:.1} s of training",
         size_in_words(report.splats, report.parameters),
-        report.seconds
+        report.training_seconds
     ))?;
     if !finished.complete {
         say(format_args!(

@@ -63,6 +63,20 @@ fn a_comparison_sums_up_its_runs_and_reads_finished_ones_again() {
     let psnr = |value: &serde_json::Value| value["scenes"][0]["entries"][0]["psnr"]["mean"].as_f64();
     assert_eq!(psnr(&json(&both.join("compare.json"))), psnr(&json_before));
 
+    // Data or a program that changed since are noticed.
+    let request = both.join("data/classic/seed_0/request.json");
+    let kept = fs::read_to_string(&request).expect("a request");
+    let mut changed = json(&request);
+    changed["program"] = "another".into();
+    fs::write(&request, changed.to_string()).expect("written");
+    irradia(folder.path(), LINE).refused(2, &["seed_0", "another build", "--overwrite"]);
+    fs::write(&request, kept).expect("written");
+    let picture = folder.path().join("data/train/r_000.png");
+    let bytes = fs::read(&picture).expect("a picture");
+    fs::copy(folder.path().join("data/train/r_001.png"), &picture).expect("replaced");
+    irradia(folder.path(), LINE).refused(2, &["seed_0", "data that changed since"]);
+    fs::write(&picture, bytes).expect("written");
+
     // Other conditions are another comparison, unless that is what is wanted.
     let other = LINE.replace("--steps 20", "--steps 21");
     irradia(folder.path(), &other).refused(2, &["other conditions", "--overwrite"]);

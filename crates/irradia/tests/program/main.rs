@@ -9,3 +9,4 @@ mod process;
 mod real_data;
 mod recipe;
 mod reproducible;
+mod views;

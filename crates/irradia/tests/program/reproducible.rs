@@ -127,3 +127,105 @@ fn ctrl_c_saves_everything_and_the_run_resumes_to_the_same_bytes() {
     let again = irradia(folder.path(), "train --resume run").well();
     assert!(again.stdout.contains("complete"), "{again:?}");
 }
+
+#[test]
+fn two_processes_do_not_train_into_one_folder() {
+    let folder = with_data();
+    let mut child = caught_in_its_midst(folder.path());
+    let number = child.id().to_string();
+    for line in ["train data --out run --overwrite --steps 5", "train --resume run"] {
+        irradia(folder.path(), line).refused(1, &["run is in use", &number]);
+    }
+    child.kill().expect("killed");
+    child.wait().expect("gone");
+    // The lock went with its process; what it was writing goes now.
+    let half = folder.path().join("run/checkpoints/.step_20.safetensors.1.0.tmp");
+    std::fs::write(&half, "half a checkpoint").expect("written");
+    irradia(folder.path(), "train data --out run --overwrite --steps 5").well();
+    assert_no_leftovers(&folder.path().join("run"));
+}
+
+#[test]
+fn a_run_does_not_go_on_with_other_data() {
+    let folder = with_data();
+    irradia(
+        folder.path(),
+        "train data --out run --steps 40 --set checkpoint_every=20",
+    )
+    .well();
+    let run = folder.path().join("run");
+    let before = scene(&run);
+    unfinish(&run, "scene.ply");
+    let picture = folder.path().join("data/train/r_002.png");
+    std::fs::rename(&picture, folder.path().join("kept.png")).expect("moved");
+    irradia(folder.path(), "train --resume run").refused(1, &["run", "data", "1 views are gone", "r_002"]);
+    std::fs::rename(folder.path().join("kept.png"), &picture).expect("back");
+    irradia(folder.path(), "train --resume run").well();
+    assert!(scene(&run) == before);
+}
+
+#[test]
+fn a_run_within_a_time_is_repeated_to_the_byte() {
+    let folder = with_data();
+    irradia_with(folder.path(), "train data --out run --budget 2s --seed 5", &LIVELY).well();
+    irradia(folder.path(), "train --replay run --out again").well();
+    let [run, again] = ["run", "again"].map(|name| folder.path().join(name));
+    assert!(scene(&run) == scene(&again));
+    let steps = |run: &Path| json(&run.join("report.json"))["steps"].as_u64();
+    assert!(steps(&run) == steps(&again) && steps(&run) > Some(20));
+    let paces = |run: &Path| std::fs::read_to_string(run.join("pace.txt")).expect("paces");
+    assert_eq!(paces(&run), paces(&again), "a repeated run can be repeated");
+    assert!(paces(&run).lines().count() > 10);
+    // A repetition that was interrupted goes on as one.
+    unfinish(&again, "scene.ply");
+    irradia(folder.path(), "train --resume again").well();
+    assert!(scene(&run) == scene(&again));
+    std::fs::remove_file(run.join("pace.txt")).expect("removed");
+    irradia(folder.path(), "train --replay run --out x").refused(1, &["run/pace.txt"]);
+    assert!(!folder.path().join("x").exists());
+}
+
+#[test]
+fn killed_again_and_again_it_ends_with_the_same_bytes() {
+    let folder = with_data();
+    let line = "train data --steps 150 --seed 3 --set checkpoint_every=5";
+    let started = Instant::now();
+    irradia_with(folder.path(), &format!("{line} --out unbroken"), &LIVELY).well();
+    let whole = started.elapsed();
+    let mut rng = irradia_runs::scene::Rng::new(11, 0);
+    let (mut kills, mut tries) = (0, 0);
+    let mut arguments = format!("{line} --out run");
+    while kills < 5 {
+        tries += 1;
+        assert!(tries < 60, "{kills} kills in {tries} tries");
+        let more: &[&str] = if folder.path().join("run/run.json").exists() {
+            arguments = "train --resume run".into();
+            &[]
+        } else {
+            &LIVELY
+        };
+        let mut child = program(folder.path())
+            .args(arguments.split_whitespace())
+            .args(more)
+            .spawn()
+            .expect("it starts");
+        std::thread::sleep(whole.mul_f32(0.1 + 0.3 * rng.uniform()));
+        if child.try_wait().expect("asked").is_none() {
+            child.kill().expect("killed");
+            kills += 1;
+        }
+        child.wait().expect("gone");
+        if folder.path().join("run/report.json").exists() {
+            // Over before it was killed often enough: from the start again.
+            std::fs::remove_dir_all(folder.path().join("run")).expect("removed");
+            arguments = format!("{line} --out run");
+        }
+    }
+    if folder.path().join("run/run.json").exists() {
+        irradia(folder.path(), "train --resume run").well();
+    } else {
+        irradia_with(folder.path(), &format!("{line} --out run"), &LIVELY).well();
+    }
+    assert!(scene(&folder.path().join("run")) == scene(&folder.path().join("unbroken")));
+    assert_no_leftovers(&folder.path().join("run"));
+}

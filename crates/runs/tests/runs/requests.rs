@@ -160,6 +160,7 @@ fn what_was_asked_for_is_read_back() {
             format: Some("blender".into()),
             downscale: 1.5,
             max_side: None,
+            holdout: Some("5".into()),
         },
         ..input(folder.path(), "run", 4)
     };
@@ -183,6 +184,24 @@ fn what_was_asked_for_is_read_back() {
     assert_eq!(request.recipe().hash(), recipe.hash());
 }
 
+#[test]
+fn what_died_before_its_run_had_begun_is_no_run() {
+    let folder = folder();
+    let run = folder.path().join("run");
+    fs::create_dir(&run).expect("a folder");
+    fs::write(run.join("recipe.toml"), "somebody's own").expect("written");
+    let again = || Run::begin_on(input(folder.path(), "run", 2).check().expect("a request"), dataset());
+    assert!(
+        again()
+            .err()
+            .expect("refused")
+            .to_string()
+            .contains("already holds a run")
+    );
+    fs::write(run.join(".lock"), "4194305").expect("written");
+    again().expect("a run");
+}
+
 /// As 0.1.0's first builds wrote it: no recipe, and `lpips` in later ones only.
 #[test]
 fn an_old_run_json_is_read() {
@@ -193,6 +212,8 @@ fn an_old_run_json_is_read() {
     let record: RunRecord = serde_json::from_str(text).expect("an old record");
     assert_eq!(record.input.data, Path::new("/photos"));
     assert_eq!((record.input.seed, record.input.reading.downscale), (3, 2.0));
+    // It had no usual size.
+    assert_eq!(record.input.reading.max_side, None);
     assert_eq!((record.input.lpips, record.complete), (None, false));
 
     let folder = folder();

@@ -1,6 +1,6 @@
 //! Observers: stop, save and pause.
 
-use crate::{begin, dataset, folder, scene, unwatched};
+use crate::{begin, dataset, folder, input, scene, unwatched};
 use irradia_runs::prelude::*;
 use std::fs;
 use std::time::{Duration, Instant};
@@ -91,7 +91,23 @@ fn a_stopped_run_may_be_trained_on_at_once() {
     let report = run.finish().expect("finishes").report;
     assert!(scene(folder.path(), "run") == unwatched(folder.path(), 12));
     let seconds: f64 = report.stages.iter().map(|stage| stage.seconds).sum();
-    assert!((seconds - report.seconds).abs() < 1e-9, "each second is counted once");
+    let inside = report.breakdown.inside;
+    let parts = [
+        inside.steps,
+        inside.density,
+        inside.loading,
+        inside.evaluating,
+        inside.saving,
+        inside.paused,
+        inside.other,
+    ];
+    assert!((parts.iter().sum::<f64>() - report.seconds).abs() < 1e-9, "{inside:?}");
+    assert!(report.seconds >= report.training_seconds && report.total_seconds > report.seconds);
+    assert!(report.breakdown.beside.preparing > 0.0 && report.breakdown.beside.finishing > 0.0);
+    assert!(
+        (seconds - report.training_seconds).abs() < 1e-9,
+        "each second is counted once"
+    );
 }
 
 #[test]
@@ -170,4 +186,50 @@ fn an_observers_warning_reaches_the_others_and_the_report_once() {
     let warned = |event: &&Event| matches!(event, Event::Warned { message } if message == "no sound");
     assert_eq!(listens.told.iter().filter(warned).count(), 1);
     assert_eq!(run.finish().expect("finishes").report.warnings, ["no sound"]);
+}
+
+#[test]
+fn an_evaluation_that_was_stopped_is_made_when_the_run_is_resumed() {
+    let folder = folder();
+    let mut run = begin(folder.path(), "run", 12);
+    run.train(&mut []).expect("trains");
+    let path = run.folder().path().to_owned();
+    let stopped = run.finish_unless(&|| true);
+    assert!(matches!(stopped, Err(RunError::EvaluationStopped)));
+    assert!(path.join("scene.ply").is_file() && !path.join("report.json").exists());
+
+    let request = TrainInput::of_run(&path).expect("a run").check().expect("a request");
+    let mut run = Run::resume_on(request, dataset()).expect("resumed");
+    assert_eq!(run.trainer().clock.step, 12);
+    run.train(&mut []).expect("nothing is left to train");
+    let finished = run.finish().expect("finishes");
+    assert!(finished.complete && finished.report.psnr > 5.0 && finished.report.steps == 12);
+    assert!(scene(folder.path(), "run") == unwatched(folder.path(), 12));
+}
+
+/// Wants to stop as soon as held-out views are evaluated.
+struct Impatient(Vec<Event>);
+
+impl Observer for Impatient {
+    fn on_event(&mut self, event: &Event, _: &Trainer) -> Signal {
+        self.0.push(event.clone());
+        Signal::Continue
+    }
+
+    fn wants_stop(&self) -> bool {
+        true
+    }
+}
+
+#[test]
+fn half_an_evaluation_is_not_told() {
+    let folder = folder();
+    let asked = TrainInput {
+        set: vec!["eval_every=2".into()],
+        ..input(folder.path(), "run", 5)
+    };
+    let mut run = Run::begin_on(asked.check().expect("a request"), dataset()).expect("a run");
+    let mut observer = Impatient(Vec::new());
+    run.train(&mut [&mut observer]).expect("trains");
+    assert!(!observer.0.iter().any(|event| matches!(event, Event::Evaluated { .. })));
 }

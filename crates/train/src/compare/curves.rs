@@ -28,12 +28,12 @@ pub(super) fn looks(report: &Report) -> Vec<Look> {
         })
     });
     let mut looks: Vec<Look> = measured.filter(|look| look.psnr.is_finite()).collect();
-    if report.psnr.is_finite() && report.seconds.is_finite() {
+    if report.psnr.is_finite() && report.training_seconds.is_finite() {
         // The same scene with all bands of harmonics: it stands for a look at the last step.
         looks.retain(|look| look.step < report.steps);
         looks.push(Look {
             step: report.steps,
-            seconds: report.seconds,
+            seconds: report.training_seconds,
             psnr: report.psnr,
         });
     }

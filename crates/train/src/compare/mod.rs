@@ -250,7 +250,7 @@ impl Figures {
         let looks = curves::looks(report);
         Self {
             steps: report.steps,
-            seconds: report.seconds,
+            seconds: report.training_seconds,
             cpu_seconds: report.cpu_seconds,
             total_seconds: report.total_seconds,
             splats: report.splats,

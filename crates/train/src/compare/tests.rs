@@ -14,7 +14,7 @@ fn report(seconds: f64, psnr: f64) -> Report {
     curve[99].psnr = Some(psnr - 0.1);
     Report {
         steps: 100,
-        seconds,
+        training_seconds: seconds,
         cpu_seconds: 2.0 * seconds,
         psnr,
         ssim: 0.8,

@@ -11,6 +11,7 @@ pub use columns::columns;
 pub use machine::{Machine, machine, peak_rss_bytes};
 pub use schedule::{KnobCurve, Schedule, schedule};
 
+use crate::times::Times;
 use serde::{Deserialize, Deserializer, Serialize};
 
 /// Everything a run is judged by. Numbers that are not finite are written as `null` and read back as NaN.
@@ -32,13 +33,19 @@ pub struct Report {
     pub seed: u64,
     /// Steps taken.
     pub steps: u64,
-    /// Wall-clock seconds of the training loop alone.
+    /// Wall-clock seconds of everything between the first step and the last; earlier versions told `training_seconds` here.
     #[serde(deserialize_with = "or_nan")]
     pub seconds: f64,
-    /// Processor seconds of the training loop alone, all threads together.
+    /// Wall-clock seconds of the steps alone.
+    #[serde(default = "nan", deserialize_with = "or_nan")]
+    pub training_seconds: f64,
+    /// What `seconds` and `total_seconds` went into.
+    #[serde(default)]
+    pub breakdown: Breakdown,
+    /// Processor seconds of the steps alone, all threads together.
     #[serde(deserialize_with = "or_nan")]
     pub cpu_seconds: f64,
-    /// Wall-clock seconds of everything, loading and evaluation too.
+    /// Wall-clock seconds of everything that this process did for the run, from reading the dataset to the last evaluation.
     #[serde(deserialize_with = "or_nan")]
     pub total_seconds: f64,
     /// Gaussians at the end.
@@ -48,11 +55,14 @@ pub struct Report {
     pub parameters: Option<u64>,
     /// Most memory the process ever held, bytes; 0 where the system does not say.
     pub peak_rss_bytes: u64,
-    /// Mean over the held-out views, dB.
-    #[serde(deserialize_with = "or_nan")]
+    /// What it was trained over and is scored over, for people.
+    #[serde(default)]
+    pub background: String,
+    /// Mean over the held-out views, dB; NaN, and absent from files, where none could be measured.
+    #[serde(default = "nan", deserialize_with = "or_nan", skip_serializing_if = "is_nan")]
     pub psnr: f64,
-    /// Mean over the held-out views.
-    #[serde(deserialize_with = "or_nan")]
+    /// Mean over the held-out views, likewise.
+    #[serde(default = "nan", deserialize_with = "or_nan", skip_serializing_if = "is_nan")]
     pub ssim: f64,
     /// Mean over the held-out views; `None` without the network's weights.
     pub lpips: Option<f64>,
@@ -78,16 +88,78 @@ pub struct Report {
     pub warnings: Vec<String>,
 }
 
+/// Wall-clock seconds by what they were spent on. Those of `inside` add up to [`Report::seconds`]; those of `beside` are this
+/// process's own, where a run was resumed.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Breakdown {
+    /// Between the first step and the last.
+    pub inside: Inside,
+    /// Before the first step and after the last.
+    pub beside: Beside,
+}
+
+/// Wall-clock seconds between a run's first step and its last.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Inside {
+    /// The steps, without density control.
+    pub steps: f64,
+    /// Density control.
+    pub density: f64,
+    /// Waiting for photographs.
+    pub loading: f64,
+    /// Evaluating held-out views.
+    pub evaluating: f64,
+    /// Writing checkpoints.
+    pub saving: f64,
+    /// Paused.
+    pub paused: f64,
+    /// Events, forecasts, snapshots.
+    pub other: f64,
+}
+
+/// Wall-clock seconds before a run's first step and after its last.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Beside {
+    /// Reading the dataset, making or reading the first state.
+    pub preparing: f64,
+    /// Writing the scene, evaluating it.
+    pub finishing: f64,
+}
+
+impl Inside {
+    /// What `times` and the seconds of the steps say.
+    pub fn of(times: &Times, training_seconds: f64) -> Self {
+        let Times {
+            wall,
+            loading,
+            density,
+            evaluating,
+            saving,
+            paused,
+        } = *times;
+        let named = training_seconds + loading + evaluating + saving + paused;
+        Self {
+            steps: training_seconds - density,
+            density,
+            loading,
+            evaluating,
+            saving,
+            paused,
+            other: wall - named,
+        }
+    }
+}
+
 /// One held-out view.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct ViewReport {
     /// Name within the dataset.
     pub name: String,
-    /// dB.
-    #[serde(deserialize_with = "or_nan")]
+    /// dB; NaN, and absent from files, where the view's mask leaves no pixel.
+    #[serde(default = "nan", deserialize_with = "or_nan", skip_serializing_if = "is_nan")]
     pub psnr: f64,
-    /// Structural similarity.
-    #[serde(deserialize_with = "or_nan")]
+    /// Structural similarity, likewise.
+    #[serde(default = "nan", deserialize_with = "or_nan", skip_serializing_if = "is_nan")]
     pub ssim: f64,
     /// Perceptual distance, where there are weights.
     pub lpips: Option<f64>,
@@ -111,7 +183,7 @@ pub struct StageReport {
     pub first_step: u64,
     /// Its last step.
     pub last_step: u64,
-    /// Wall-clock seconds of the loop within it.
+    /// Wall-clock seconds of the steps within it.
     #[serde(deserialize_with = "or_nan")]
     pub seconds: f64,
 }
@@ -121,16 +193,25 @@ pub struct StageReport {
 pub struct CurvePoint {
     /// Steps taken.
     pub step: u64,
-    /// Wall-clock seconds of the loop so far.
+    /// Wall-clock seconds of the steps so far.
     #[serde(deserialize_with = "or_nan")]
     pub seconds: f64,
-    /// Training loss.
-    #[serde(deserialize_with = "or_nan")]
+    /// Training loss; NaN, and absent from files, where only PSNR was measured.
+    #[serde(default = "nan", deserialize_with = "or_nan", skip_serializing_if = "is_nan")]
     pub loss: f64,
     /// PSNR in dB, where it was measured at this step.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
     pub psnr: Option<f64>,
     /// Gaussians.
     pub splats: u64,
+}
+
+fn nan() -> f64 {
+    f64::NAN
+}
+
+fn is_nan(value: &f64) -> bool {
+    value.is_nan()
 }
 
 fn or_nan<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f64, D::Error> {

@@ -13,7 +13,7 @@
     [lpips, fixed(report.lpips, 4)],
     isField ? ["Parameters", whole(report.parameters)] : ["Splats", whole(report.splats)],
     ["Steps", whole(report.steps)],
-    ["Training", duration(report.seconds)],
+    ["First to last step", duration(report.seconds)],
     ["Peak memory", bytes(report.peak_rss_bytes)],
   ]) {
     const box = make("div");
@@ -165,15 +165,20 @@
 
   // Machine, stages, recipe.
   const machine = report.machine;
+  const spent = (times) =>
+    Object.entries(times || {}).filter(([, seconds]) => seconds >= 0.05).map(([what, seconds]) => `${what} ${duration(seconds)}`).join(", ");
   for (const [label, value] of [
     ["Processor", machine.cpu],
     ["Cores", whole(machine.cores)],
     ["Memory", bytes(machine.memory)],
     ["System", machine.os],
     ["Device", report.device],
-    ["Training", `${duration(report.seconds)} (${duration(report.cpu_seconds)} of processor time)`],
+    ["Steps alone", `${duration(report.training_seconds)} (${duration(report.cpu_seconds)} of processor time)`],
+    ["First to last step", [duration(report.seconds), spent(report.breakdown?.inside)].filter(Boolean).join(": ")],
+    ["Before and after", spent(report.breakdown?.beside)],
     ["All included", duration(report.total_seconds)],
-    ["Per step", known(report.seconds) && report.steps ? `${((1e3 * report.seconds) / report.steps).toFixed(1)} ms` : "–"],
+    ["Per step", known(report.training_seconds) && report.steps ? `${((1e3 * report.training_seconds) / report.steps).toFixed(1)} ms` : "–"],
+    ["Background", report.background],
     ["Seed", String(report.seed)],
     ["Version", report.version],
   ]) at("machine").append(make("dt", label), make("dd", value || "–"));

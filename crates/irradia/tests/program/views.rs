@@ -1,0 +1,189 @@
+//! Which photographs a run is trained on and scored by, at which size and over which background.
+
+use crate::process::*;
+use image::{Rgba, RgbaImage};
+use serde_json::json as value;
+use std::fs;
+use std::path::Path;
+
+/// Names of the held-out views in a run's report.
+fn held_out(run: &Path) -> Vec<String> {
+    let report = json(&run.join("report.json"));
+    let views = report["views"].as_array().expect("views").iter();
+    views
+        .map(|view| view["name"].as_str().expect("a name").to_owned())
+        .collect()
+}
+
+#[test]
+fn all_views_are_trained_on_when_none_is_held_out_and_nothing_is_made_up() {
+    let folder = with_data();
+    let ended = irradia(folder.path(), "train data --out run --steps 5 --holdout 0").well();
+    assert!(!ended.stdout.contains("PSNR") && ended.stdout.contains("nothing was evaluated"));
+    let text = fs::read_to_string(folder.path().join("run/report.json")).expect("a report");
+    assert!(
+        !text.contains("null") && !text.contains("NaN") && !text.contains("\"psnr\""),
+        "{text}"
+    );
+    assert!(text.contains("no view is held out"));
+    assert_eq!(events(&folder.path().join("run"))[0]["views"], 10);
+    // What a run was trained on does not score it later.
+    irradia(folder.path(), "eval run --data data").refused(2, &["no such views"]);
+    irradia(folder.path(), "train data --out x --steps 5 --holdout 0 --until-psnr 9").refused(2, &["--until-psnr"]);
+}
+
+#[test]
+fn a_number_or_a_list_chooses_the_views_that_are_held_out() {
+    let folder = with_data();
+    irradia(folder.path(), "train data --out run --steps 5 --holdout 5").well();
+    assert_eq!(
+        held_out(&folder.path().join("run")),
+        ["test/r_000.png", "train/r_003.png"]
+    );
+    let ended = irradia(folder.path(), "eval run --data data").well();
+    assert!(
+        ended.stdout.contains("train/r_003.png") && ended.stdout.contains("mean of 2"),
+        "{ended:?}"
+    );
+    fs::write(folder.path().join("list.txt"), "train/r_001\n").expect("written");
+    irradia(folder.path(), "train data --out listed --steps 5 --holdout list.txt").well();
+    assert_eq!(held_out(&folder.path().join("listed")), ["train/r_001.png"]);
+    for wrong in ["1", "none.txt"] {
+        irradia(folder.path(), &format!("train data --out x --holdout {wrong}")).refused(2, &["--holdout", wrong]);
+    }
+    fs::write(folder.path().join("list.txt"), "nobody\n").expect("written");
+    irradia(folder.path(), "train data --out x --holdout list.txt").refused(2, &["list.txt", "names none"]);
+}
+
+#[test]
+fn a_dataset_without_its_training_images_is_refused() {
+    let folder = with_data();
+    // Enough held-out views to train on, were that allowed.
+    let path = folder.path().join("data/transforms_test.json");
+    let mut test = json(&path);
+    let frame = test["frames"][0].clone();
+    test["frames"]
+        .as_array_mut()
+        .expect("frames")
+        .extend([frame.clone(), frame]);
+    fs::write(&path, test.to_string()).expect("written");
+    fs::remove_dir_all(folder.path().join("data/train")).expect("removed");
+    irradia(folder.path(), "train data --out x").refused(1, &["data", "no view is left to train on", "r_000"]);
+    assert!(!folder.path().join("x").exists());
+}
+
+#[test]
+fn large_photographs_are_scaled_unless_another_size_is_asked_for() {
+    let folder = with_data();
+    irradia(folder.path(), "synth wide --views 3 --size 1700x8").well();
+    for (option, width) in [
+        ("", 1600),
+        ("--full-size", 1700),
+        ("--downscale 2", 850),
+        ("--max-side 34", 34),
+    ] {
+        let ended = irradia(
+            folder.path(),
+            &format!("train wide --out run --overwrite --steps 1 {option}"),
+        )
+        .well();
+        assert_eq!(
+            json(&folder.path().join("run/cameras.json"))[0]["width"],
+            width,
+            "{option}"
+        );
+        let told = json(&folder.path().join("run/report.json"))["warnings"].to_string();
+        for said in [ended.stderr, told] {
+            assert_eq!(
+                said.contains("1700x8 pixels, are scaled to 1600"),
+                width == 1600,
+                "{option}: {said}"
+            );
+        }
+    }
+}
+
+#[test]
+fn blender_scenes_are_trained_and_scored_over_white_unless_told_otherwise() {
+    let folder = with_data();
+    for picture in files_under(&folder.path().join("data")) {
+        if picture.extension().is_some_and(|e| e == "png") && !picture.to_string_lossy().contains("depth") {
+            let mut image = image::open(&picture).expect("a picture").to_rgba8();
+            for x in 0..20 {
+                (0..48).for_each(|y| image.put_pixel(x, y, Rgba([90, 90, 90, 0])));
+            }
+            image.save(&picture).expect("written");
+        }
+    }
+    let corner = |run: &str| {
+        let view = json(&folder.path().join(run).join("report.json"))["views"][0]["truth"].clone();
+        let truth: RgbaImage = image::open(folder.path().join(run).join(view.as_str().expect("a path")))
+            .expect("a picture")
+            .to_rgba8();
+        truth.get_pixel(0, 0).0[0]
+    };
+    for (run, option, said, level) in [
+        ("usual", "", "white", 255),
+        ("black", "--background black", "black", 0),
+        (
+            "random",
+            "--background random",
+            "white; trained over random colours",
+            255,
+        ),
+        ("set", "--set render.background=[0.0,0.0,1.0]", "sRGB 0, 0, 1", 0),
+    ] {
+        let ended = irradia(folder.path(), &format!("train data --out {run} --steps 5 {option}")).well();
+        assert!(ended.stderr.contains(&format!("background: {said}")), "{ended:?}");
+        let report = json(&folder.path().join(run).join("report.json"));
+        assert!(
+            report["background"].as_str().is_some_and(|b| b.starts_with(said)),
+            "{report}"
+        );
+        assert_eq!(corner(run), level, "{run}");
+        irradia(folder.path(), &format!("eval {run} --data data --json {run}.json")).well();
+        let again = json(&folder.path().join(format!("{run}.json")));
+        assert!(
+            (again["psnr"].as_f64().unwrap() - report["psnr"].as_f64().unwrap()).abs() < 1e-9,
+            "{run}"
+        );
+    }
+    irradia(
+        folder.path(),
+        "eval black --data data --background white --json white.json",
+    )
+    .well();
+    let psnr = |file: &str| json(&folder.path().join(file))["psnr"].as_f64();
+    assert!(psnr("white.json") < psnr("black.json"));
+    irradia(folder.path(), "train data --out x --background grey").refused(2, &["--background", "grey"]);
+}
+
+#[test]
+fn views_whose_names_collide_get_files_of_their_own() {
+    let folder = with_data();
+    let test = folder.path().join("data/test");
+    let image = image::open(test.join("r_001.png")).expect("a picture").to_rgb8();
+    image.save(test.join("r_000.jpg")).expect("written");
+    let path = folder.path().join("data/transforms_test.json");
+    let mut content = json(&path);
+    content["frames"][1]["file_path"] = value!("./test/r_000.jpg");
+    content["frames"][0]["file_path"] = value!("./test/r_000.png");
+    fs::write(&path, content.to_string()).expect("written");
+    irradia(folder.path(), "train data --out run --steps 5").well();
+    let report = json(&folder.path().join("run/report.json"));
+    let render = |i: usize| {
+        folder
+            .path()
+            .join("run")
+            .join(report["views"][i]["render"].as_str().expect("a path"))
+    };
+    assert_ne!(
+        fs::read(render(0)).expect("a file"),
+        fs::read(render(1)).expect("another")
+    );
+    irradia(folder.path(), "eval run --data data --save-images seen").well();
+    irradia(folder.path(), "render run --data data --out frames").well();
+    for name in ["seen", "frames"] {
+        assert_eq!(files_under(&folder.path().join(name)).len(), 2, "{name}");
+    }
+}

@@ -1,0 +1,163 @@
+//! What a run was trained on, so that a change is noticed.
+
+use irradia_scene::Dataset;
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+use std::io;
+use std::path::Path;
+
+/// `views.json`: the views of a run's dataset, by name.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub(crate) struct ViewList(BTreeMap<String, ViewRecord>);
+
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+struct ViewRecord {
+    width: u32,
+    height: u32,
+    part: Part,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+enum Part {
+    Train,
+    Test,
+    Neither,
+}
+
+impl ViewList {
+    pub fn of(dataset: &Dataset) -> Self {
+        let mut parts = vec![Part::Neither; dataset.views.len()];
+        dataset.train.iter().for_each(|i| parts[*i] = Part::Train);
+        dataset.test.iter().for_each(|i| parts[*i] = Part::Test);
+        let record = |(view, part): (&irradia_scene::View, Part)| {
+            let k = &view.camera.intrinsics;
+            let (width, height) = (k.width, k.height);
+            (view.name.clone(), ViewRecord { width, height, part })
+        };
+        Self(dataset.views.iter().zip(parts).map(record).collect())
+    }
+
+    /// How `now` differs: one phrase a kind of difference, each with the first view that has it.
+    pub fn differences(&self, now: &Self) -> Vec<String> {
+        let told = |what: &str, names: Vec<&String>| {
+            let first = names.first()?;
+            Some(format!("{} {what}, such as {first}", names.len()))
+        };
+        let lacking = |of: &Self, from: &Self| -> Vec<String> {
+            of.0.keys()
+                .filter(|name| !from.0.contains_key(*name))
+                .cloned()
+                .collect()
+        };
+        let (gone, new) = (lacking(self, now), lacking(now, self));
+        let both = || {
+            self.0
+                .iter()
+                .filter_map(|(name, then)| Some((name, then, now.0.get(name)?)))
+        };
+        let sizes = both().filter(|(_, a, b)| (a.width, a.height) != (b.width, b.height));
+        let parts = both().filter(|(_, a, b)| a.part != b.part);
+        [
+            told("views are gone", gone.iter().collect()),
+            told("views are new", new.iter().collect()),
+            told("views have another size", sizes.map(|(name, ..)| name).collect()),
+            told(
+                "views changed between training and held out",
+                parts.map(|(name, ..)| name).collect(),
+            ),
+        ]
+        .into_iter()
+        .flatten()
+        .collect()
+    }
+}
+
+/// FNV-1a, 64 bits.
+struct Hash(u64);
+
+impl Hash {
+    fn new() -> Self {
+        Self(0xcbf2_9ce4_8422_2325)
+    }
+
+    fn add(&mut self, bytes: &[u8]) {
+        for byte in bytes {
+            self.0 = (self.0 ^ u64::from(*byte)).wrapping_mul(0x0100_0000_01b3);
+        }
+    }
+
+    fn hex(&self) -> String {
+        format!("{:016x}", self.0)
+    }
+}
+
+/// A hash of what a training takes from the dataset in `root`: names, split, sizes, cameras, number of points, and the sizes
+/// of the image files. The pixels are not read.
+pub fn data_fingerprint(dataset: &Dataset, root: &Path) -> String {
+    let mut hash = Hash::new();
+    hash.add(&serde_json::to_vec(&ViewList::of(dataset)).expect("plain data"));
+    for view in &dataset.views {
+        let k = &view.camera.intrinsics;
+        let pose = &view.camera.pose;
+        let numbers = [k.fx, k.fy, k.cx, k.cy].into_iter();
+        let numbers = numbers.chain(pose.position.to_array()).chain(pose.rotation.to_array());
+        numbers.for_each(|number| hash.add(&number.to_bits().to_le_bytes()));
+        let bytes = std::fs::metadata(root.join(&view.name)).map_or(0, |file| file.len());
+        hash.add(&bytes.to_le_bytes());
+    }
+    let points = dataset.points.as_ref().map_or(0, |points| points.len());
+    hash.add(&(points as u64).to_le_bytes());
+    hash.hex()
+}
+
+/// A hash of this program's file: another build has another one.
+///
+/// # Errors
+/// When the file cannot be read.
+pub fn program_fingerprint() -> io::Result<String> {
+    let mut hash = Hash::new();
+    hash.add(&std::fs::read(std::env::current_exe()?)?);
+    Ok(hash.hex())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use irradia_synth::{SynthOptions, dataset};
+
+    #[test]
+    fn each_kind_of_difference_is_named() {
+        let data = data();
+        let then = ViewList::of(&data);
+        let changed = |change: &dyn Fn(&mut Dataset)| {
+            let mut data = data.clone();
+            change(&mut data);
+            let fingerprint = |data: &Dataset| data_fingerprint(data, Path::new("."));
+            assert_ne!(fingerprint(&data), fingerprint(&self::data()));
+            then.differences(&ViewList::of(&data)).join("; ")
+        };
+        assert!(then.differences(&ViewList::of(&data)).is_empty());
+        let renamed = changed(&|data| data.views[0].name = "other".into());
+        assert!(
+            renamed.contains("1 views are gone") && renamed.contains("new, such as other"),
+            "{renamed}"
+        );
+        assert!(changed(&|data| data.views[1].camera.intrinsics.width = 23).contains("another size"));
+        let moved = changed(&|data| {
+            let view = data.train.pop().unwrap();
+            data.test.push(view);
+        });
+        assert!(moved.contains("held out"), "{moved}");
+    }
+
+    fn data() -> Dataset {
+        let options = SynthOptions {
+            views: 4,
+            width: 24,
+            height: 16,
+            seed: 1,
+        };
+        dataset(&options).unwrap()
+    }
+}

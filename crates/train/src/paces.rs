@@ -1,0 +1,66 @@
+//! The pace of each step as it was: with a budget it depends on the clock, and everything that is trained on it.
+
+/// Paces in the order of steps: from a step on, until the next pair. A run that repeats them writes the bytes of the run that
+/// they were taken from, whatever the clock says.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Paces(Vec<(u64, f64)>);
+
+impl Paces {
+    /// Reads lines of `step pace`, the step being the first (from 1) that has the pace. What follows the last newline was cut
+    /// and does not count.
+    ///
+    /// # Errors
+    /// One line that names the number of the line that is none of these, or says that there is none.
+    pub fn parse(text: &str) -> Result<Self, String> {
+        let whole = text.rfind('\n').map_or("", |end| &text[..end]);
+        let pair = |(number, line): (usize, &str)| {
+            let pair = line.split_once(' ').and_then(|(step, pace)| {
+                let pace: f64 = pace.parse().ok()?;
+                Some((step.parse().ok()?, pace)).filter(|_| pace > 0.0 && pace.is_finite())
+            });
+            pair.ok_or_else(|| format!("line {} is no step and pace", number + 1))
+        };
+        let pairs: Vec<(u64, f64)> = whole.lines().enumerate().map(pair).collect::<Result<_, _>>()?;
+        let ascend = pairs.windows(2).all(|pair| pair[0].0 < pair[1].0);
+        match pairs.first() {
+            Some((1, _)) if ascend => Ok(Self(pairs)),
+            _ => Err("its steps do not ascend from 1".into()),
+        }
+    }
+
+    /// The line of a step that has another pace than the one before. The pace is written so that it reads back to the bit.
+    pub fn line(step: u64, pace: f64) -> String {
+        format!("{step} {pace}\n")
+    }
+
+    /// The pace of `step`, from 1; behind the last one its own.
+    pub(crate) fn at(&self, step: u64) -> Option<f64> {
+        let next = self.0.partition_point(|(first, _)| *first <= step);
+        Some(self.0[next.checked_sub(1)?].1)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn paces_read_back_to_the_bit_and_hold_until_the_next() {
+        let (third, tiny) = (1.0 / 3.0, f64::MIN_POSITIVE);
+        let text = Paces::line(1, third) + &Paces::line(4, tiny) + &Paces::line(9, 1e300) + "12 0.5";
+        let paces = Paces::parse(&text).unwrap();
+        let at = [1, 3, 4, 8, 9, 5000].map(|step| paces.at(step).unwrap());
+        assert_eq!(at, [third, third, tiny, tiny, 1e300, 1e300]);
+        for wrong in [
+            "",
+            "1 0.5",
+            "2 0.5\n",
+            "1 0.5\n1 0.6\n",
+            "1 0.5\nx\n",
+            "1 -1\n",
+            "1 NaN\n",
+        ] {
+            assert!(Paces::parse(wrong).is_err(), "{wrong:?}");
+        }
+    }
+}

@@ -97,8 +97,10 @@ pub fn evaluate_views(
         if fit.any() && !blank {
             metrics.half_fit_psnr = half_fit_psnr(model, &mut renderer, &held_out, fit);
         }
-        metrics.psnr = metrics.psnr.min(MOST_PSNR);
-        metrics.half_fit_psnr = metrics.half_fit_psnr.map(|psnr| psnr.min(MOST_PSNR));
+        // Not `f64::min`, of which NaN would come out as the other.
+        let capped = |psnr: f64| if psnr > MOST_PSNR { MOST_PSNR } else { psnr };
+        metrics.psnr = capped(metrics.psnr);
+        metrics.half_fit_psnr = metrics.half_fit_psnr.map(capped);
         let seen = see(EvaluatedView {
             name: view.name.clone(),
             metrics,

@@ -98,9 +98,8 @@ pub fn evaluate_views(
             metrics.half_fit_psnr = half_fit_psnr(model, &mut renderer, &held_out, fit);
         }
         // Not `f64::min`, of which NaN would come out as the other.
-        let capped = |psnr: f64| if psnr > MOST_PSNR { MOST_PSNR } else { psnr };
-        metrics.psnr = capped(metrics.psnr);
-        metrics.half_fit_psnr = metrics.half_fit_psnr.map(capped);
+        metrics.psnr = metrics.psnr.clamp(f64::NEG_INFINITY, MOST_PSNR);
+        metrics.half_fit_psnr = metrics.half_fit_psnr.map(|psnr| psnr.min(MOST_PSNR));
         let seen = see(EvaluatedView {
             name: view.name.clone(),
             metrics,

@@ -97,7 +97,8 @@ pub fn evaluate_views(
         if fit.any() && !blank {
             metrics.half_fit_psnr = half_fit_psnr(model, &mut renderer, &held_out, fit);
         }
-        metrics.psnr = metrics.psnr.min(MOST_PSNR);
+        // Not `f64::min`, of which NaN would come out as the other.
+        metrics.psnr = metrics.psnr.clamp(f64::NEG_INFINITY, MOST_PSNR);
         metrics.half_fit_psnr = metrics.half_fit_psnr.map(|psnr| psnr.min(MOST_PSNR));
         let seen = see(EvaluatedView {
             name: view.name.clone(),

@@ -226,7 +226,7 @@ fn half_an_evaluation_is_not_told() {
     let folder = folder();
     let asked = TrainInput {
         set: vec!["eval_every=2".into()],
-        ..input(folder.path(), "run", 5)
+        ..crate::input(folder.path(), "run", 5)
     };
     let mut run = Run::begin_on(asked.check().expect("a request"), dataset()).expect("a run");
     let mut observer = Impatient(Vec::new());

@@ -1,6 +1,6 @@
 //! Observers: stop, save and pause.
 
-use crate::{begin, dataset, folder, input, scene, unwatched};
+use crate::{begin, dataset, folder, scene, unwatched};
 use irradia_runs::prelude::*;
 use std::fs;
 use std::time::{Duration, Instant};

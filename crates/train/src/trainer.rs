@@ -16,7 +16,7 @@ use irradia_field::{FieldError, FieldState, KnownDepth};
 use irradia_measure::{DepthSample, Lpips};
 use irradia_scene::{Camera, Dataset, LoadError, PointCloud, Rng, View, sh};
 use irradia_splat::densify::{DensityChange, classic, fast, mcmc, merge, taming};
-use irradia_splat::init::{self, InitOptions, Look};
+use irradia_splat::init::{self, InitOptions, PixelClass};
 use irradia_splat::{
     Engine, FramePlanes, Gather, Noise, Optimizer, RenderOptions, SplatState, Splats, Statistics, Update, ViewParams,
     filter,
@@ -235,11 +235,11 @@ impl Trainer {
                         let at = y * photo.width as usize + x;
                         let zero = |plane: &Option<Vec<u8>>| plane.as_ref().is_some_and(|plane| plane[at] == 0);
                         if zero(&photo.mask) {
-                            Look::Masked
+                            PixelClass::Masked
                         } else if zero(&photo.alpha) {
-                            Look::Empty
+                            PixelClass::Empty
                         } else {
-                            Look::Color([0, 1, 2].map(|c| photo.rgb[3 * at + c]))
+                            PixelClass::Color([0, 1, 2].map(|c| photo.rgb[3 * at + c]))
                         }
                     },
                 );

@@ -1,5 +1,5 @@
-//! How far the forecast of finished runs was off: the whole time that each predicted after a tenth, a quarter and half of its
-//! training, beside what it took; and how often that lay within the range that was shown.
+//! Errors of the forecasts of finished runs: the total time predicted after a tenth, a quarter and half of the training, beside
+//! the actual one; and how often the actual time was within the displayed range.
 //!
 //! `cargo run --release --example forecast -- RUN..`
 
@@ -12,7 +12,7 @@ fn main() -> anyhow::Result<()> {
     );
     for run in std::env::args().skip(1) {
         let text = std::fs::read_to_string(format!("{run}/events.jsonl"))?;
-        // Seconds gone by and left, by logged step.
+        // Seconds elapsed and remaining, by logged step.
         let pair = |line: &str| {
             let event: Value = serde_json::from_str(line).ok()?;
             let end = |i: usize| event["seconds_left_range"][i].as_f64();

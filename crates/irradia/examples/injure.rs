@@ -1,12 +1,12 @@
-//! Writes a copy of a dataset with made-up faults, to measure what cures them:
+//! Writes a copy of a dataset with artificial faults, to measure what corrects them:
 //!
 //! ```text
-//! cargo run --release --example injure -- DATA OUT --gains 0.6,1.6 --balance 0.15      # exposure and white balance a photograph
+//! cargo run --release --example injure -- DATA OUT --gains 0.6,1.6 --balance 0.15      # exposure and white balance per photograph
 //! cargo run --release --example injure -- DATA OUT --pose-noise 0.5,0.005              # degrees, fraction of the scene's extent
 //! ```
 //!
-//! The copy is a nerfstudio folder with the split of the original, undistorted PNG images and its points. Faults hit all
-//! photographs, held-out ones too. Known tracks of points are not copied.
+//! The copy is a nerfstudio folder with the split of the original, undistorted PNG images and its points. Faults affect all
+//! photographs, including held-out ones. Tracks of points are not copied.
 
 use anyhow::{Context, Result, bail};
 use clap::Parser;
@@ -24,13 +24,13 @@ struct Args {
     data: PathBuf,
     /// Folder for the copy
     out: PathBuf,
-    /// Divide the images' sides by this
+    /// Divide the images' sides by this factor
     #[arg(long, default_value_t = 1.0)]
     downscale: f32,
-    /// A factor a photograph on its sRGB colours, log-uniform between these
+    /// A factor per photograph on its sRGB colours, log-uniform between these
     #[arg(long, value_name = "FROM,TO", value_delimiter = ',', num_args = 2)]
     gains: Option<Vec<f32>>,
-    /// A factor a channel and photograph, uniform between 1 - this and 1 + this
+    /// A factor per channel and photograph, uniform between 1 - this and 1 + this
     #[arg(long, default_value_t = 0.0)]
     balance: f32,
     /// Standard deviations of the poses' rotation in degrees and of their position in extents of the scene
@@ -49,9 +49,13 @@ fn main() -> Result<()> {
     };
     let dataset = read_dataset(&args.data, &options)?;
     if args.out.join("transforms.json").exists() {
-        bail!("{} already holds a dataset: give another folder", args.out.display());
+        bail!(
+            "{} already contains a dataset; choose another folder",
+            args.out.display()
+        );
     }
-    std::fs::create_dir_all(args.out.join("images")).with_context(|| format!("cannot make {}", args.out.display()))?;
+    std::fs::create_dir_all(args.out.join("images"))
+        .with_context(|| format!("cannot create {}", args.out.display()))?;
     let frames: Vec<Value> = (0..dataset.views.len())
         .into_par_iter()
         .map(|view| write_view(&args, &dataset, view))
@@ -71,7 +75,7 @@ fn main() -> Result<()> {
     Ok(())
 }
 
-/// Writes one photograph; its frame of `transforms.json`.
+/// Writes one photograph; returns its frame of `transforms.json`.
 fn write_view(args: &Args, dataset: &Dataset, view: usize) -> Result<Value> {
     let cameras: Vec<Camera> = dataset.train.iter().map(|i| dataset.views[*i].camera).collect();
     let extent = camera_extent(&cameras);
@@ -105,7 +109,7 @@ fn write_view(args: &Args, dataset: &Dataset, view: usize) -> Result<Value> {
     } = source.camera;
     if let Some(noise) = &args.pose_noise {
         let vector = |rng: &mut Rng| Vec3::from_array([0; 3].map(|_| rng.normal()));
-        // Each axis has a third of the variance.
+        // Each axis gets a third of the variance.
         let turn = vector(&mut rng) * (noise[0].to_radians() / 3f32.sqrt());
         pose.rotation *= Quat::from_scaled_axis(turn);
         pose.position += vector(&mut rng) * (noise[1] * extent / 3f32.sqrt());

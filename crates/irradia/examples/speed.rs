@@ -2,11 +2,11 @@
 //!
 //! ```text
 //! cargo run --release -p irradia --example speed -- steps DATA [STEPS]   a training step and its parts
-//! cargo run --release -p irradia --example speed -- blend                the blend's inner loop
-//! cargo run --release -p irradia --example speed -- frame SCENE.ply      a frame of a million splats, and how cost grows
+//! cargo run --release -p irradia --example speed -- blend                the inner loop of blending
+//! cargo run --release -p irradia --example speed -- frame SCENE.ply      a frame of a million splats, and how its cost scales
 //! ```
 //!
-//! CPU time stands beside wall time: on a shared machine it is the steadier of the two.
+//! CPU time is given beside wall time: on a shared machine it is more stable.
 
 use anyhow::{Context, Result, bail};
 use cpu_time::ProcessTime;
@@ -25,7 +25,7 @@ fn main() -> Result<()> {
         ["steps", data, count] => steps(data, count.parse()?),
         ["blend"] => blend(),
         ["frame", scene] => frame(scene),
-        _ => bail!("say: steps DATA [STEPS], blend, or frame SCENE.ply"),
+        _ => bail!("usage: steps DATA [STEPS], blend, or frame SCENE.ply"),
     }
 }
 
@@ -40,7 +40,7 @@ fn time(repeats: u32, mut work: impl FnMut()) -> (f64, f64) {
     (each(wall.elapsed().as_secs_f64()), each(cpu.elapsed().as_secs_f64()))
 }
 
-/// The `classic` recipe's first steps at full resolution without density control; then forward and backward alone.
+/// The first steps of the recipe `classic` at full resolution without density control; then forward and backward separately.
 fn steps(data: &str, steps: u64) -> Result<()> {
     let dataset = Arc::new(read_dataset(data.as_ref(), &DatasetOptions::default())?);
     let mut recipe = Recipe::parse("classic", Recipe::built_in("classic")?, &[])?;
@@ -52,7 +52,7 @@ fn steps(data: &str, steps: u64) -> Result<()> {
         trainer.step(&mut Vec::new())?;
     }
     println!(
-        "{steps} steps, {} splats: {:.2} ms wall, {:.2} ms CPU a step",
+        "{steps} steps, {} splats: {:.2} ms wall, {:.2} ms CPU per step",
         trainer.engine.len(),
         1e3 * trainer.seconds / steps as f64,
         1e3 * trainer.cpu_seconds / steps as f64,
@@ -116,7 +116,7 @@ fn report_parts(what: &str, splats: &Splats, views: &[ViewParams], options: &Ren
     );
 }
 
-/// 1,000 faint splats, each larger than the image: every pair is visited, and nothing but the inner loop counts.
+/// 1,000 faint splats, each larger than the image: every pair is visited, so that only the inner loop counts.
 fn blend() -> Result<()> {
     let n = 1000;
     let mut cloud = GaussianCloud {
@@ -127,7 +127,7 @@ fn blend() -> Result<()> {
         cloud.means.push([0.0, 0.0, 5.0 + 1e-3 * i as f32]);
         cloud.quats.push([1.0, 0.0, 0.0, 0.0]);
         cloud.log_scales.push([2.0, 2.1, 2.0]);
-        cloud.opacity_logits.push(-4.8); // Alpha 0.008: the pixels do not end.
+        cloud.opacity_logits.push(-4.8); // Alpha 0.008: the pixels do not terminate.
         cloud.sh.extend([0.1, 0.2, 0.3]);
     }
     let splats = Splats::from_cloud(&cloud);
@@ -154,7 +154,7 @@ fn blend() -> Result<()> {
         renderer.backward(&splats, &OutputGradient::of_color(&v_color), &mut gradients);
     });
     println!(
-        "{} on {} threads: forward {:.2} G pairs a CPU second, backward {:.2}",
+        "{} on {} threads: forward {:.2} G pairs per CPU second, backward {:.2}",
         renderer.level.name(),
         rayon::current_num_threads(),
         pairs / forward.1 / 1e6,
@@ -166,9 +166,9 @@ fn blend() -> Result<()> {
 /// A trained scene copied with jitter to a million splats, seen whole at 1280x720, SH degree 3.
 fn frame(scene: &str) -> Result<()> {
     let cloud = read_splats(scene.as_ref())?;
-    let cameras = cameras(scene).context("the scene must lie in its run, beside cameras.json")?;
+    let cameras = cameras(scene).context("the scene must be in its run's folder, beside cameras.json")?;
     let original = Splats::from_cloud(&cloud);
-    // Back along the first camera's axis until the whole scene, but for what lies far out, is in sight.
+    // Move back along the first camera's axis until the whole scene, except for outliers, is in view.
     let sees_most = |camera: &Camera| {
         let (k, n) = (&camera.intrinsics, cloud.means.len());
         let inside = |m: &&[f32; 3]| {
@@ -219,8 +219,8 @@ fn frame(scene: &str) -> Result<()> {
     Ok(())
 }
 
-/// `original` repeated to `count` splats; copies are moved by a standard deviation and shrunk so that together they
-/// cover what one did.
+/// `original` repeated to `count` splats; copies are shifted randomly and shrunk so that together they cover what one
+/// original did.
 fn multiplied(original: &Splats, count: usize) -> Splats {
     let indices: Vec<u32> = (0..count).map(|i| (i % original.len()) as u32).collect();
     let mut splats = original.gather(&indices);

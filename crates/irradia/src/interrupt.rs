@@ -7,7 +7,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 pub fn stop_flag() -> Arc<AtomicBool> {
     let stop = Arc::new(AtomicBool::new(false));
     let asked = stop.clone();
-    // A handler that is set already (by a test, say) is no reason not to go on.
+    // If a handler is already set (by a test, say), continue without.
     let _ = ctrlc::set_handler(move || {
         if asked.swap(true, Ordering::Relaxed) {
             std::process::exit(130);

@@ -1,6 +1,6 @@
-//! `irradia`: photographs in, a scene you can look at from anywhere out.
+//! `irradia`: photographs in, a scene for free-viewpoint rendering out.
 //!
-//! This is the program. **To train or render from Rust, begin with [`irradia_runs`]**: one import, and a runnable example
+//! This is the program. **To train or render from Rust, start with [`irradia_runs`]**: one import, and a runnable example
 //! on its first page. The crates below it are `irradia_train` (recipes, schedule, the training step), `irradia_splat` and
 //! `irradia_field` (what is trained), `irradia_measure`, `irradia_formats`, `irradia_synth`, `irradia_compute` and
 //! `irradia_scene` (plain types and conventions).
@@ -24,23 +24,23 @@ struct Cli {
 
 #[derive(Subcommand)]
 enum Command {
-    /// Make a scene by ray tracing, train on it, measure and show it: no data needed
+    /// Ray trace a scene, train on it, evaluate and report: no data needed
     Demo(command::demo::Args),
     /// Train a scene from posed photographs
     Train(command::train::Args),
-    /// Train several recipes under the same conditions and say how they did
+    /// Train several recipes under the same conditions and compare them
     Compare(command::compare::Args),
-    /// List the recipes, show what one does when, or explain their keys
+    /// List the recipes, show their schedules, or explain their keys
     Recipe(command::recipe::Args),
-    /// Measure a scene against photographs: PSNR, SSIM, LPIPS
+    /// Evaluate a scene against photographs: PSNR, SSIM, LPIPS
     Eval(command::eval::Args),
-    /// Say where weights of LPIPS are found, or import them from PyTorch's files
+    /// Show which LPIPS weights are found, or import them from PyTorch files
     Lpips(command::lpips::Args),
     /// Render a scene into PNG frames
     Render(command::render::Args),
-    /// Say what a scene, a run or a dataset holds
+    /// Describe a scene, a run or a dataset
     Info(command::files::InfoArgs),
-    /// Convert a scene from one file format to another, by extension
+    /// Convert a scene to another file format, by extension
     Convert(command::files::ConvertArgs),
     /// Write the demo scene as a dataset: images, depth, normals, points, cameras
     Synth(command::demo::SynthArgs),
@@ -80,7 +80,7 @@ fn main() -> ExitCode {
     }
 }
 
-/// Whether the command line is what must be changed.
+/// Whether the error is a mistake in the command line.
 fn is_usage(error: &anyhow::Error) -> bool {
     let of_a_file = matches!(
         error.downcast_ref(),

@@ -1,4 +1,4 @@
-//! Lines for people. A reader that went away (`| head`, a closed window) must never end a run.
+//! Terminal output. A closed pipe or window (`| head`) must never end a run.
 
 use anyhow::{Context, Result};
 use std::fmt::Display;
@@ -7,7 +7,7 @@ use std::io::{ErrorKind, Write, stderr, stdout};
 /// Prints a result on standard output.
 ///
 /// # Errors
-/// When it cannot be written; a reader that has read enough is no error.
+/// When it cannot be written; a closed pipe is no error.
 pub fn say(line: impl Display) -> Result<()> {
     match writeln!(stdout(), "{line}") {
         Err(error) if error.kind() != ErrorKind::BrokenPipe => Err(error).context("cannot write to standard output"),
@@ -15,12 +15,12 @@ pub fn say(line: impl Display) -> Result<()> {
     }
 }
 
-/// Prints what happens meanwhile on standard error, if anybody listens.
+/// Prints progress on standard error; failures are ignored.
 pub fn note(line: impl Display) {
     let _ = writeln!(stderr(), "{line}");
 }
 
-/// An error with its causes in one line; what a cause repeats is left out.
+/// An error with its causes in one line, without repetitions.
 pub fn one_line(error: &anyhow::Error) -> String {
     let mut line = String::new();
     for cause in error.chain().map(ToString::to_string) {

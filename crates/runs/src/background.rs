@@ -1,4 +1,4 @@
-//! What is behind a scene.
+//! The background of a scene.
 
 use crate::RunError;
 use irradia_scene::{Dataset, LoadError};
@@ -7,20 +7,20 @@ use irradia_train::{Recipe, TrainError};
 use serde::{Deserialize, Serialize};
 use std::str::FromStr;
 
-/// What photographs with alpha are laid over, and what is behind a scene's splats or field.
+/// Background of photographs with alpha, and of a scene's splats or field.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Background {
-    /// Trained and scored over white, as the published figures of NeRF's synthetic scenes are.
+    /// White in training and evaluation, like the published figures of NeRF's synthetic scenes.
     White,
-    /// Trained and scored over black.
+    /// Black in training and evaluation.
     Black,
-    /// Trained over another colour at each step, scored over white.
+    /// A random colour per training step, white in evaluation.
     Random,
 }
 
 impl Background {
-    /// The colour, sRGB, that views are scored over.
+    /// The colour, sRGB, in evaluation.
     pub fn color(self) -> [f32; 3] {
         match self {
             Self::White | Self::Random => [1.0; 3],
@@ -28,7 +28,7 @@ impl Background {
         }
     }
 
-    /// As the command line writes it.
+    /// The name on the command line.
     pub fn name(self) -> &'static str {
         match self {
             Self::White => "white",
@@ -37,7 +37,7 @@ impl Background {
         }
     }
 
-    /// Lets `recipe` train so. Where it already trains over random colours it goes on to do so.
+    /// Sets this background in `recipe`. Where the recipe already trains over random colours, it still does.
     pub(crate) fn apply_to(self, recipe: &mut Recipe) {
         recipe.render.background = self.color();
         if self == Self::Random {
@@ -48,8 +48,8 @@ impl Background {
         }
     }
 
-    /// That of datasets for which nobody chose one: white for Blender scenes with transparent photographs, as the first one
-    /// is or is not; the recipe's own for others.
+    /// The default for a dataset: white for Blender scenes with transparent photographs, judged by the first one; the
+    /// recipe's own for others.
     ///
     /// # Errors
     /// When that photograph cannot be read.
@@ -70,11 +70,11 @@ impl FromStr for Background {
         let found = [Self::White, Self::Black, Self::Random]
             .into_iter()
             .find(|background| background.name() == text);
-        found.ok_or_else(|| "give white, black or random".into())
+        found.ok_or_else(|| "expected white, black or random".into())
     }
 }
 
-/// What `recipe` trains over and is scored over, for people.
+/// Description of the training and evaluation background of `recipe`.
 pub(crate) fn in_words(recipe: &Recipe) -> String {
     let color = match recipe.render.background {
         [1.0, 1.0, 1.0] => "white".to_owned(),
@@ -86,7 +86,7 @@ pub(crate) fn in_words(recipe: &Recipe) -> String {
         .filter_map(|params| params.get(&Param::RandomBackground))
         .any(|knob| *knob != Knob::Const(0.0));
     if random {
-        format!("{color}; trained over random colours where photographs have alpha")
+        format!("{color}; trained over random colours if photographs have alpha")
     } else {
         color
     }
@@ -97,7 +97,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn random_colours_reach_every_stage_and_white_and_black_leave_the_recipe_its_own() {
+    fn random_applies_to_every_stage_and_white_and_black_keep_the_recipes_own() {
         let recipe = |name: &str| Recipe::parse(name, Recipe::built_in(name).unwrap(), &[]).unwrap();
         for name in ["fast", "hybrid"] {
             let mut changed = recipe(name);

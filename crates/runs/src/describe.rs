@@ -1,4 +1,4 @@
-//! What a file or folder is, for people.
+//! Descriptions of files and folders.
 
 use crate::RunError;
 use crate::folder::RESIDUAL;
@@ -33,7 +33,7 @@ fn describe_field(field: &Field, bytes: u64) -> Description {
     let encoding = match &net.encoding {
         PositionEncoding::Frequency(f) => format!("frequencies of {} octaves", f.octaves),
         PositionEncoding::HashGrid(g) => format!(
-            "hash grid of {} levels, {} to {} cells a side, {} features a corner, at most 2^{} corners a level",
+            "hash grid of {} levels, {} to {} cells per side, {} features per corner, at most 2^{} corners per level",
             g.levels, g.coarsest, g.finest, g.features, g.log2_table
         ),
     };
@@ -41,14 +41,14 @@ fn describe_field(field: &Field, bytes: u64) -> Description {
         format!("; colour {} of {}", color.depth, color.width)
     });
     let sampler = match &config.sampler {
-        Sampler::Occupancy(o) => format!("steps through an occupancy grid of {} cells a side", o.side),
+        Sampler::Occupancy(o) => format!("steps through an occupancy grid of {} cells per side", o.side),
         Sampler::Hierarchy { coarse, fine } => format!("hierarchy, {coarse} and {fine} more"),
         Sampler::Proposal { rounds, last } => {
             let rounds: Vec<String> = rounds.iter().map(|(_, n)| n.to_string()).collect();
             format!("proposals, {} and then {last}", rounds.join(", "))
         }
-        Sampler::Given { mirrored: false } => "colours of splats, by direction of view".to_owned(),
-        Sampler::Given { mirrored: true } => "colours of splats, by the direction that a mirror shows".to_owned(),
+        Sampler::Given { mirrored: false } => "colours of splats, by viewing direction".to_owned(),
+        Sampler::Given { mirrored: true } => "colours of splats, by reflected viewing direction".to_owned(),
     };
     let space = &field.space;
     let [x, y, z] = space.center;
@@ -63,7 +63,7 @@ fn describe_field(field: &Field, bytes: u64) -> Description {
     };
     let background = config
         .background_degree
-        .map_or("given when looked at".to_owned(), |degree| {
+        .map_or("given when rendering".to_owned(), |degree| {
             format!("learnt, harmonics of degree {degree}")
         });
     let mut facts = vec![
@@ -78,7 +78,7 @@ fn describe_field(field: &Field, bytes: u64) -> Description {
         ("background", background),
     ];
     if config.appearance() > 0 {
-        let codes = format!("{} photographs, {} numbers each", config.images, config.appearance());
+        let codes = format!("{} photographs, {} values each", config.images, config.appearance());
         facts.push(("appearance", codes));
     }
     facts.push(("file", format!("{:.1} MB", bytes as f64 * 1e-6)));

@@ -5,7 +5,7 @@ use irradia_train::{RecipeError, TrainError};
 use std::io;
 use std::path::{Path, PathBuf};
 
-/// Why something could not be done: one line that says what, where and what to do.
+/// Why an operation failed: one line that says what, where and what to do.
 #[derive(Debug, thiserror::Error)]
 pub enum RunError {
     /// A setting of a request is out of range.
@@ -13,24 +13,24 @@ pub enum RunError {
     Setting {
         /// The field of the request.
         name: &'static str,
-        /// As given.
+        /// The given value.
         value: String,
-        /// What is allowed.
+        /// The allowed values.
         message: String,
     },
-    /// A recipe that does not exist or is not valid.
+    /// A recipe that does not exist or is invalid.
     #[error(transparent)]
     Recipe(#[from] RecipeError),
-    /// The request does not suit what the folder holds.
+    /// The request conflicts with the content of the folder.
     #[error("{0}")]
     Refused(String),
     /// A dataset or a scene could not be read or written.
     #[error(transparent)]
     Format(#[from] FormatError),
-    /// Training could not begin or go on.
+    /// Training could not begin or continue.
     #[error(transparent)]
     Train(#[from] TrainError),
-    /// A checkpoint or a field is not valid.
+    /// A checkpoint or a field is invalid.
     #[error("{}: {source}", path.display())]
     File {
         /// The file.
@@ -38,28 +38,28 @@ pub enum RunError {
         /// What is wrong with it.
         source: TrainError,
     },
-    /// A residual field was named as if it were a scene.
-    #[error("{} only adds to splats: name the scene.ply that it lies beside", _0.display())]
+    /// A residual field was given as a scene.
+    #[error("{} only adds to splats: name the scene.ply beside it", _0.display())]
     Residual(PathBuf),
-    /// The operating system refused.
+    /// The operating system reported an error.
     #[error("cannot {action} {}: {source}", path.display())]
     Io {
-        /// `read`, `write`, `make`, ..
+        /// `read`, `write`, `create`, ..
         action: &'static str,
         /// The file or folder.
         path: PathBuf,
         /// The system's reason.
         source: io::Error,
     },
-    /// The folder of a run could not be made.
-    #[error("cannot make {}: {source}; give another --out", path.display())]
+    /// The folder of a run could not be created.
+    #[error("cannot create {}: {source}; choose another --out", path.display())]
     NoFolder {
         /// The folder.
         path: PathBuf,
         /// The system's reason.
         source: io::Error,
     },
-    /// A folder holds no run.
+    /// A folder contains no run.
     #[error("{0} holds no run to resume: cannot read {0}/run.json: {source}", path.display())]
     NoRun {
         /// The folder.
@@ -67,7 +67,7 @@ pub enum RunError {
         /// The system's reason.
         source: io::Error,
     },
-    /// A file of a run that this program did not write so.
+    /// A file of a run is damaged.
     #[error("{} is damaged: {reason}", path.display())]
     Damaged {
         /// The file.
@@ -81,17 +81,17 @@ pub enum RunError {
     /// The weights of LPIPS could not be read.
     #[error("LPIPS weights: {0}")]
     Lpips(#[from] LpipsError),
-    /// Another process, or another run of this one, is at work in the folder.
-    #[error("{} is in use by process{holder}, which trains there: wait for it, stop it, or give another --out", folder.display())]
+    /// Another process, or another run of this one, uses the folder.
+    #[error("{} is in use by process{holder}, which trains there: wait for it, stop it, or choose another --out", folder.display())]
     InUse {
         /// The folder.
         folder: PathBuf,
-        /// A blank and the number of the process, where it is known.
+        /// A space and the process id, if known.
         holder: String,
     },
-    /// A run's dataset is not what it was.
+    /// A run's dataset has changed.
     #[error(
-        "{} cannot go on: its dataset {} changed: {differences}; put it back, or begin anew with another --out",
+        "{} cannot be resumed: its dataset {} has changed: {differences}; restore it, or start again with another --out",
         folder.display(), data.display()
     )]
     DataChanged {
@@ -99,19 +99,19 @@ pub enum RunError {
         folder: PathBuf,
         /// The dataset.
         data: PathBuf,
-        /// What differs.
+        /// The differences.
         differences: String,
     },
-    /// The evaluation was stopped before its end.
+    /// The evaluation was stopped before it was complete.
     #[error("stopped before all held-out views were evaluated; the scene is saved")]
     EvaluationStopped,
-    /// Options that make no ray-traced dataset.
+    /// Invalid options of a ray-traced dataset.
     #[error(transparent)]
     Synth(#[from] SynthError),
 }
 
 impl RunError {
-    /// Whether the request is what must be changed, not files or the machine.
+    /// Whether the request must be changed, rather than files or the machine.
     pub fn is_request(&self) -> bool {
         match self {
             Self::Setting { .. } | Self::Recipe(_) | Self::Refused(_) | Self::Synth(_) => true,
@@ -128,7 +128,7 @@ impl RunError {
         }
     }
 
-    /// For `map_err` on what the operating system was asked for.
+    /// For `map_err` on errors of the operating system.
     pub(crate) fn io(action: &'static str, path: &Path) -> impl FnOnce(io::Error) -> Self {
         move |source| Self::Io {
             action,

@@ -1,4 +1,4 @@
-//! Scenes against photographs.
+//! Evaluation of scenes against photographs.
 
 use crate::RunError;
 use irradia_measure::Evaluation;
@@ -8,11 +8,11 @@ use irradia_train::model::Model;
 use std::collections::HashSet;
 use std::ops::ControlFlow;
 
-/// Renders `model` from the views `indices` of `dataset` and measures each as `options` say. Every view is handed to `see` when it is done; returned is the mean over
-/// all that could be measured, NaN where there are none.
+/// Renders `model` from the views `indices` of `dataset` and evaluates each with `options`. Every view is passed to `see` when it
+/// is done; returns the mean over the measured views, NaN if there are none.
 ///
 /// # Errors
-/// When a photograph cannot be read; the error of `see`, with which it ends.
+/// When a photograph cannot be read; the error of `see`, which ends the evaluation.
 pub fn evaluate<E: From<RunError>>(
     model: &Model,
     dataset: &Dataset,
@@ -36,7 +36,7 @@ pub fn evaluate<E: From<RunError>>(
     Ok(mean(&metrics))
 }
 
-/// What is not measured of a scene evaluated on `views`, names and whether they were measured: one line.
+/// The views that are not measured, given names and whether they were measured: one line.
 pub fn unmeasured<'a>(views: impl Iterator<Item = (&'a str, bool)>) -> Option<String> {
     let (mut all, mut blank) = (0, Vec::new());
     for (name, measured) in views {
@@ -48,18 +48,18 @@ pub fn unmeasured<'a>(views: impl Iterator<Item = (&'a str, bool)>) -> Option<St
     (!blank.is_empty()).then(|| {
         let names = blank.join(", ");
         format!(
-            "{} of {all} views are not measured, since their masks leave no pixel: {names}",
+            "{} of {all} views are not measured, since their masks exclude all pixels: {names}",
             blank.len()
         )
     })
 }
 
-/// [`file_stem`] of each name, those that came before with a number: no two are the same, capitals or not.
+/// [`file_stem`] of each name, with a number added to duplicates: no two are equal, ignoring case.
 pub fn file_stems<'a>(names: impl Iterator<Item = &'a str>) -> Vec<String> {
     distinct(names.map(file_stem))
 }
 
-/// The same names, those that came before with a number; two that differ in capitals alone are one to some file systems.
+/// The names, with a number added to duplicates; names that differ only in case are equal to some file systems.
 pub fn distinct(names: impl Iterator<Item = String>) -> Vec<String> {
     let mut taken: HashSet<String> = HashSet::new();
     let free = |name: String| {
@@ -67,12 +67,12 @@ pub fn distinct(names: impl Iterator<Item = String>) -> Vec<String> {
         let mut candidates = std::iter::once(name.clone()).chain(numbered);
         candidates
             .find(|name| taken.insert(name.to_lowercase()))
-            .expect("numbers do not end")
+            .expect("the range is infinite")
     };
     names.map(free).collect()
 }
 
-/// A view's name as a file name without extension: folders become underscores.
+/// A view's name as a file name without extension: slashes become underscores.
 pub fn file_stem(name: &str) -> String {
     let stem = name.rsplit_once('.').map_or(
         name,
@@ -94,7 +94,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn names_that_would_be_one_file_become_several() {
+    fn names_that_would_collide_get_numbers() {
         let names = ["a/b.png", "a_b.png", "1.jpg", "1.png", "1_2.png", "A_B.png"];
         let stems = file_stems(names.into_iter());
         assert_eq!(stems, ["a_b", "a_b_2", "1", "1_2", "1_2_2", "A_B_3"]);

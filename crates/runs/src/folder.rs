@@ -16,15 +16,15 @@ use std::path::{Path, PathBuf};
 pub const SCENE: &str = "scene.ply";
 /// The radiance field of a run.
 pub const FIELD: &str = "field.safetensors";
-/// What adds to the colours of a run's splats.
+/// The residual field of a run's splats.
 pub const RESIDUAL: &str = socket::FILES[1];
 
-/// The views of a run's dataset.
+/// List of the views of a run's dataset.
 pub(crate) const VIEWS: &str = "views.json";
 /// The pace of each step.
 pub(crate) const PACES: &str = "pace.txt";
 
-/// What a run may leave in its folder.
+/// The files of a run.
 const FILES: [&str; 13] = [
     "run.json",
     VIEWS,
@@ -40,34 +40,34 @@ const FILES: [&str; 13] = [
     "report.json",
     "report.html",
 ];
-/// The folders in it.
+/// The subfolders of a run.
 const FOLDERS: [&str; 2] = ["eval", "checkpoints"];
 
-/// What is written before `run.json`, with which a run has begun.
+/// Files written before `run.json`, with which a run has begun.
 const EARLY: [&str; 3] = ["recipe.toml", "cameras.json", VIEWS];
 
-/// Whether there is a run in the folder `path`, or what may be one; not if all is there that a process left which died before
-/// its run had begun.
+/// Whether the folder `path` contains a run, or may contain one; not if it contains only the files of a process that died
+/// before its run had begun.
 fn holds_run(path: &Path) -> bool {
     let is_early = |file: &&str| EARLY.contains(file) && FolderLock::was_taken(path);
     FILES.iter().any(|file| path.join(file).exists() && !is_early(file))
 }
 
-/// A run's place on disk.
+/// The folder of a run.
 #[derive(Clone, Debug)]
 pub struct RunFolder(PathBuf);
 
-/// `run.json`: what the run was asked for, and how far it came.
+/// `run.json`: the request and the progress of a run.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct RunRecord {
-    /// What was asked for.
+    /// The request.
     #[serde(flatten)]
     pub input: TrainInput,
     /// Whether the recipe was followed to its end and everything was written.
     pub complete: bool,
 }
 
-/// A camera as `cameras.json` holds it: enough to orbit the scene later without its photographs.
+/// A camera in `cameras.json`: enough to orbit the scene later without its photographs.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 struct CameraRecord {
     name: String,
@@ -84,20 +84,20 @@ struct CameraRecord {
 }
 
 impl RunFolder {
-    /// Whether a new run may be made at `path`; asked before any work is done for it.
+    /// Checks that a new run may be created at `path`, before any work is done for it.
     ///
     /// # Errors
-    /// When it already holds a run and `overwrite` is not set, or is a file.
+    /// When it already contains a run and `overwrite` is not set, or is a file.
     pub fn check_free(path: &Path, overwrite: bool) -> Result<(), RunError> {
         if path.exists() && !path.is_dir() {
             return Err(RunError::Refused(format!(
-                "{} is a file: --out takes a folder",
+                "{} is a file: name a folder with --out",
                 path.display()
             )));
         }
         if !overwrite && holds_run(path) {
             let message = format!(
-                "{} already holds a run: give another --out, --overwrite to replace it, or --resume {0} to go on with it",
+                "{} already holds a run: choose another --out, --overwrite to replace it, or --resume {0} to resume it",
                 path.display()
             );
             return Err(RunError::Refused(message));
@@ -105,10 +105,10 @@ impl RunFolder {
         Ok(())
     }
 
-    /// Makes the folder for a new run and locks it; what an earlier run left there is removed.
+    /// Creates and locks the folder of a new run; removes the files of an earlier run.
     ///
     /// # Errors
-    /// When it cannot be made or cleared, is in use, or came to hold a run that is not to be replaced.
+    /// When it cannot be created or cleared, is in use, or meanwhile contains a run that must not be replaced.
     pub(crate) fn create(
         path: &Path,
         overwrite: bool,
@@ -164,18 +164,18 @@ impl RunFolder {
         Ok((Self(path.to_owned()), record))
     }
 
-    /// `run.json` of the run that the scene `path`, a file or a run's folder, lies in; `None` where it lies in none.
+    /// `run.json` of the run that contains the scene `path`, a file or a run's folder; `None` if there is none.
     pub fn around(path: &Path) -> Option<RunRecord> {
         let folder = if path.is_dir() { path } else { path.parent()? };
         serde_json::from_slice(&fs::read(folder.join("run.json")).ok()?).ok()
     }
 
-    /// Keeps which views the run is trained on and scored by.
+    /// Writes the list of training and held-out views.
     pub(crate) fn write_views(&self, dataset: &Dataset) -> Result<(), RunError> {
         self.write(VIEWS, &to_json(&ViewList::of(dataset)))
     }
 
-    /// How `dataset` differs from the one that the run began with; nothing where the run did not keep that.
+    /// Differences between `dataset` and the one with which the run began; empty if the run has no list.
     pub(crate) fn changed_views(&self, dataset: &Dataset) -> Result<Vec<String>, RunError> {
         let path = self.file(VIEWS);
         let Ok(text) = fs::read_to_string(&path) else {
@@ -188,17 +188,17 @@ impl RunFolder {
         Ok(then.differences(&ViewList::of(dataset)))
     }
 
-    /// The paces of the run's steps.
+    /// The recorded paces of the run's steps.
     ///
     /// # Errors
-    /// When the run kept none, or the file is damaged.
+    /// When the run has none, or the file is damaged.
     pub(crate) fn paces(&self) -> Result<Paces, RunError> {
         let path = self.file(PACES);
         let text = fs::read_to_string(&path).map_err(RunError::io("read", &path))?;
         Paces::parse(&text).map_err(|reason| RunError::Damaged { path, reason })
     }
 
-    /// Removes the temporary files that a killed process could not remove; only who holds the folder's lock may ask.
+    /// Removes the temporary files that a killed process left; requires the folder's lock.
     pub(crate) fn remove_leftovers(&self) -> Result<(), RunError> {
         for folder in FOLDERS.map(|folder| self.file(folder)).iter().chain([&self.0]) {
             let entries = fs::read_dir(folder).map_err(RunError::io("read", folder))?;
@@ -212,17 +212,17 @@ impl RunFolder {
         Ok(())
     }
 
-    /// The folder itself.
+    /// The path of the folder.
     pub fn path(&self) -> &Path {
         &self.0
     }
 
-    /// A file in it.
+    /// The path of a file in it.
     pub fn file(&self, name: &str) -> PathBuf {
         self.0.join(name)
     }
 
-    /// Writes `bytes` to `name`, whole or not at all.
+    /// Writes `bytes` to `name`, atomically.
     pub fn write(&self, name: &str, bytes: &[u8]) -> Result<(), RunError> {
         write_atomic(&self.file(name), |out| out.write_all(bytes))?;
         Ok(())
@@ -231,11 +231,11 @@ impl RunFolder {
     /// Writes `run.json`.
     pub(crate) fn write_record(&self, record: &RunRecord) -> Result<(), RunError> {
         let bytes = serde_json::to_vec_pretty(record)
-            .map_err(|e| RunError::Refused(format!("the request cannot be kept in run.json: {e}")))?;
+            .map_err(|e| RunError::Refused(format!("the request cannot be written to run.json: {e}")))?;
         self.write("run.json", &bytes)
     }
 
-    /// Writes `cameras.json`: the training views' cameras, as the run has come to know them.
+    /// Writes `cameras.json`: the training views' cameras, with their refinement.
     pub(crate) fn write_cameras(&self, trainer: &Trainer) -> Result<(), RunError> {
         let dataset = &trainer.dataset;
         let records: Vec<CameraRecord> = dataset
@@ -263,7 +263,7 @@ impl RunFolder {
         self.write("cameras.json", &to_json(&records))
     }
 
-    /// The newest checkpoint, if there is one.
+    /// The latest checkpoint, if there is one.
     ///
     /// # Errors
     /// When the folder cannot be read.
@@ -292,7 +292,7 @@ impl RunFolder {
         Ok(found)
     }
 
-    /// Writes the checkpoint of `step` and removes older ones; its name relative to the run.
+    /// Writes the checkpoint of `step` and removes older ones; returns its path relative to the run.
     pub(crate) fn write_checkpoint(&self, step: u64, bytes: &[u8]) -> Result<String, RunError> {
         let name = format!("checkpoints/step_{step}.safetensors");
         self.write(&name, bytes)?;
@@ -303,12 +303,12 @@ impl RunFolder {
     }
 }
 
-/// Plain data as indented JSON.
+/// Serialisable data as indented JSON.
 pub(crate) fn to_json(value: &impl Serialize) -> Vec<u8> {
     serde_json::to_vec_pretty(value).expect("plain data")
 }
 
-/// The cameras of the run that the file `scene` lies in, if it lies in one.
+/// The cameras of the run that contains the file `scene`, if there is one.
 pub(crate) fn cameras_beside(scene: &Path) -> Option<Vec<Camera>> {
     let text = fs::read_to_string(scene.parent()?.join("cameras.json")).ok()?;
     let records: Vec<CameraRecord> = serde_json::from_str(&text).ok()?;

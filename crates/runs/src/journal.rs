@@ -1,4 +1,4 @@
-//! What a run writes while it goes: `events.jsonl`, checkpoints, and the curves for its report.
+//! The files that a run writes while training: `events.jsonl`, paces, checkpoints, and the curves for its report.
 
 use crate::folder::PACES;
 use crate::{RunError, RunFolder};
@@ -10,37 +10,37 @@ use std::fs::{self, File, OpenOptions};
 use std::io::{self, Write};
 use std::path::Path;
 
-/// Points that a curve has, about: more would not be seen.
+/// Approximate number of points of a curve: more would not be visible.
 const CURVE_POINTS: u64 = 1000;
 
-/// Writes as the run goes.
+/// Writes the files of a run as an observer.
 pub struct Journal {
     folder: RunFolder,
     events: File,
-    /// Loss, PSNR and count over the run.
+    /// Loss, PSNR and number of splats over the run.
     pub curve: Vec<CurvePoint>,
     /// Stages entered.
     pub stages: Vec<StageReport>,
-    /// Lines that should reach the report.
+    /// Warnings for the report.
     pub warnings: Vec<String>,
-    /// When the present stage began, seconds of training.
+    /// Start of the current stage, seconds of training.
     stage_start: f64,
     non_finite: usize,
     paces: File,
     /// The last pace written.
     pace: Option<f64>,
     failed: bool,
-    /// What [`Observer::warning`] is to tell.
+    /// The warning for [`Observer::warning`].
     warning: Option<String>,
 }
 
-/// `events.jsonl`, to be written behind what it holds.
+/// `events.jsonl`, opened for appending.
 fn appended(path: &Path) -> Result<File, RunError> {
     let file = OpenOptions::new().create(true).append(true).open(path);
     file.map_err(RunError::io("write", path))
 }
 
-/// `pace.txt`, to be written behind step `from`: what an interrupted run had written beyond is dropped.
+/// `pace.txt`, opened for appending after step `from`: later lines of an interrupted run are removed.
 fn kept_paces(folder: &RunFolder, from: u64) -> Result<File, RunError> {
     let path = folder.file(PACES);
     let text = fs::read_to_string(&path).unwrap_or_default();
@@ -56,7 +56,7 @@ fn kept_paces(folder: &RunFolder, from: u64) -> Result<File, RunError> {
 }
 
 impl Journal {
-    /// Begins, or goes on behind step `from`: what an interrupted run had written beyond is dropped.
+    /// Begins, or resumes after step `from`: later events of an interrupted run are removed.
     pub fn open(folder: &RunFolder, from: u64) -> Result<Self, RunError> {
         let path = folder.file("events.jsonl");
         let mut journal = Self {
@@ -75,7 +75,7 @@ impl Journal {
         let text = fs::read_to_string(&path).unwrap_or_default();
         let mut kept = String::new();
         for line in text.lines() {
-            // A line cut by a power failure is no JSON: it and what follows is dropped.
+            // A line truncated by a power failure is not JSON: it and all later ones are removed.
             let Ok(value) = serde_json::from_str::<serde_json::Value>(line) else {
                 break;
             };
@@ -93,7 +93,7 @@ impl Journal {
         Ok(journal)
     }
 
-    /// Takes an earlier event into the curves.
+    /// Adds an earlier event to the curves.
     fn recall(&mut self, event: &serde_json::Value) {
         let step = event["step"].as_u64().unwrap_or(0);
         let seconds = event["seconds"].as_f64().unwrap_or(f64::NAN);
@@ -154,7 +154,7 @@ impl Journal {
         self.check(written, "events.jsonl");
     }
 
-    /// Keeps the pace of a step, where it is another one than that of the step before.
+    /// Records the pace of a step, if it differs from the previous step's.
     fn keep_pace(&mut self, step: u64, pace: f64) {
         if self.pace != Some(pace) {
             self.pace = Some(pace);
@@ -163,22 +163,22 @@ impl Journal {
         }
     }
 
-    /// A full disk must not end the training; one word about it is enough.
+    /// A full disk must not end the training; it is reported once.
     fn check(&mut self, written: io::Result<()>, file: &str) {
         if let Err(error) = written
             && !self.failed
         {
             self.failed = true;
             let path = self.folder.file(file);
-            self.warning = Some(format!("cannot write {}: {error}; training goes on", path.display()));
+            self.warning = Some(format!("cannot write {}: {error}; training continues", path.display()));
         }
     }
 
-    /// All warnings, with what was counted.
+    /// All warnings, including counts.
     pub fn all_warnings(&self) -> Vec<String> {
         let counted = (self.non_finite > 0).then(|| {
             let times = self.non_finite;
-            format!("{times} times a splat rested for a step because its gradient was not finite")
+            format!("{times} splat updates were skipped because of non-finite gradients")
         });
         self.warnings.iter().cloned().chain(counted).collect()
     }
@@ -235,7 +235,7 @@ impl Observer for Journal {
     }
 }
 
-/// Mean squared errors of the training views that the run in `folder` logged, step by step; none where it left no log.
+/// Mean squared errors of the training views that the run in `folder` logged, step by step; empty without a log.
 pub fn logged_errors(folder: &Path) -> Vec<f64> {
     let text = fs::read_to_string(folder.join("events.jsonl")).unwrap_or_default();
     let events = text

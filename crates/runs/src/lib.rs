@@ -1,11 +1,11 @@
-//! Irradia as a library: photographs in, a scene that can be rendered out. **Begin here**; one import does it:
+//! Irradia as a library: photographs in, a renderable scene out. **Start here**; one import suffices:
 //!
 //! ```
 //! # let folder = tempfile::tempdir().unwrap();
 //! # let here = |name: &str| folder.path().join(name);
 //! use irradia_runs::prelude::*;
 //!
-//! // A small dataset to try it on; any folder of posed photographs does.
+//! // A small dataset to try; any folder of posed photographs works.
 //! write_synth_dataset(here("photos"), &SynthOptions { views: 4, width: 24, height: 16, seed: 0 })?;
 //!
 //! // Train ..
@@ -19,21 +19,21 @@
 //! # Ok::<(), RunError>(())
 //! ```
 //!
-//! | to | begin with |
+//! | to | start with |
 //! |---|---|
 //! | train on a folder | [`TrainInput`], which becomes a validated [`TrainRequest`]; [`Run::begin`] |
 //! | train on a dataset in memory | [`Run::begin_on`] |
-//! | go on with an interrupted run | [`TrainInput::of_run`], [`Run::resume`] |
+//! | resume an interrupted run | [`TrainInput::of_run`], [`Run::resume`] |
 //! | show progress, pause, save or stop | an [`Observer`](train::event::Observer) given to [`Run::train`] |
-//! | see a training from another thread | [`Run::snapshots`] |
+//! | view a training run from another thread | [`Run::snapshots`] |
 //! | read and render a scene | [`Scene`] |
-//! | measure a scene against photographs | [`evaluate`] |
-//! | say what a file or folder is | [`describe`] |
+//! | evaluate a scene against photographs | [`evaluate`] |
+//! | describe a file or folder | [`describe`] |
 //!
-//! Nothing here prints: warnings are returned, or told to observers. Random numbers come from the request's seed alone, and
+//! Nothing here prints: warnings are returned, or passed to observers. Random numbers come from the request's seed alone, and
 //! the number of threads (rayon's global pool) does not change a byte of a scene.
 //!
-//! The crates below are re-exported by their short names. [`train`] has the recipes, the schedule and the training step,
+//! The lower crates are re-exported by their short names. [`train`] has the recipes, the schedule and the training step,
 //! [`scene`] the plain types and their conventions.
 #![forbid(unsafe_code)]
 
@@ -71,7 +71,7 @@ pub use scene_file::{Scene, scene_of};
 pub use snapshot::{Snapshot, Snapshots};
 pub use synth_files::{SynthSummary, write_synth_dataset};
 
-/// All that a program which trains or renders names.
+/// The names that a program which trains or renders needs.
 pub mod prelude {
     pub use crate::scene::{Camera, Dataset, Image, Intrinsics, Pose};
     pub use crate::synth::SynthOptions;

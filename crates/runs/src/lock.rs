@@ -1,28 +1,28 @@
-//! One process a run's folder: the lock that is held while a run is trained.
+//! One process per run folder: the lock that is held during training.
 
 use crate::RunError;
 use std::fs::{File, OpenOptions, TryLockError};
 use std::io::{Read, Seek, Write};
 use std::path::Path;
 
-/// The file that is locked. It stays when the run is over.
+/// The locked file. It remains after the run.
 const NAME: &str = ".lock";
 
-/// Held for as long as a run may write into its folder.
+/// Held while a run may write into its folder.
 ///
-/// The lock is the system's own on an open file, not the file's existence: it goes when its process does, however that ends,
-/// so that none is ever stale, and network file systems keep it across hosts. Where a file system has no locks, nothing is
-/// held and nothing refused.
+/// The lock is the system's own on an open file, not the file's existence: it is released when its process ends in any way, so
+/// that no lock is ever stale, and network file systems honour it across hosts. On a file system without locks, nothing is
+/// locked and nothing rejected.
 #[derive(Debug)]
 pub(crate) struct FolderLock {
     _file: Option<File>,
 }
 
 impl FolderLock {
-    /// Takes the lock of `folder`, which exists.
+    /// Locks `folder`, which exists.
     ///
     /// # Errors
-    /// When another process, or another run of this one, holds it; when the file cannot be made.
+    /// When another process, or another run of this one, holds the lock; when the file cannot be created.
     pub fn take(folder: &Path) -> Result<Self, RunError> {
         let path = folder.join(NAME);
         let opened = OpenOptions::new()
@@ -34,7 +34,7 @@ impl FolderLock {
         let mut file = opened.map_err(RunError::io("write", &path))?;
         match file.try_lock() {
             Ok(()) => {
-                // Who holds it is only told, never asked: it does not matter if this fails.
+                // The holder's id is only for messages: a failure does not matter.
                 let _ = file.set_len(0).and_then(|()| write!(file, "{}", std::process::id()));
                 Ok(Self { _file: Some(file) })
             }
@@ -51,12 +51,12 @@ impl FolderLock {
         }
     }
 
-    /// Whether a run was ever trained in `folder`, or prepared to be.
+    /// Whether `folder` was ever locked for a run.
     pub fn was_taken(folder: &Path) -> bool {
         folder.join(NAME).is_file()
     }
 
-    /// [`Self::take`] where a run has left its lock file: refuses early, and leaves no trace in other folders.
+    /// [`Self::take`] if a run has left its lock file: fails early, and leaves no file in other folders.
     pub fn take_existing(folder: &Path) -> Result<Option<Self>, RunError> {
         Self::was_taken(folder).then(|| Self::take(folder)).transpose()
     }
@@ -67,10 +67,10 @@ mod tests {
     use super::*;
 
     #[test]
-    fn one_holder_at_a_time_and_what_a_dead_process_left_does_not_count() {
+    fn there_is_one_holder_at_a_time_and_files_of_dead_processes_are_ignored() {
         let folder = tempfile::tempdir().unwrap();
         assert!(FolderLock::take_existing(folder.path()).unwrap().is_none());
-        // As a process that was killed leaves it.
+        // As left by a killed process.
         std::fs::write(folder.path().join(NAME), "4194305").unwrap();
         let held = FolderLock::take(folder.path()).unwrap();
         let line = FolderLock::take_existing(folder.path()).unwrap_err().to_string();

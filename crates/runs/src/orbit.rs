@@ -4,8 +4,8 @@ use glam::Vec3;
 use irradia_scene::{Camera, Intrinsics, Pose};
 use irradia_splat::{Splats, init::focus_point};
 
-/// A circle around what the training cameras looked at, at their mean distance and height; for a scene without them,
-/// around the middle of the splats.
+/// A circle around the focus of the training cameras, at their mean distance and height; for a scene without them, around
+/// the centre of the splats.
 pub(crate) fn orbit(
     splats: Option<&Splats>,
     cameras: Option<&[Camera]>,
@@ -41,7 +41,7 @@ pub(crate) fn orbit(
             };
             let axes = [middle(0), middle(1), middle(2)];
             let size = axes.iter().map(|a| a.1).fold(1e-3, f32::max);
-            // Most files of this kind come from COLMAP, whose y points down.
+            // Most files of this kind come from COLMAP, whose y axis points down.
             (
                 Vec3::from_array(axes.map(|a| a.0)),
                 Vec3::NEG_Y,
@@ -55,7 +55,7 @@ pub(crate) fn orbit(
         let fov_x = 2.0 * (0.5 * intrinsics.width as f32 / intrinsics.fx).atan();
         intrinsics = Intrinsics::from_fov_x(width, height, fov_x);
     }
-    // The circle starts where the first camera stood.
+    // The circle starts at the azimuth of the first camera.
     let toward = cameras.map_or(up.any_orthonormal_vector(), |c| c[0].pose.position - center);
     let x = (toward - up * toward.dot(up)).normalize_or(up.any_orthonormal_vector());
     let y = up.cross(x);

@@ -1,4 +1,4 @@
-//! What a run was trained on, so that a change is noticed.
+//! The data of a run, to detect changes.
 
 use irradia_scene::Dataset;
 use serde::{Deserialize, Serialize};
@@ -38,7 +38,7 @@ impl ViewList {
         Self(dataset.views.iter().zip(parts).map(record).collect())
     }
 
-    /// How `now` differs: one phrase a kind of difference, each with the first view that has it.
+    /// Differences from `now`: one phrase per kind of difference, each with the first view concerned.
     pub fn differences(&self, now: &Self) -> Vec<String> {
         let told = |what: &str, names: Vec<&String>| {
             let first = names.first()?;
@@ -92,8 +92,8 @@ impl Hash {
     }
 }
 
-/// A hash of what a training takes from the dataset in `root`: names, split, sizes, cameras, number of points, and the sizes
-/// of the image files. The pixels are not read.
+/// A hash of the dataset in `root` as training uses it: names, split, sizes, cameras, number of points, and the sizes of the
+/// image files. The pixels are not read.
 pub fn data_fingerprint(dataset: &Dataset, root: &Path) -> String {
     let mut hash = Hash::new();
     hash.add(&serde_json::to_vec(&ViewList::of(dataset)).expect("plain data"));
@@ -111,7 +111,7 @@ pub fn data_fingerprint(dataset: &Dataset, root: &Path) -> String {
     hash.hex()
 }
 
-/// A hash of this program's file: another build has another one.
+/// A hash of this program's file, which differs between builds.
 ///
 /// # Errors
 /// When the file cannot be read.
@@ -127,7 +127,7 @@ mod tests {
     use irradia_synth::{SynthOptions, dataset};
 
     #[test]
-    fn each_kind_of_difference_is_named() {
+    fn each_kind_of_difference_is_described() {
         let data = data();
         let then = ViewList::of(&data);
         let changed = |change: &dyn Fn(&mut Dataset)| {

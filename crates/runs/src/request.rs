@@ -1,4 +1,4 @@
-//! What a training is asked for: raw input, and the validated request.
+//! Training requests: raw input, and the validated request.
 
 use crate::{Background, RunError, RunFolder};
 use irradia_formats::{DatasetFormat, DatasetOptions, Holdout, USUAL_MAX_SIDE, read_dataset};
@@ -6,39 +6,39 @@ use irradia_scene::Dataset;
 use irradia_train::Recipe;
 use irradia_train::paces::Paces;
 use irradia_train::recipe::Param;
-use irradia_train::schedule::{Moment, outline};
+use irradia_train::schedule::{OutlinePoint, outline};
 use serde::{Deserialize, Serialize};
 use std::fmt::Display;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
-/// How to get the weights of LPIPS, in the words of the command line.
+/// How to get LPIPS weights, in terms of the command line.
 pub const HOW_TO_GET_LPIPS: &str = "import the weights once with irradia lpips --import FEATURES HEADS, or name a file or a \
                                     folder with --lpips or IRRADIA_LPIPS";
 
-/// The recipe of a request that names none: the best for its time on all scenes of RESULTS.md.
+/// The default recipe: the best for its time on all scenes of RESULTS.md.
 pub const DEFAULT_RECIPE: &str = "fast";
 
-/// How a dataset is read, unchecked.
+/// How to read a dataset, not validated.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Reading {
-    /// `colmap`, `nerfstudio`, `blender` or `llff`; recognised from the folder when `None`.
+    /// `colmap`, `nerfstudio`, `blender` or `llff`; detected from the folder if `None`.
     #[serde(default)]
     pub format: Option<String>,
     /// The images' sides are divided by this; 1 or more.
     pub downscale: f32,
-    /// The longer side of an image has at most this many pixels; at least 1, and not together with `downscale`, which takes
-    /// the place of the usual limit. `None`: as large as they are.
+    /// Maximum number of pixels of an image's longer side; at least 1, and not together with `downscale`, which replaces the
+    /// default limit. `None`: full size.
     #[serde(default)]
     pub max_side: Option<u32>,
-    /// Which views are held out: every N-th in the order of names (`8`), none (`0`), or those that a file names, one a line.
-    /// `None`: those that the dataset itself holds out, every 8th where it does not say.
+    /// Views to hold out: every N-th in the order of names (`8`), none (`0`), or those listed in a file, one per line.
+    /// `None`: those that the dataset itself holds out, every 8th if it does not define any.
     #[serde(default)]
     pub holdout: Option<String>,
 }
 
 impl Default for Reading {
-    /// Any format, the dataset's own split, at most [`USUAL_MAX_SIDE`] pixels a side.
+    /// Any format, the dataset's own split, at most [`USUAL_MAX_SIDE`] pixels per side.
     fn default() -> Self {
         Self {
             format: None,
@@ -63,17 +63,17 @@ impl Reading {
             None => None,
         };
         if !self.downscale.is_finite() || self.downscale < 1.0 {
-            return Err(RunError::setting("downscale", self.downscale, "give 1 or more"));
+            return Err(RunError::setting("downscale", self.downscale, "must be 1 or more"));
         }
         if self.max_side == Some(0) {
-            return Err(RunError::setting("max_side", 0, "give 1 or more"));
+            return Err(RunError::setting("max_side", 0, "must be 1 or more"));
         }
-        // A downscale that was asked for takes the place of the usual limit.
+        // An explicit downscale replaces the default limit.
         let max_side = self
             .max_side
             .filter(|side| self.downscale == 1.0 || *side != USUAL_MAX_SIDE);
         if let Some(side) = max_side.filter(|_| self.downscale != 1.0) {
-            return Err(RunError::setting("max_side", side, "give it or downscale, not both"));
+            return Err(RunError::setting("max_side", side, "cannot be combined with downscale"));
         }
         Ok(DatasetOptions {
             format,
@@ -90,14 +90,14 @@ impl Reading {
         let wrong = |message: &str| Err(RunError::setting("holdout", text, message));
         match text.parse::<usize>() {
             Ok(0) => Ok(Holdout::Nothing),
-            Ok(1) => wrong("every view would be held out; give 2 or more, or 0 to train on all"),
+            Ok(1) => wrong("every view would be held out; must be 2 or more, or 0 to train on all"),
             Ok(n) => Ok(Holdout::Every(n)),
             Err(_) if Path::new(text).is_file() => Ok(Holdout::Listed(text.into())),
-            Err(_) => wrong("give a number, 0 to train on all views, or a file that names the views to hold out"),
+            Err(_) => wrong("expected a number, 0 to train on all views, or a file that lists the views to hold out"),
         }
     }
 
-    /// Lets `holdout` name its file whatever the current folder is.
+    /// Makes the path in `holdout` absolute.
     fn with_absolute_paths(mut self) -> Self {
         if let Ok(Holdout::Listed(file)) = self.holdout() {
             self.holdout = Some(std::path::absolute(&file).unwrap_or(file).display().to_string());
@@ -105,16 +105,16 @@ impl Reading {
         self
     }
 
-    /// Reads the dataset at `path`; its `warnings` are for the caller to show.
+    /// Reads the dataset at `path`; the caller shows its `warnings`.
     ///
     /// # Errors
-    /// When a value is out of range, or `path` holds no dataset.
+    /// When a value is out of range, or `path` contains no dataset.
     pub fn read(&self, path: &Path) -> Result<Dataset, RunError> {
         Ok(read_dataset(path, &self.check()?)?)
     }
 }
 
-/// What a training is asked for, unchecked; `run.json` keeps it. A new option is a field here, with its bounds in
+/// A training request, not validated; stored in `run.json`. A new option is a field here, with its bounds in
 /// [`TrainInput::check`].
 ///
 /// ```
@@ -124,7 +124,7 @@ impl Reading {
 /// assert_eq!(input.clone().check()?.recipe().name, "fast");
 ///
 /// let nonsense = TrainInput { steps: Some(0), ..input };
-/// assert_eq!(nonsense.check().unwrap_err().to_string(), "steps 0: give 1 or more");
+/// assert_eq!(nonsense.check().unwrap_err().to_string(), "steps 0: must be 1 or more");
 /// # Ok::<(), irradia_runs::RunError>(())
 /// ```
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -137,17 +137,17 @@ pub struct TrainInput {
     /// A built-in recipe, or a `.toml` file.
     #[serde(default = "default_recipe")]
     pub recipe: String,
-    /// Changes to the recipe, each `key=value`.
+    /// Overrides of the recipe, each `key=value`.
     #[serde(default)]
     pub set: Vec<String>,
-    /// Most splats; the recipe's own limit when `None`.
+    /// Maximum number of splats; the recipe's own limit if `None`.
     #[serde(default)]
     pub max_splats: Option<usize>,
-    /// Steps into which the recipe is fitted; its own number when `None`.
+    /// Number of steps into which the recipe is fitted; its own number if `None`.
     pub steps: Option<u64>,
     /// Seconds of training into which the recipe is fitted; not together with `steps`.
     pub budget: Option<f64>,
-    /// The folder of a run whose steps are repeated at the pace that they had; with neither `steps` nor `budget`.
+    /// The folder of a run whose steps are repeated at their recorded pace; with neither `steps` nor `budget`.
     #[serde(default)]
     pub replay: Option<PathBuf>,
     /// Held-out PSNR at which to stop, dB.
@@ -160,10 +160,10 @@ pub struct TrainInput {
     /// How the dataset is read.
     #[serde(flatten)]
     pub reading: Reading,
-    /// What photographs with alpha are laid over. `None`: white for Blender scenes, the recipe's elsewhere.
+    /// Background of photographs with alpha. `None`: white for Blender scenes, otherwise the recipe's.
     #[serde(default)]
     pub background: Option<Background>,
-    /// Whether a run that `out` holds is replaced.
+    /// Whether to replace an existing run in `out`.
     #[serde(skip)]
     pub overwrite: bool,
 }
@@ -173,7 +173,7 @@ fn default_recipe() -> String {
 }
 
 impl TrainInput {
-    /// Trains on the dataset in `data` by the default recipe and writes the run to `out`.
+    /// Trains on the dataset in `data` with the default recipe and writes the run to `out`.
     pub fn new(data: impl Into<PathBuf>, out: impl Into<PathBuf>) -> Self {
         Self {
             data: data.into(),
@@ -193,11 +193,11 @@ impl TrainInput {
         }
     }
 
-    /// What the run in the folder `out` was asked for, to resume it: its recipe is the resolved one that it holds. The
-    /// dataset, limits and weights may be changed before [`TrainInput::check`].
+    /// The request of the run in the folder `out`, to resume it: its recipe is the resolved one in that folder. The dataset, limits
+    /// and weights may be changed before [`TrainInput::check`].
     ///
     /// # Errors
-    /// When the folder holds no run, or its `run.json` is damaged.
+    /// When the folder contains no run, or its `run.json` is damaged.
     pub fn of_run(out: impl AsRef<Path>) -> Result<Self, RunError> {
         let out = out.as_ref();
         let (folder, record) = RunFolder::open(out)?;
@@ -207,14 +207,14 @@ impl TrainInput {
         input.set.clear();
         input.max_splats = None;
         if input.budget.is_some() {
-            // A run may be given a budget when it is resumed; it then replaces the steps.
+            // A run may get a budget when it is resumed; the budget then replaces the steps.
             input.steps = None;
         }
         Ok(input)
     }
 
-    /// Repeats the run in the folder `run` into the folder `out`: the same data, recipe and seed, each step at the pace that it
-    /// had, so that the scene has the same bytes, also where a budget set the pace by the clock.
+    /// Repeats the run in the folder `run` into the folder `out`: the same data, recipe and seed, each step at its recorded pace,
+    /// so that the scene has the same bytes, even if a budget set the pace by the clock.
     ///
     /// # Errors
     /// Those of [`TrainInput::of_run`].
@@ -229,8 +229,8 @@ impl TrainInput {
         })
     }
 
-    /// The validated request: every setting in its range, the recipe read and resolved. The dataset and the run's folder
-    /// are not touched.
+    /// The validated request: every setting in range, the recipe read and resolved. Neither the dataset nor the run's folder is
+    /// accessed.
     ///
     /// # Errors
     /// [`RunError::Setting`] or [`RunError::Recipe`], for the first setting that is out of range.
@@ -239,13 +239,13 @@ impl TrainInput {
         at_least_one("steps", self.steps)?;
         at_least_one("max_splats", self.max_splats)?;
         if let Some(seconds) = self.budget.filter(|seconds| !(*seconds > 0.0 && seconds.is_finite())) {
-            return Err(RunError::setting("budget", seconds, "give seconds, more than 0"));
+            return Err(RunError::setting("budget", seconds, "must be more than 0 seconds"));
         }
         if let (Some(steps), Some(_)) = (self.steps, self.budget) {
-            return Err(RunError::setting("steps", steps, "give steps or a budget, not both"));
+            return Err(RunError::setting("steps", steps, "cannot be combined with a budget"));
         }
         if let Some(psnr) = self.until_psnr.filter(|psnr| !psnr.is_finite()) {
-            return Err(RunError::setting("until_psnr", psnr, "give a number of dB"));
+            return Err(RunError::setting("until_psnr", psnr, "must be a number of dB"));
         }
         self.reading = self.reading.with_absolute_paths();
         let reading = self.reading.check()?;
@@ -264,12 +264,12 @@ impl TrainInput {
 
 fn at_least_one<N: PartialOrd + From<u8> + Display>(name: &'static str, value: Option<N>) -> Result<(), RunError> {
     match value {
-        Some(value) if value < N::from(1) => Err(RunError::setting(name, value, "give 1 or more")),
+        Some(value) if value < N::from(1) => Err(RunError::setting(name, value, "must be 1 or more")),
         _ => Ok(()),
     }
 }
 
-/// The built-in recipe or `.toml` file `name`, changed by `overrides`, each `key=value`.
+/// The built-in recipe or `.toml` file `name`, modified by `overrides`, each `key=value`.
 ///
 /// # Errors
 /// [`RunError::Recipe`]; a file that cannot be read is [`RunError::Refused`].
@@ -282,49 +282,49 @@ pub fn read_recipe(name: &str, overrides: &[String]) -> Result<Recipe, RunError>
     Ok(Recipe::parse(name, &text, overrides)?)
 }
 
-/// A validated request, made by [`TrainInput::check`]; one request is one run.
+/// A validated request, created by [`TrainInput::check`]; one request is one run.
 #[derive(Debug)]
 pub struct TrainRequest {
     pub(crate) input: TrainInput,
     pub(crate) recipe: Recipe,
     reading: DatasetOptions,
-    /// A report's `total_seconds` counts from here.
+    /// Start time for a report's `total_seconds`.
     pub(crate) started: Instant,
 }
 
 impl TrainRequest {
-    /// What was asked for; its dataset's path is absolute.
+    /// The input; its dataset's path is absolute.
     pub fn input(&self) -> &TrainInput {
         &self.input
     }
 
-    /// The recipe, resolved.
+    /// The resolved recipe.
     pub fn recipe(&self) -> &Recipe {
         &self.recipe
     }
 
-    /// Reads the dataset; its `warnings` are for the caller to show.
+    /// Reads the dataset; the caller shows its `warnings`.
     ///
     /// # Errors
-    /// When the folder holds no dataset that can be trained on.
+    /// When the folder contains no dataset that can be trained on.
     pub fn read_dataset(&self) -> Result<Dataset, RunError> {
         Ok(read_dataset(&self.input.data, &self.reading)?)
     }
 
-    /// What of the request cannot be followed, one line each.
+    /// Parts of the request that cannot be satisfied, one line each.
     pub fn warnings(&self) -> Vec<String> {
-        let weighs = |moment: &Moment| moment.values[Param::PerceptualWeight] > 0.0;
+        let weighs = |moment: &OutlinePoint| moment.values[Param::PerceptualWeight] > 0.0;
         let missing = self.input.lpips.is_none() && outline(&self.recipe, 1000).iter().any(weighs);
         let line = || {
             format!(
-                "recipe {} is trained without its perceptual loss, since no weights of LPIPS were found: {HOW_TO_GET_LPIPS}",
+                "recipe {} is trained without its perceptual loss: no LPIPS weights found; {HOW_TO_GET_LPIPS}",
                 self.recipe.name
             )
         };
         missing.then(line).into_iter().collect()
     }
 
-    /// Settles what photographs with alpha are laid over, where neither the input nor its changes to the recipe say it.
+    /// Sets the background of photographs with alpha, if neither the input nor its overrides of the recipe do.
     pub(crate) fn choose_background(&mut self, dataset: &Dataset) -> Result<(), RunError> {
         let is_set = self
             .input
@@ -340,7 +340,7 @@ impl TrainRequest {
         Ok(())
     }
 
-    /// The paces of the run that this one repeats.
+    /// The paces of the run to repeat.
     pub(crate) fn paces(&self) -> Result<Option<Paces>, RunError> {
         let run = self.input.replay.as_deref();
         run.map(|run| RunFolder::open(run)?.0.paces()).transpose()

@@ -1,4 +1,4 @@
-//! What a run leaves when it is finished: its scene, the held-out views, and the report.
+//! The results of a finished run: its scene, the held-out views, and the report.
 
 use crate::folder::{FIELD, SCENE, to_json};
 use crate::{Run, RunError, RunFolder, evaluate, file_stems, unmeasured};
@@ -17,7 +17,7 @@ use std::time::Instant;
 const NOTHING_HELD_OUT: &str = "no view is held out";
 
 impl Run {
-    /// Writes the splats with what was trained beside them, or the field.
+    /// Writes the splats with the components trained beside them, or the field.
     pub(crate) fn write_scene(&self) -> Result<(), RunError> {
         let folder = &self.folder;
         match self.trainer.scene() {
@@ -35,9 +35,9 @@ impl Run {
         Ok(())
     }
 
-    /// Measures the held-out views, writes their pictures, and sums up the run.
+    /// Evaluates the held-out views, writes their pictures, and creates the report.
     ///
-    /// `finishing` is when the run began to finish; `stop`, asked after each view, ends it all.
+    /// `finishing` is when the run began to finish; `stop`, polled after each view, aborts.
     pub(crate) fn report(&self, finishing: Instant, stop: &dyn Fn() -> bool) -> Result<Report, RunError> {
         let (trainer, input, journal) = (&self.trainer, &self.request.input, &self.journal);
         let names = trainer.dataset.views.iter().map(|view| view.name.as_str());
@@ -54,7 +54,7 @@ impl Run {
                 half_fit: trainer.half_fit(),
             },
             |view| {
-                let stem = stems.next().expect("one for each view");
+                let stem = stems.next().expect("one per view");
                 views.push(write_view(&self.folder, stem, view)?);
                 if stop() {
                     Err(RunError::EvaluationStopped)
@@ -126,7 +126,7 @@ impl Run {
     pub(crate) fn write_report(&self, report: &Report) -> Result<(), RunError> {
         let mut json = serde_json::to_value(report).expect("plain data");
         if let Some(fields) = json.as_object_mut().filter(|_| report.views.is_empty()) {
-            // What cannot be is not written; with held-out views, null says that there was no network.
+            // Missing values are not written; with held-out views, null means that there was no network.
             fields.retain(|_, value| !value.is_null());
         }
         self.folder.write("report.json", &to_json(&json))?;
@@ -134,7 +134,7 @@ impl Run {
     }
 }
 
-/// Writes `image`, sRGB in \[0, 1\] with 1, 3 or 4 channels, as an 8-bit PNG, whole or not at all.
+/// Writes `image`, sRGB in \[0, 1\] with 1, 3 or 4 channels, as an 8-bit PNG, atomically.
 ///
 /// # Errors
 /// When the file cannot be written.
@@ -168,8 +168,8 @@ fn write_view(folder: &RunFolder, stem: &str, view: &EvaluatedView) -> Result<Vi
     })
 }
 
-/// Absolute difference, four times enlarged so that a difference of a quarter is white; black where a mask says that the
-/// pixel does not count.
+/// Absolute difference, amplified four times so that a difference of a quarter is white; black where the mask excludes the
+/// pixel.
 fn error_image(view: &EvaluatedView) -> Image {
     let (truth, render) = (&view.truth, &view.render);
     let counts = |pixel: usize| view.mask.as_ref().is_none_or(|mask| mask[pixel] != 0);

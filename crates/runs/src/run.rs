@@ -1,4 +1,4 @@
-//! A training with its folder: begin or resume, train, finish.
+//! A training run with its folder: begin or resume, train, finish.
 
 use crate::folder::RunRecord;
 use crate::journal::Journal;
@@ -16,7 +16,7 @@ use std::path::Path;
 use std::sync::Arc;
 use std::time::Instant;
 
-/// A training with its folder. [`Run::train`] makes the steps, [`Run::finish`] writes the scene and the report.
+/// A training run with its folder. [`Run::train`] makes the steps, [`Run::finish`] writes the scene and the report.
 ///
 /// ```
 /// # let folder = tempfile::tempdir().unwrap();
@@ -33,15 +33,14 @@ use std::time::Instant;
 /// # Ok::<(), RunError>(())
 /// ```
 ///
-/// What watches or steers a training is an [`Observer`]; another thread sees its newest state through
-/// [`Run::snapshots`].
+/// An [`Observer`] watches or controls a training run; another thread gets its latest state from [`Run::snapshots`].
 pub struct Run {
     pub(crate) folder: RunFolder,
     pub(crate) request: TrainRequest,
     pub(crate) trainer: Trainer,
     pub(crate) journal: Journal,
     snapshots: SnapshotServer,
-    /// What is repeated of another run.
+    /// The paces to repeat of another run.
     paces: Option<Paces>,
     /// Seconds between the request and the first step.
     pub(crate) preparing: Option<f64>,
@@ -51,11 +50,11 @@ pub struct Run {
 /// How a run ended.
 #[derive(Clone, Debug)]
 pub struct Finished {
-    /// Where everything lies.
+    /// The run's folder.
     pub folder: RunFolder,
-    /// What `report.json` holds.
+    /// The content of `report.json`.
     pub report: Report,
-    /// Whether the recipe was followed to its end; otherwise the run can be resumed.
+    /// Whether the recipe was completed; otherwise the run can be resumed.
     pub complete: bool,
 }
 
@@ -63,7 +62,7 @@ impl Run {
     /// Begins a run in a folder of its own.
     ///
     /// # Errors
-    /// When the folder holds a run that the request does not replace, or the dataset cannot be trained on. Nothing is
+    /// When the folder contains a run that the request does not replace, or the dataset cannot be trained on. Nothing is
     /// written then.
     pub fn begin(request: TrainRequest) -> Result<Self, RunError> {
         RunFolder::check_free(&request.input.out, request.input.overwrite)?;
@@ -71,7 +70,7 @@ impl Run {
         Self::begin_on(request, dataset)
     }
 
-    /// Begins a run on a dataset that is in memory. It can be resumed by [`Run::resume_on`] with the same dataset.
+    /// Begins a run on a dataset in memory. It can be resumed by [`Run::resume_on`] with the same dataset.
     ///
     /// # Errors
     /// Those of [`Run::begin`].
@@ -79,7 +78,7 @@ impl Run {
         if dataset.test.is_empty()
             && let Some(psnr) = request.input.until_psnr
         {
-            let message = "no view is held out, so that nothing can be measured";
+            let message = "no view is held out, so that PSNR cannot be measured";
             return Err(RunError::setting("until_psnr", psnr, message));
         }
         request.choose_background(&dataset)?;
@@ -93,7 +92,7 @@ impl Run {
         folder.write("recipe.toml", trainer.recipe.to_toml().as_bytes())?;
         folder.write_cameras(&trainer)?;
         folder.write_views(&trainer.dataset)?;
-        // Last: who finds it finds all that resuming needs.
+        // Last: a folder with this file has everything needed to resume.
         folder.write_record(&RunRecord {
             input: request.input.clone(),
             complete: false,
@@ -101,18 +100,18 @@ impl Run {
         Self::new(folder, lock, request, trainer, paces)
     }
 
-    /// Goes on with the run in the request's folder from its newest checkpoint. The request comes from
+    /// Resumes the run in the request's folder from its latest checkpoint. The request comes from
     /// [`TrainInput::of_run`](crate::TrainInput::of_run).
     ///
     /// # Errors
-    /// When the folder holds no run or is in use, its checkpoint is damaged, or its dataset cannot be read or has other views than
-    /// those that the steps so far were made on.
+    /// When the folder contains no run or is in use, its checkpoint is damaged, or its dataset cannot be read or has different
+    /// views from those of the previous steps.
     pub fn resume(request: TrainRequest) -> Result<Self, RunError> {
         let dataset = request.read_dataset()?;
         Self::resume_on(request, dataset)
     }
 
-    /// Likewise, on a dataset that was read already.
+    /// [`Run::resume`] on a dataset that has already been read.
     ///
     /// # Errors
     /// Those of [`Run::resume`].
@@ -135,7 +134,7 @@ impl Run {
                 }
                 read_checkpoint(&path, dataset, options)?
             }
-            // Interrupted before its first checkpoint: nothing was learnt from the data as they were.
+            // Interrupted before its first checkpoint: no step depends on the earlier data.
             None => Trainer::new(dataset, request.recipe.clone(), options)?,
         };
         folder.write_views(&trainer.dataset)?;
@@ -164,17 +163,17 @@ impl Run {
         })
     }
 
-    /// What is trained, as it stands.
+    /// The current state of training.
     pub fn trainer(&self) -> &Trainer {
         &self.trainer
     }
 
-    /// What was asked for.
+    /// The request.
     pub fn request(&self) -> &TrainRequest {
         &self.request
     }
 
-    /// What it trains over and is scored over, for people.
+    /// Description of the training and evaluation background.
     pub fn background(&self) -> String {
         background::in_words(&self.trainer.recipe)
     }
@@ -184,16 +183,16 @@ impl Run {
         &self.folder
     }
 
-    /// Lets other threads see the newest state while [`Run::train`] runs.
+    /// A handle by which other threads get the latest state while [`Run::train`] runs.
     pub fn snapshots(&self) -> Snapshots {
         self.snapshots.handle()
     }
 
-    /// Trains until the recipe is over, a limit of the request is reached, or an observer answers
-    /// [`Signal::Stop`](irradia_train::event::Signal::Stop); returns why it ended. A run that was stopped may be trained on.
+    /// Trains until the recipe is complete, a limit of the request is reached, or an observer returns
+    /// [`Signal::Stop`](irradia_train::event::Signal::Stop); returns the reason. A stopped run may be trained further.
     ///
     /// # Errors
-    /// When a photograph cannot be read; the steps made are saved all the same.
+    /// When a photograph cannot be read; completed steps are saved nevertheless.
     pub fn train(&mut self, observers: &mut [&mut dyn Observer]) -> Result<String, RunError> {
         let started = self.request.started;
         self.preparing.get_or_insert_with(|| started.elapsed().as_secs_f64());
@@ -212,14 +211,14 @@ impl Run {
         let ended = irradia_train::run(&mut self.trainer, &limits, &mut all);
         self.snapshots.close(&self.trainer);
         ended.map_err(|error| {
-            // The first error is the one worth telling.
+            // The first error is the one to report.
             let _ = self.save_unfinished();
             error.into()
         })
     }
 
-    /// Writes the scene, measures it on the held-out views, and writes the report. A run that has not come to its
-    /// recipe's end is saved, to be resumed.
+    /// Writes the scene, evaluates it on the held-out views, and writes the report. A run that has not completed its
+    /// recipe is saved, to be resumed.
     ///
     /// # Errors
     /// When a file cannot be written or a held-out photograph cannot be read.
@@ -227,8 +226,8 @@ impl Run {
         self.finish_unless(&|| false)
     }
 
-    /// Likewise, but `stop`, asked after each view, ends the evaluation: [`RunError::EvaluationStopped`]. The run is then saved
-    /// as it is, and resuming it evaluates it again.
+    /// [`Run::finish`], except that `stop`, polled after each view, ends the evaluation: [`RunError::EvaluationStopped`]. The run is
+    /// then saved, and resuming it evaluates it again.
     ///
     /// # Errors
     /// Those of [`Run::finish`].
@@ -263,7 +262,7 @@ impl Run {
     }
 }
 
-/// The request's part that the trainer needs, with LPIPS's network read.
+/// The trainer's options of the request, with the LPIPS network read.
 fn train_options(request: &TrainRequest) -> Result<TrainOptions, RunError> {
     let input = &request.input;
     Ok(TrainOptions {

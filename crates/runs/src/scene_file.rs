@@ -15,7 +15,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-/// Splats, with or without a residual field, or a radiance field; how it is rendered, and from where it was seen.
+/// Splats, with or without a residual field, or a radiance field, with render options and the training cameras.
 ///
 /// ```
 /// # use irradia_runs::scene::GaussianCloud;
@@ -37,17 +37,17 @@ use std::sync::Arc;
 /// ```
 #[derive(Clone, Debug)]
 pub struct Scene {
-    /// What is rendered.
+    /// What is rendered: splats or a field.
     pub model: Model<'static>,
     /// Background, antialiasing and SH degree.
     pub options: RenderOptions,
-    /// The training views' cameras, where they are known.
+    /// The training views' cameras, if known.
     pub cameras: Option<Arc<[Camera]>>,
 }
 
 impl Scene {
     /// Reads a splat file, a field, or the scene of a run's folder. Background and antialiasing are those of the run that
-    /// the file lies in; a residual field beside a run's splats is part of the scene.
+    /// contains the file; a residual field beside a run's splats is part of the scene.
     ///
     /// # Errors
     /// When it cannot be read, or is a residual field without its splats.
@@ -66,20 +66,20 @@ impl Scene {
         })
     }
 
-    /// What `camera` sees. For many frames, [`Model::render`] with one [`Renderer`] reuses memory.
+    /// Renders the view of `camera`. For many frames, [`Model::render`] with one [`Renderer`] reuses memory.
     pub fn render(&self, camera: &Camera) -> Frame {
         self.model.render(&mut Renderer::new(), camera, &self.options)
     }
 
-    /// `frames` cameras on a circle around what the training cameras looked at, at their mean distance and height; for a
-    /// scene without them, around the middle of the splats. `size` is width and height in pixels; that of the training
-    /// images, or 1280 x 720, when `None`.
+    /// `frames` cameras on a circle around the focus of the training cameras, at their mean distance and height; for a scene
+    /// without them, around the centre of the splats. `size` is width and height in pixels; if `None`, that of the training
+    /// images, or 1280 x 720.
     pub fn orbit(&self, frames: u32, size: Option<(u32, u32)>) -> Vec<Camera> {
         orbit(self.model.splats(), self.cameras.as_deref(), frames, size)
     }
 }
 
-/// The file of the scene where `path` is a run's folder, `path` itself elsewhere.
+/// The file of the scene if `path` is a run's folder, otherwise `path` itself.
 pub fn scene_of(path: &Path) -> PathBuf {
     let files = [SCENE, FIELD].map(|name| path.join(name));
     files.into_iter().find(|file| file.is_file()).unwrap_or(path.to_owned())
@@ -94,12 +94,12 @@ pub(crate) fn read_field(path: &Path) -> Result<Field, RunError> {
     })
 }
 
-/// Whether `path` is named as the file of a field is.
+/// Whether `path` has the file name of a field.
 pub(crate) fn is_field(path: &Path) -> bool {
     path.extension().is_some_and(|extension| extension == "safetensors")
 }
 
-/// The model in a file: a field where its name ends so, splats elsewhere; and whether it wants its opacities scaled.
+/// The model in a file: a field by its extension, otherwise splats; and whether its opacities require antialiasing.
 fn read_model(path: &Path) -> Result<(Model<'static>, bool), RunError> {
     if is_field(path) {
         let field = read_field(path)?;
@@ -114,14 +114,14 @@ fn read_model(path: &Path) -> Result<(Model<'static>, bool), RunError> {
     Ok((Model::Splats { splats, residual }, cloud.antialiased))
 }
 
-/// What adds to the colours of a run's `scene`, if anything does.
+/// The residual field beside `scene`, if there is one.
 pub(crate) fn residual_beside(scene: &Path) -> Result<Option<Field>, RunError> {
     let beside = scene.with_file_name(RESIDUAL);
     let is_there = scene.file_name().is_some_and(|name| name == SCENE) && beside.is_file();
     is_there.then(|| read_field(&beside)).transpose()
 }
 
-/// Background and antialiasing of the run that `scene` lies in; the defaults elsewhere.
+/// Background and antialiasing of the run that contains `scene`; otherwise the defaults.
 fn render_knobs_beside(scene: &Path) -> RenderKnobs {
     let fallback = RenderKnobs {
         background: [0.0; 3],

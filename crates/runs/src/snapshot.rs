@@ -1,4 +1,4 @@
-//! The newest state of a training, for other threads.
+//! The latest state of a training run, for other threads.
 
 use crate::Scene;
 use irradia_scene::{Camera, Dataset};
@@ -8,59 +8,59 @@ use irradia_train::{Recipe, Trainer};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 
-/// The state of a training between two steps.
+/// The state of a training run between two steps.
 #[derive(Clone)]
 pub struct Snapshot {
-    /// Steps made.
+    /// Steps completed.
     pub step: u64,
-    /// Steps the run will make, as far as is known.
+    /// Total number of steps, as far as known.
     pub total_steps: u64,
     /// Seconds of training.
     pub seconds: f64,
     /// Name of the stage.
     pub stage: String,
-    /// What is trained, as held-out views show it.
+    /// The trained scene, as used for evaluation.
     pub scene: Scene,
     /// The resolved recipe, shared by all snapshots of a run.
     pub recipe: Arc<Recipe>,
-    /// The data, shared with the training.
+    /// The dataset, shared with the training.
     pub dataset: Arc<Dataset>,
 }
 
 #[derive(Default)]
 struct State {
     newest: Option<Arc<Snapshot>>,
-    /// Whether the training loop runs, and answers.
+    /// Whether the training loop is running, and answers.
     running: bool,
-    /// Requests answered.
+    /// Number of requests answered.
     answers: u64,
 }
 
 #[derive(Default)]
 struct Shared {
-    /// Whether somebody waits; read between steps without a lock.
+    /// Whether a request is pending; read between steps without a lock.
     wanted: AtomicBool,
     state: Mutex<State>,
     answered: Condvar,
 }
 
 impl Shared {
-    /// The state is whole between any two statements, so that a panic elsewhere does not spoil it.
+    /// The state is consistent between any two statements, so that a panic elsewhere does not invalidate it.
     fn lock(&self) -> MutexGuard<'_, State> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
-/// Asks a running training for its newest state, from any thread. Handles are cheap to clone.
+/// Requests the latest state of a running training, from any thread. Handles are cheap to clone.
 ///
-/// The training answers between two steps and goes on; splats are copied only when they are asked for and a step was made
-/// since. Dataset, recipe and cameras are shared.
+/// The training answers between two steps and continues; splats are copied only on request and if a step has been made since
+/// the last copy. Dataset, recipe and cameras are shared.
 #[derive(Clone)]
 pub struct Snapshots(Arc<Shared>);
 
 impl Snapshots {
-    /// The newest state: waits for the end of the present step while the training runs. Before the training runs there is
-    /// none; afterwards it is the last one.
+    /// The latest state: waits for the end of the current step while the training runs. Before the training runs there is
+    /// none; afterwards it is the final one.
     pub fn newest(&self) -> Option<Arc<Snapshot>> {
         let mut state = self.0.lock();
         let before = state.answers;
@@ -73,12 +73,12 @@ impl Snapshots {
         state.newest.clone()
     }
 
-    /// Asks for the newest state without waiting for it: [`Snapshots::last`] has it after the present step.
+    /// Requests the latest state without waiting: [`Snapshots::last`] returns it after the current step.
     pub fn request(&self) {
         self.0.wanted.store(true, Ordering::Relaxed);
     }
 
-    /// The state that was asked for last, by any handle.
+    /// The state most recently requested by any handle.
     pub fn last(&self) -> Option<Arc<Snapshot>> {
         self.0.lock().newest.clone()
     }
@@ -87,7 +87,7 @@ impl Snapshots {
 /// The training's side of [`Snapshots`].
 pub(crate) struct SnapshotServer {
     shared: Arc<Shared>,
-    /// What all snapshots share, made at the first request.
+    /// Shared by all snapshots, created at the first request.
     common: Option<(Arc<Recipe>, Arc<[Camera]>)>,
 }
 
@@ -103,12 +103,12 @@ impl SnapshotServer {
         Snapshots(self.shared.clone())
     }
 
-    /// From now on requests are answered.
+    /// Starts answering requests.
     pub fn open(&self) {
         self.shared.lock().running = true;
     }
 
-    /// From now on the last state is the newest: it is kept where somebody may still ask.
+    /// Stops answering; the final state remains available if a handle exists.
     pub fn close(&mut self, trainer: &Trainer) {
         if Arc::strong_count(&self.shared) > 1 {
             self.publish(trainer);
@@ -171,7 +171,7 @@ impl Observer for SnapshotServer {
 }
 
 impl Drop for SnapshotServer {
-    /// Nobody waits for a training that is gone, by a panic perhaps.
+    /// Releases threads that wait for a training that has ended, by a panic perhaps.
     fn drop(&mut self) {
         self.stop();
     }

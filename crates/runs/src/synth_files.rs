@@ -1,5 +1,5 @@
-//! The demo scene on disk, in the layout of the Blender datasets (Mildenhall et al. 2020), with what only a made scene
-//! can have: true depth and normals, and points as structure from motion would leave them.
+//! The demo scene on disk, in the layout of the Blender datasets (Mildenhall et al. 2020), with additional ground truth: depth
+//! and normals, and points like those of structure from motion.
 //!
 //! ```text
 //! transforms_train.json  transforms_val.json  transforms_test.json
@@ -19,10 +19,10 @@ use serde_json::{Value, json};
 use std::path::Path;
 use std::{fmt, fs};
 
-/// World units of one step of the depth images: 16 bits reach 32.8 units, the backdrop's far side is at 25.
+/// World units per step of the depth images: 16 bits reach 32.8 units, the backdrop's far side is at 25.
 const DEPTH_SCALE: f32 = 0.0005;
 
-/// What was made.
+/// Summary of the dataset.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct SynthSummary {
     /// Training views.
@@ -50,11 +50,11 @@ impl fmt::Display for SynthSummary {
     }
 }
 
-/// Traces the demo scene and writes it under `out`, which is made where it is missing. Existing files of the same names
-/// are replaced; the `transforms_*.json` come last, so that a folder that has them is complete.
+/// Traces the demo scene and writes it under `out`, which is created if missing. Existing files of the same names are
+/// replaced; the `transforms_*.json` come last, so that a folder that contains them is complete.
 ///
 /// # Errors
-/// Sizes or counts that make no dataset; a file that cannot be written, by name.
+/// Invalid sizes or counts; a file that cannot be written, by name.
 pub fn write_synth_dataset(out: impl AsRef<Path>, options: &SynthOptions) -> Result<SynthSummary, RunError> {
     let out = out.as_ref();
     let capture = Capture::new(options)?;
@@ -63,7 +63,7 @@ pub fn write_synth_dataset(out: impl AsRef<Path>, options: &SynthOptions) -> Res
     for part in Part::ALL {
         for folder in ["", "depth", "normal"] {
             let folder = out.join(folder).join(part.name());
-            fs::create_dir_all(&folder).map_err(RunError::io("make", &folder))?;
+            fs::create_dir_all(&folder).map_err(RunError::io("create", &folder))?;
         }
     }
     for shot in capture.shots() {
@@ -151,12 +151,12 @@ mod tests {
     }
 
     #[test]
-    fn equal_seeds_write_equal_bytes_and_nothing_temporary_stays() {
+    fn equal_seeds_write_equal_bytes_and_no_temporary_files() {
         let (a, b) = (tempfile::tempdir().expect("dir"), tempfile::tempdir().expect("dir"));
         let summary = write_synth_dataset(a.path(), &SMALL).expect("writes");
         assert_eq!(write_synth_dataset(b.path(), &SMALL).expect("writes"), summary);
         let (first, second) = (all_files(a.path()), all_files(b.path()));
-        // Three images a view, three lists, the points.
+        // Three images per view, three lists, the points.
         assert_eq!(first.len() as u32, 3 * (summary.train + summary.val + summary.test) + 4);
         for ((path, bytes), (other, others)) in first.iter().zip(&second) {
             assert_eq!(path.strip_prefix(a.path()).ok(), other.strip_prefix(b.path()).ok());
@@ -166,7 +166,7 @@ mod tests {
     }
 
     #[test]
-    fn the_files_say_what_was_traced() {
+    fn the_files_contain_what_was_traced() {
         let dir = tempfile::tempdir().expect("dir");
         write_synth_dataset(dir.path(), &SMALL).expect("writes");
         let text = fs::read_to_string(dir.path().join("transforms_train.json")).expect("file");
@@ -179,7 +179,7 @@ mod tests {
         assert!((column(3) - camera.pose.position).length() < 1e-5);
         assert!(
             (column(2) + camera.pose.rotation * Vec3::Z).length() < 1e-5,
-            "z looks back"
+            "z points back"
         );
         assert!((column(1) + camera.pose.rotation * Vec3::Y).length() < 1e-5, "y is up");
 
@@ -200,7 +200,7 @@ mod tests {
     }
 
     #[test]
-    fn our_own_reader_finds_the_same_cameras_parts_and_points() {
+    fn our_own_reader_finds_the_same_cameras_splits_and_points() {
         let dir = tempfile::tempdir().expect("dir");
         let summary = write_synth_dataset(dir.path(), &SMALL).expect("writes");
         let dataset = irradia_formats::read_dataset(dir.path(), &Default::default()).expect("reads");
@@ -227,7 +227,7 @@ mod tests {
     }
 
     #[test]
-    fn senseless_options_are_refused_in_one_line() {
+    fn invalid_options_are_rejected_in_one_line() {
         for options in [SynthOptions { views: 0, ..SMALL }, SynthOptions { width: 0, ..SMALL }] {
             let error = write_synth_dataset("never-made", &options).expect_err("refused");
             assert!(error.to_string().contains("must be"), "{error}");

@@ -1,8 +1,8 @@
-//! Splats in training, as a step asks for them: the narrow interface behind which a device sits.
+//! Splats in training as a step accesses them: a narrow interface that a device can implement.
 //!
-//! A step never reads a splat, a footprint or a gradient by itself. It asks for a frame, for the surfaces in view, for the
-//! gradients of added colours: whole lists, which a device can compute where its data lies and hand over late or in bulk.
-//! What edits single splats (density control, first splats, files) takes the state with [`Engine::state_mut`], rarely.
+//! A step never reads single splats, footprints or gradients. It requests a frame, the surfaces in view, the gradients of added
+//! colours: whole lists, which a device can compute where its data resides and return late or in bulk. Code that edits single
+//! splats (density control, initialisation, files) takes the state with [`Engine::state_mut`], rarely.
 
 use crate::densify::mcmc;
 use crate::regularize::{self, Regularized, Regularizers};
@@ -10,21 +10,21 @@ use crate::render::{CameraGradient, FramePlanes, OutputGradient, RenderOptions, 
 use crate::{Optimizer, Rates, SplatState, Splats, Statistics, Surface};
 use irradia_scene::{Camera, sh};
 
-/// The state of splats in training with the renderer and the gradients of the last frame, on this machine's processor.
+/// The state of splats in training with the renderer and the gradients of the last frame, on the CPU.
 pub struct Engine {
     state: SplatState,
     renderer: Renderer,
     gradients: SplatGradients,
-    /// What the last frame showed in place of the state's splats.
+    /// The splats of the last frame, if they were not the state's.
     moved: Option<Splats>,
 }
 
-/// What a frame is taken of, and from where.
+/// The camera and the splats of a frame.
 #[derive(Clone, Debug)]
 pub struct Placement {
     /// The camera.
     pub camera: Camera,
-    /// The splats as they lie at this time in this view; as the state has them when `None`.
+    /// The splats at this time in this view; `None`: those of the state.
     pub moved: Option<Splats>,
 }
 
@@ -34,24 +34,24 @@ impl From<Camera> for Placement {
     }
 }
 
-/// What one update does with the gradients of the last backward pass.
+/// How one update uses the gradients of the last backward pass.
 #[derive(Clone, Copy, Debug)]
 pub struct Update {
-    /// Statistics of density control to add up.
+    /// Statistics of density control to accumulate.
     pub statistics: Option<Statistics>,
-    /// Losses of the splats themselves.
+    /// Weights of the regularisers.
     pub regularizers: Regularizers,
-    /// Of which splats they are a mean.
+    /// The splats over which regularisers are averaged.
     pub regularized: Regularized,
-    /// Their unit of length, world units.
+    /// Unit of length of the regularisers, world units.
     pub regularizer_unit: f32,
-    /// Fraction of the visible splats whose place and shape are trained, the largest first.
+    /// Fraction of the visible splats whose position and shape are trained, the largest first.
     pub trained_fraction: f32,
     /// Learning rates; that of the means in world units.
     pub rates: Rates,
     /// SH bands that are trained.
     pub sh_degree: u32,
-    /// What makes a step of gradients.
+    /// How gradients become steps.
     pub optimizer: Optimizer,
     /// Noise on the means of faint splats.
     pub noise: Option<Noise>,
@@ -71,7 +71,7 @@ pub struct Noise {
 }
 
 impl Engine {
-    /// Of `state`, with nothing rendered.
+    /// For `state`, with no frame rendered.
     pub fn new(state: SplatState) -> Self {
         Self {
             state,
@@ -81,7 +81,7 @@ impl Engine {
         }
     }
 
-    /// How many splats.
+    /// Number of splats.
     pub fn len(&self) -> usize {
         self.state.len()
     }
@@ -96,12 +96,12 @@ impl Engine {
         &self.state
     }
 
-    /// Likewise, to be edited or replaced between two steps.
+    /// Parameters, moments and statistics, to be edited or replaced between two steps.
     pub fn state_mut(&mut self) -> &mut SplatState {
         &mut self.state
     }
 
-    /// From the next frame on, convolves every splat with the 3D smoothing filter that the state holds, or with none.
+    /// From the next frame on, convolves every splat with the state's 3D smoothing filter, or with none.
     pub fn use_filter(&mut self, on: bool) {
         let filter = if on { self.state.filter.plane(0) } else { &[] };
         self.renderer.set_filter(filter);
@@ -115,7 +115,7 @@ impl Engine {
             .render(splats, &ViewParams::new(&placement.camera), options);
     }
 
-    /// The first half of a frame to whose colours something is added; [`Self::composite`] is the second.
+    /// The first half of a frame with added colours; [`Self::composite`] is the second.
     pub fn project(&mut self, placement: Placement, options: &RenderOptions) {
         self.moved = placement.moved;
         let splats = self.moved.as_ref().unwrap_or(&self.state.splats);
@@ -123,7 +123,7 @@ impl Engine {
             .project(splats, &ViewParams::new(&placement.camera), options);
     }
 
-    /// What the splats in view of the last [`Self::project`] stand for, in ascending order of splats.
+    /// The surfaces in view of the last [`Self::project`], in ascending order of splats.
     pub fn surfaces_in_view(&self) -> Vec<Surface> {
         self.rendered().surfaces(self.renderer.in_view())
     }
@@ -144,34 +144,34 @@ impl Engine {
         self.renderer.visible()
     }
 
-    /// Splat-pixel pairs that the last frame's blending visited. Counting walks all tiles: not for every step.
+    /// Splat-pixel pairs visited by blending in the last frame. Counting walks all tiles: not for every step.
     pub fn pairs(&self) -> u64 {
         self.renderer.pairs()
     }
 
-    /// Gradients of the last frame, which stay here until [`Self::update`].
+    /// Computes the gradients of the last frame, which stay here until [`Self::update`].
     pub fn backward(&mut self, v_out: &OutputGradient) {
         let splats = self.moved.as_ref().unwrap_or(&self.state.splats);
         self.renderer.backward(splats, v_out, &mut self.gradients);
     }
 
-    /// Splats whose gradient of the last backward pass was not finite.
+    /// Number of splats whose gradient was not finite in the last backward pass.
     pub fn non_finite(&self) -> usize {
         self.gradients.non_finite
     }
 
-    /// Gradient of the camera, where the last backward pass was asked for it.
+    /// Gradient of the camera, if the last backward pass was asked for it.
     pub fn camera_gradient(&self) -> Option<CameraGradient> {
         self.gradients.camera
     }
 
-    /// The splats' gradients of the last backward pass: for what moved the splats, to take back to where they were.
+    /// The splats' gradients of the last backward pass: for a socket that moved the splats, to propagate further back.
     pub fn gradients_mut(&mut self) -> &mut SplatGradients {
         &mut self.gradients
     }
 
-    /// The surfaces whose added colour has a gradient, with that gradient, in ascending order of splats. What hides behind
-    /// others has none, and is most of what is in view.
+    /// The surfaces whose added colour has a gradient, with that gradient, in ascending order of splats. Occluded surfaces, most of
+    /// those in view, have none.
     pub fn color_gradients(&self) -> (Vec<Surface>, Vec<[f32; 3]>) {
         let planes = [0, 1, 2].map(|c| self.gradients.splats.sh.plane(c));
         let v_of = |i: u32| planes.map(|plane| plane[i as usize] / sh::C0 as f32);
@@ -181,7 +181,7 @@ impl Engine {
         (self.rendered().surfaces(&seen), v_colors)
     }
 
-    /// Statistics, regularisers, Adam, noise and the cap on conditions, in this order, with the last gradients.
+    /// Applies statistics, regularisers, Adam, noise and the condition cap, in this order, with the last gradients.
     pub fn update(&mut self, update: &Update) {
         let (level, gradients) = (self.renderer.level, &mut self.gradients);
         if let (Some(statistics), Some([width, height])) = (update.statistics, self.renderer.size()) {
@@ -190,7 +190,7 @@ impl Engine {
             self.state
                 .gather_statistics(statistics, gradients, width, height, extent);
         }
-        // Without weights there is no gradient that splats out of view could have.
+        // With weights of zero, splats out of view have no gradient.
         let regularizers = (!update.regularizers.is_zero()).then_some(&update.regularizers);
         if let Some(weights) = regularizers {
             regularize::add_gradients(
@@ -203,7 +203,7 @@ impl Engine {
             );
         }
         if update.trained_fraction < 1.0 {
-            regularize::rest_small(&self.state.splats, update.trained_fraction, gradients);
+            regularize::freeze_small(&self.state.splats, update.trained_fraction, gradients);
         }
         let regularized = regularizers.map_or(Regularized::Visible, |_| update.regularized);
         self.state.step(
@@ -222,7 +222,7 @@ impl Engine {
         }
     }
 
-    /// What the last frame showed.
+    /// The splats of the last frame.
     fn rendered(&self) -> &Splats {
         self.moved.as_ref().unwrap_or(&self.state.splats)
     }

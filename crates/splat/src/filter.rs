@@ -1,16 +1,16 @@
-//! The 3D smoothing filter of Mip-Splatting (Yu et al. 2024, section 5.1): no splat is finer than what the training views
-//! can have sampled, so that nothing breaks up when a camera comes nearer than any of them.
+//! The 3D smoothing filter of Mip-Splatting (Yu et al. 2024, section 5.1): no splat is finer than the training views'
+//! sampling rate, so that closer cameras show no erosion artefacts.
 
 use crate::{SplatState, Splats, ViewParams, logit, sigmoid};
 use rayon::prelude::*;
 
 /// Variance of the filter in units of the squared sampling interval (`s` in eq. 7; 0.2 in the paper).
 const VARIANCE: f64 = 0.2;
-/// A view counts where a centre falls within its image widened by this share on each side (the authors' code).
+/// A view is included where a centre falls within its image extended by this fraction on each side (the authors' code).
 const MARGIN: f64 = 0.15;
 
-/// Sets `state.filter` from the highest rate, focal length over depth, at which any of `views` samples each splat. What no
-/// view sees gets the coarsest filter there is.
+/// Sets `state.filter` from the highest sampling rate, focal length over depth, of each splat over `views`. Splats outside all
+/// views get the coarsest filter of the others.
 pub fn update(state: &mut SplatState, views: &[ViewParams]) {
     let n = state.len();
     let means = &state.splats.means;
@@ -33,7 +33,7 @@ pub fn update(state: &mut SplatState, views: &[ViewParams]) {
     }
 }
 
-/// Samples a world unit at `mean`, where `view` sees it.
+/// Samples per world unit at `mean`, if `view` sees it.
 fn rate(view: &ViewParams, mean: [f64; 3]) -> Option<f64> {
     let x: [f64; 3] =
         std::array::from_fn(|i| (0..3).map(|j| view.rotation[i][j] * mean[j]).sum::<f64>() + view.translation[i]);
@@ -46,7 +46,7 @@ fn rate(view: &ViewParams, mean: [f64; 3]) -> Option<f64> {
     inside.then(|| view.focal[0].max(view.focal[1]) / x[2])
 }
 
-/// The splats with their filter made part of them: what to write into a file that knows of no filter.
+/// The splats with the filter baked in, for files without a filter.
 pub fn baked(state: &SplatState) -> Splats {
     let mut splats = state.splats.clone();
     for i in 0..splats.len() {
@@ -85,7 +85,7 @@ mod tests {
     }
 
     #[test]
-    fn the_nearest_view_decides_and_a_baked_scene_looks_the_same() {
+    fn the_nearest_view_decides_and_a_baked_scene_renders_the_same() {
         let mut splats = Splats::zeros(2, 0);
         for (i, x) in [0.0f32, 50.0].into_iter().enumerate() {
             splats.means.set(0, i, x);

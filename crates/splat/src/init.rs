@@ -1,4 +1,4 @@
-//! Where the first splats stand: on points that structure from motion found, or at random in what the cameras see.
+//! Initial splats: on points from structure from motion, or at random in the cameras' frusta.
 
 use crate::nearest::Nearest;
 use crate::{Splats, logit};
@@ -6,18 +6,18 @@ use glam::{Vec2, Vec3};
 use irradia_scene::{Camera, GaussianCloud, PointCloud, Rng, sh};
 use rayon::prelude::*;
 
-/// Knobs of the first cloud.
+/// Options of the initial splats.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct InitOptions {
     /// Opacity of every splat; 0.1 in 3DGS.
     pub opacity: f32,
-    /// Factor on the neighbour distance; 1 in 3DGS.
+    /// Factor on the neighbour distance, which is the initial size; 1 in 3DGS.
     pub scale: f32,
-    /// Room for SH of this degree.
+    /// SH degree for which there is room.
     pub sh_degree: u32,
 }
 
-/// One round splat on each point, as large as the root mean square distance to its three nearest neighbours (Inria code).
+/// One isotropic splat per point, its size the root mean square distance to the three nearest neighbours (Inria code).
 pub fn from_points(points: &PointCloud, options: &InitOptions) -> Splats {
     let kept: Vec<usize> = (0..points.len()).filter(|i| points.positions[*i].is_finite()).collect();
     let positions: Vec<[f32; 3]> = kept.iter().map(|i| points.positions[*i].to_array()).collect();
@@ -41,7 +41,7 @@ pub fn from_points(points: &PointCloud, options: &InitOptions) -> Splats {
     })
 }
 
-/// Root mean square distance to the three nearest neighbours, at least 1e-7 of the cloud's size, for it is put into a logarithm.
+/// Root mean square distance to the three nearest neighbours, at least 1e-7 of the cloud's size, since its logarithm is taken.
 fn neighbour_distances(positions: &[[f32; 3]]) -> Vec<f32> {
     let size = (0..3)
         .map(|c| {
@@ -67,32 +67,32 @@ fn neighbour_distances(positions: &[[f32; 3]]) -> Vec<f32> {
         .collect()
 }
 
-/// What a photograph shows in a pixel.
+/// The content of a photograph's pixel.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Look {
-    /// This colour, sRGB.
+pub enum PixelClass {
+    /// A colour, sRGB.
     Color([u8; 3]),
-    /// Nothing: it is transparent there.
+    /// Transparent.
     Empty,
-    /// Something that is not to be trained on.
+    /// Masked: excluded from training.
     Masked,
 }
 
-/// At most `count` points in the space that the cameras see, for scenes that come without any. `depth_bounds[i]` says how
-/// near and far view i's scene lies, where that is known; otherwise it is taken around the point that the cameras look at.
+/// At most `count` points in the cameras' frusta, for scenes without points. `depth_bounds[i]` holds the nearest and farthest
+/// depth of view i's scene, where known; otherwise depths are taken around the point that the cameras focus on.
 ///
-/// Points are drawn along random pixels' rays, uniformly in inverse depth, and kept with a probability that grows with
-/// the share of cameras that see them, so that they gather where views overlap. `look(view, pixel)` says what is there.
-/// A point that any camera sees through is outside the visual hull of what is shown (Laurentini 1994) and is not kept;
-/// nor is one that more cameras have masked than not, for nothing would ever clear it away. A point's colour is the mean
-/// over the cameras that see it: right where it lies on a surface, and never so dark elsewhere that the clamp of negative
-/// colours keeps it from learning.
+/// Points are drawn along rays of random pixels, uniformly in inverse depth, and kept with a probability that grows with the
+/// fraction of cameras that see them, so that they concentrate where views overlap. `classify(view, pixel)` gives the pixel's
+/// content. A point that is transparent in any camera is outside the visual hull (Laurentini 1994) and is discarded; so is one
+/// that is masked in more cameras than not, since training would never remove it. A point's colour is the mean over the
+/// cameras that see it: correct if it lies on a surface, and elsewhere never so dark that the clamp of negative colours
+/// prevents it from learning.
 pub fn random_points(
     cameras: &[Camera],
     depth_bounds: &[Option<[f32; 2]>],
     count: usize,
     rng: &mut Rng,
-    look: impl Fn(usize, Vec2) -> Look,
+    classify: impl Fn(usize, Vec2) -> PixelClass,
 ) -> PointCloud {
     let mut cloud = PointCloud::default();
     let focus = focus_point(cameras);
@@ -112,10 +112,10 @@ pub fn random_points(
         let ray = camera.pose.rotation * Vec3::new((pixel.x - k.cx) / k.fx, (pixel.y - k.cy) / k.fy, 1.0);
         let point = camera.pose.position + ray / inverse;
         let chance = rng.uniform();
-        let Some((seen, color)) = mean_color(cameras, point, &look) else {
+        let Some((seen, color)) = mean_color(cameras, point, &classify) else {
             continue;
         };
-        // Late attempts take what comes: a scene whose cameras share little must still get its points.
+        // Late attempts accept any point: a scene whose cameras overlap little must still get its points.
         if chance < seen as f32 / cameras.len() as f32 || attempt > count * 15 {
             cloud.positions.push(point);
             cloud.colors.push(color);
@@ -124,18 +124,22 @@ pub fn random_points(
     cloud
 }
 
-/// How many cameras see `point`, and its mean colour in them; `None` where it cannot be part of the scene.
-fn mean_color(cameras: &[Camera], point: Vec3, look: &impl Fn(usize, Vec2) -> Look) -> Option<(u32, [u8; 3])> {
+/// Number of cameras that see `point`, and its mean colour in them; `None` if it cannot be part of the scene.
+fn mean_color(
+    cameras: &[Camera],
+    point: Vec3,
+    classify: &impl Fn(usize, Vec2) -> PixelClass,
+) -> Option<(u32, [u8; 3])> {
     let (mut seen, mut masked, mut sum) = (0u32, 0u32, [0u32; 3]);
     for (view, camera) in cameras.iter().enumerate() {
         if let Some(pixel) = sees(camera, point) {
-            match look(view, pixel) {
-                Look::Color(color) => {
+            match classify(view, pixel) {
+                PixelClass::Color(color) => {
                     seen += 1;
                     (0..3).for_each(|c| sum[c] += u32::from(color[c]));
                 }
-                Look::Masked => masked += 1,
-                Look::Empty => return None,
+                PixelClass::Masked => masked += 1,
+                PixelClass::Empty => return None,
             }
         }
     }
@@ -145,15 +149,15 @@ fn mean_color(cameras: &[Camera], point: Vec3, look: &impl Fn(usize, Vec2) -> Lo
     Some((seen, sum.map(|s| (s / seen.max(1)) as u8)))
 }
 
-/// The pixel in which `camera` sees `point`.
+/// The pixel onto which `camera` projects `point`, if inside the image.
 fn sees(camera: &Camera, point: Vec3) -> Option<Vec2> {
     let k = &camera.intrinsics;
     let (p, _) = camera.project(point)?;
     (p.x >= 0.0 && p.y >= 0.0 && p.x < k.width as f32 && p.y < k.height as f32).then_some(p)
 }
 
-/// The point nearest to all optical axes, in the least-squares sense, pulled in front of the cameras when they look in
-/// parallel (forward-facing captures), where it would lie at infinity.
+/// The point nearest to all optical axes, in the least-squares sense, moved in front of the cameras if the axes are parallel
+/// (forward-facing captures), where it would be at infinity.
 pub fn focus_point(cameras: &[Camera]) -> Vec3 {
     let n = cameras.len().max(1) as f32;
     let center = cameras.iter().map(|c| c.pose.position).sum::<Vec3>() / n;
@@ -171,7 +175,7 @@ pub fn focus_point(cameras: &[Camera]) -> Vec3 {
     normal.inverse() * right
 }
 
-/// The scene's size as 3DGS measures it: 1.1 times the largest distance of a camera from the cameras' mean.
+/// The scene's extent as 3DGS measures it: 1.1 times the largest distance of a camera from the cameras' mean.
 pub fn camera_extent(cameras: &[Camera]) -> f32 {
     let center = cameras.iter().map(|c| c.pose.position).sum::<Vec3>() / cameras.len().max(1) as f32;
     let radius = cameras
@@ -193,7 +197,7 @@ mod tests {
     };
 
     #[test]
-    fn a_grid_gives_its_spacing_as_scale_and_its_colour_as_dc() {
+    fn a_grid_gets_its_spacing_as_scale_and_its_colour_as_dc() {
         let mut points = PointCloud::default();
         for i in 0..4 {
             for j in 0..4 {
@@ -213,7 +217,7 @@ mod tests {
     }
 
     #[test]
-    fn equal_points_one_point_and_poison_give_finite_scales() {
+    fn coincident_points_one_point_and_poison_give_finite_scales() {
         let same = |n: usize| PointCloud {
             positions: vec![Vec3::ONE; n],
             colors: vec![[9; 3]; n],
@@ -229,7 +233,7 @@ mod tests {
     }
 
     #[test]
-    fn a_ring_of_cameras_focuses_on_its_middle_and_points_fall_where_they_look() {
+    fn a_ring_of_cameras_focuses_on_its_centre_and_points_lie_in_view() {
         let target = Vec3::new(1.0, 2.0, 0.5);
         let cameras: Vec<Camera> = (0..12)
             .map(|i| {
@@ -240,13 +244,13 @@ mod tests {
             .collect();
         assert!(focus_point(&cameras).distance(target) < 0.02);
         let cloud = random_points(&cameras, &[], 500, &mut Rng::new(1, 0), |view, _| {
-            Look::Color([view as u8; 3])
+            PixelClass::Color([view as u8; 3])
         });
         assert_eq!(cloud.len(), 500);
         let mean = cloud.positions.iter().sum::<Vec3>() / 500.0;
         assert!(mean.distance(target) < 0.5, "{mean}");
-        assert!(random_points(&[], &[], 10, &mut Rng::new(1, 0), |_, _| Look::Color([0; 3])).is_empty());
-        for nothing in [Look::Empty, Look::Masked] {
+        assert!(random_points(&[], &[], 10, &mut Rng::new(1, 0), |_, _| PixelClass::Color([0; 3])).is_empty());
+        for nothing in [PixelClass::Empty, PixelClass::Masked] {
             assert!(random_points(&cameras, &[], 10, &mut Rng::new(1, 0), |_, _| nothing).is_empty());
         }
     }

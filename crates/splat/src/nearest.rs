@@ -1,9 +1,9 @@
-//! Exact nearest neighbours of points in space: a k-d tree (Bentley 1975) that is nothing but an order of the points.
+//! Exact nearest neighbours of points in space: an implicit k-d tree (Bentley 1975), stored as an order of the points.
 
-/// Points at which a part is searched one by one.
+/// Number of points up to which a subtree is searched linearly.
 const LEAF: usize = 12;
 
-/// Points `[N, 3]`, all finite, in the order of a balanced k-d tree: the middle of every part parts the rest along one axis.
+/// Points `[N, 3]`, all finite, in the order of a balanced k-d tree: the median of each subtree splits the rest along one axis.
 pub(crate) struct Nearest {
     points: Vec<([f32; 3], u32)>,
 }
@@ -18,8 +18,8 @@ impl Nearest {
         Self { points }
     }
 
-    /// The K points nearest to `at`, which may be one of them, by distance; of points at equal distances any. Where there are
-    /// fewer than K, the rest is at an infinite distance.
+    /// The K points nearest to `at`, which may be one of them, by distance; ties are broken arbitrarily. If there are fewer than
+    /// K points, the rest are at an infinite distance.
     pub(crate) fn of<const K: usize>(&self, at: [f32; 3]) -> [Neighbour; K] {
         let mut best = [(f32::INFINITY, u32::MAX); K];
         search(&self.points, 0, at, &mut best);
@@ -52,8 +52,8 @@ fn search<const K: usize>(points: &[([f32; 3], u32)], axis: usize, at: [f32; 3],
     let axis = (axis + 1) % 3;
     search(same, axis, at, best);
     insert(&points[middle], at, best);
-    // Rounding is monotone: no point beyond the plane has a smaller squared distance, in f32, than this. Points at an equal one
-    // are not searched for, or many at the same place would each visit all.
+    // Rounding is monotone: no point beyond the plane has a smaller squared distance, in f32, than this. Points at an equal
+    // distance are not searched, otherwise queries on many coincident points would each visit all of them.
     if apart * apart < best[K - 1].0 {
         search(other, axis, at, best);
     }
@@ -82,9 +82,9 @@ mod tests {
     }
 
     #[test]
-    fn the_nearest_are_those_of_a_search_through_all() {
+    fn neighbours_match_an_exhaustive_search() {
         let mut rng = Rng::new(5, 0);
-        // A cloud, a plane, a line with many at the same place, a grid of equal distances, and far coordinates.
+        // A cloud, a plane, a line with many coincident points, a grid of equal distances, and distant coordinates.
         type Make<'a> = &'a dyn Fn(&mut Rng, usize) -> [f32; 3];
         let kinds: [Make; 5] = [
             &|rng, _| std::array::from_fn(|_| rng.normal()),

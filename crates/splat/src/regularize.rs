@@ -1,6 +1,6 @@
-//! Losses of the splats themselves, whatever they look like, and their gradients.
+//! Regularisers on splat parameters, independent of the image, and their gradients.
 //!
-//! Symbols: `o` opacity, `s` standard deviations in a unit of length, each a mean over the splats that the frame saw or over
+//! Symbols: `o` opacity, `s` standard deviations in a unit of length, each averaged over the splats visible in the frame or over
 //! all: `opacity o + opacity_square o^2 + scale mean(s) + covariance |Sigma|_F^2`. The first and third are those of 3DGS-MCMC
 //! (Kheradmand et al. 2024, eq. 10), the others CurriculumGS's (`|Sigma|_F^2` is the sum of `s^4`).
 
@@ -8,39 +8,39 @@ use crate::{SplatGradients, Splats};
 use irradia_compute::simd::{Kernel, Lanes, Level, Mask, Simd};
 use irradia_compute::unroll;
 
-/// Weights of the parts.
+/// Weights of the terms.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Regularizers {
-    /// Of the opacity.
+    /// Weight of the opacity.
     pub opacity: f32,
-    /// Of its square.
+    /// Weight of the squared opacity.
     pub opacity_square: f32,
-    /// Of the mean standard deviation.
+    /// Weight of the mean standard deviation.
     pub scale: f32,
-    /// Of the squared Frobenius norm of the covariance.
+    /// Weight of the squared Frobenius norm of the covariance.
     pub covariance: f32,
 }
 
 impl Regularizers {
-    /// Whether there is anything to do.
+    /// Whether all weights are zero.
     pub fn is_zero(&self) -> bool {
         *self == Self::default()
     }
 }
 
-/// Of which splats the parts are a mean.
+/// The splats over which the terms are averaged.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Regularized {
-    /// Those that the frame saw.
+    /// Those visible in the frame.
     #[default]
     Visible,
-    /// All: those that it did not see have these gradients alone (3DGS-MCMC).
+    /// All; for splats that are not visible these are the only gradients (3DGS-MCMC).
     All,
 }
 
-/// Adds the gradients to `gradients`. `unit` is that of length, world units. Of splats that the frame did
-/// not see, [`Regularized::All`] writes the gradients of ln scales and opacity logits, which were unspecified; the other
-/// columns stay so, and the splats inactive.
+/// Adds the gradients to `gradients`. `unit` is the unit of length, world units. For splats that are not visible,
+/// [`Regularized::All`] writes the gradients of ln scales and opacity logits, which were unspecified; the other columns remain
+/// unspecified, and the splats inactive.
 pub fn add_gradients(
     level: Level,
     splats: &Splats,
@@ -61,7 +61,7 @@ pub fn add_gradients(
         weights,
         of,
         unit,
-        share: 1.0 / counted as f64,
+        per_splat: 1.0 / counted as f64,
         gradients,
     });
 }
@@ -71,7 +71,7 @@ struct AddGradients<'a> {
     weights: &'a Regularizers,
     of: Regularized,
     unit: f32,
-    share: f64,
+    per_splat: f64,
     gradients: &'a mut SplatGradients,
 }
 
@@ -83,7 +83,7 @@ impl Kernel for AddGradients<'_> {
     where
         S::F: Lanes<Scalar = f32>,
     {
-        let weights = WeightLanes::new(simd, self.weights, f64::from(self.unit), self.share);
+        let weights = WeightLanes::new(simd, self.weights, f64::from(self.unit), self.per_splat);
         let zero = simd.splat(0.0);
         let all = self.of == Regularized::All;
         for at in (0..self.splats.len()).step_by(S::LANES) {
@@ -113,17 +113,17 @@ struct WeightLanes<F> {
 
 impl<F: Lanes> WeightLanes<F> {
     #[inline(always)]
-    fn new<S: Simd<F = F>>(simd: S, weights: &Regularizers, unit: f64, share: f64) -> Self {
+    fn new<S: Simd<F = F>>(simd: S, weights: &Regularizers, unit: f64, per_splat: f64) -> Self {
         Self {
-            opacity: simd.splat(f64::from(weights.opacity) * share),
-            opacity_square: simd.splat(f64::from(weights.opacity_square) * share),
-            scale: simd.splat(f64::from(weights.scale) * share / (3.0 * unit)),
-            covariance: simd.splat(f64::from(weights.covariance) * share / unit.powi(4)),
+            opacity: simd.splat(f64::from(weights.opacity) * per_splat),
+            opacity_square: simd.splat(f64::from(weights.opacity_square) * per_splat),
+            scale: simd.splat(f64::from(weights.scale) * per_splat / (3.0 * unit)),
+            covariance: simd.splat(f64::from(weights.covariance) * per_splat / unit.powi(4)),
         }
     }
 }
 
-/// One splat's part of the loss and its gradients.
+/// One splat's term of the loss and its gradients.
 #[inline(always)]
 fn regularizer<F: Lanes>(w: &WeightLanes<F>, log_scale: [F; 3], logit: F) -> (F, [F; 3], F) {
     let one = logit.splat(1.0);
@@ -153,25 +153,25 @@ pub fn cap_condition(splats: &mut Splats, limit: f32) {
     }
 }
 
-/// Holds place and shape of all but the `share` of the visible splats that are largest. Their opacity and colour go on: what
-/// floats before the cameras must be able to fade (fern without points, 800 steps: 23.9 dB when all of it rested).
-pub fn rest_small(splats: &Splats, share: f32, gradients: &mut SplatGradients) {
+/// Freezes position and shape of all but the largest `fraction` of the visible splats. Their opacity and colour are still
+/// trained: floaters in front of the cameras must be able to fade (fern without points, 800 steps: 23.9 dB with everything frozen).
+pub fn freeze_small(splats: &Splats, fraction: f32, gradients: &mut SplatGradients) {
     let size = |i: usize| (0..3).map(|c| splats.log_scales.get(c, i)).fold(f32::MIN, f32::max);
     let mut sizes: Vec<f32> = (0..splats.len())
         .filter(|i| gradients.active[*i] != 0.0)
         .map(size)
         .collect();
-    let rests = ((1.0 - share) * sizes.len() as f32).round() as usize;
-    if rests == 0 || sizes.is_empty() {
+    let frozen = ((1.0 - fraction) * sizes.len() as f32).round() as usize;
+    if frozen == 0 || sizes.is_empty() {
         return;
     }
-    let at = rests.min(sizes.len() - 1);
+    let at = frozen.min(sizes.len() - 1);
     let limit = *sizes.select_nth_unstable_by(at, f32::total_cmp).1;
-    let held: Vec<usize> = (0..splats.len()).filter(|i| size(*i) < limit).collect();
+    let small: Vec<usize> = (0..splats.len()).filter(|i| size(*i) < limit).collect();
     let shape = &mut gradients.splats;
     for column in [&mut shape.means, &mut shape.quats, &mut shape.log_scales] {
         for c in 0..column.count() {
-            held.iter().for_each(|i| column.set(c, *i, 0.0));
+            small.iter().for_each(|i| column.set(c, *i, 0.0));
         }
     }
 }
@@ -184,7 +184,7 @@ mod tests {
     use irradia_testkit::differences::Differences;
 
     #[test]
-    fn finite_differences_hold_the_gradients() {
+    fn gradients_match_finite_differences() {
         let mut rng = Rng::new(8, 8);
         for weights in [
             [1.0, 0.0, 0.0, 0.0],
@@ -204,7 +204,7 @@ mod tests {
             let x: [f64; 4] = std::array::from_fn(|_| f64::from(rng.range(-2.0, 1.0)));
             let (_, v_log_scale, v_logit) = regularizer(&w, [x[0], x[1], x[2]], x[3]);
             let gradient = [v_log_scale[0], v_log_scale[1], v_log_scale[2], v_logit];
-            // Of values near 1: 1e-10 of curvature, 1e-11 of rounding.
+            // For values near 1: 1e-10 of curvature, 1e-11 of rounding.
             let differences = Differences {
                 absolute: 1e-8,
                 ..Differences::of_largest(1e-5, 0.0)
@@ -215,7 +215,7 @@ mod tests {
     }
 
     #[test]
-    fn splats_that_the_frame_did_not_see_are_regularised_only_where_all_are() {
+    fn invisible_splats_are_regularised_only_with_all() {
         let weights = Regularizers {
             opacity: 1.0,
             scale: 3.0,
@@ -230,7 +230,7 @@ mod tests {
                     active: vec![0.0; splats.stride()],
                     ..Default::default()
                 };
-                // What was not seen holds whatever an earlier frame left.
+                // Invisible splats hold the values of an earlier frame.
                 gradients.splats.log_scales.as_mut_slice().fill(f32::NAN);
                 gradients.splats.opacity_logits.as_mut_slice().fill(f32::NAN);
                 for i in (0..n).step_by(3) {
@@ -240,7 +240,7 @@ mod tests {
                 }
                 add_gradients(level, &splats, &weights, of, 2.0, &mut gradients);
                 for i in (0..n).filter(|i| i % 3 == 0 || of == Regularized::All) {
-                    // Opacity 1/2, whose slope is 1/4; s = 1, in units of 2 and by 3 axes: 1/2.
+                    // Opacity 1/2, whose slope is 1/4; s = 1, in units of 2 and over 3 axes: 1/2.
                     let own = if i % 3 == 0 { 0.5 } else { 0.0 };
                     let (logit, log_scale) = (own + 0.25 / counted, own + 0.5 / counted);
                     assert!(
@@ -249,14 +249,14 @@ mod tests {
                     );
                     let got = gradients.splats.log_scales.get(1, i);
                     assert!((got - log_scale).abs() < 1e-6, "{of:?} {i}: {got}");
-                    assert_eq!(gradients.active[i] != 0.0, i % 3 == 0, "seen or not, as before");
+                    assert_eq!(gradients.active[i] != 0.0, i % 3 == 0, "visibility is unchanged");
                 }
             }
         }
     }
 
     #[test]
-    fn the_condition_number_is_capped_from_below() {
+    fn the_condition_number_is_capped() {
         let mut splats = Splats::zeros(1, 0);
         splats.log_scales.set(0, 0, -9.0);
         cap_condition(&mut splats, 100.0);
@@ -266,7 +266,7 @@ mod tests {
     }
 
     #[test]
-    fn the_small_hold_their_shape_and_go_on_fading() {
+    fn small_splats_keep_their_shape_and_still_fade() {
         let mut splats = Splats::zeros(10, 0);
         for i in 0..10 {
             splats.log_scales.set(1, i, i as f32);
@@ -281,9 +281,9 @@ mod tests {
             gradients.splats.opacity_logits.set(0, i, 1.0);
         }
         gradients.active[9] = 0.0;
-        rest_small(&splats, 1.0 / 3.0, &mut gradients);
+        freeze_small(&splats, 1.0 / 3.0, &mut gradients);
         let moved: Vec<usize> = (0..9).filter(|i| gradients.splats.means.get(2, *i) != 0.0).collect();
-        assert_eq!(moved, [6, 7, 8], "a third of the nine that are visible");
+        assert_eq!(moved, [6, 7, 8], "a third of the nine visible ones");
         assert!((0..10).all(|i| gradients.splats.opacity_logits.get(0, i) == 1.0));
     }
 }

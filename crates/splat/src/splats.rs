@@ -2,17 +2,17 @@ use glam::{Quat, Vec3};
 use irradia_compute::Planes;
 use irradia_scene::{GaussianCloud, sh};
 
-/// The piece of surface that a splat stands for.
+/// The surface element that a splat represents.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Surface {
     /// The splat's mean, world.
     pub mean: [f32; 3],
-    /// Its shortest axis, unit length, world; of either sign.
+    /// Its shortest axis, unit length, world; of arbitrary sign.
     pub normal: [f32; 3],
 }
 
-/// 3D Gaussians where they are trained: five planar columns of the same N. Gradients, both Adam moments and nothing else
-/// have this shape too, so that keeping, sorting and appending are written once.
+/// 3D Gaussians during training: five planar columns of the same N. Gradients and both Adam moments have this shape, too, so
+/// that gather, sort and append are written once.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Splats {
     /// Centres, 3 planes `[N]`, world.
@@ -42,7 +42,7 @@ impl Splats {
         }
     }
 
-    /// From the host's columns. Bands above [`sh::MAX_DEGREE`] are dropped.
+    /// From a point cloud of Gaussians. Bands above [`sh::MAX_DEGREE`] are dropped.
     pub fn from_cloud(cloud: &GaussianCloud) -> Self {
         let per_item = 3 * cloud.sh_coefficients();
         let kept = 3 * sh::coefficients(cloud.sh_degree.min(sh::MAX_DEGREE));
@@ -66,7 +66,7 @@ impl Splats {
         }
     }
 
-    /// To the host's columns, bit for bit.
+    /// To a cloud of Gaussians, bit for bit.
     pub fn to_cloud(&self) -> GaussianCloud {
         GaussianCloud {
             means: self.means.to_interleaved().as_chunks().0.to_vec(),
@@ -79,7 +79,7 @@ impl Splats {
         }
     }
 
-    /// How many.
+    /// Number of splats.
     pub fn len(&self) -> usize {
         self.means.len()
     }
@@ -94,7 +94,7 @@ impl Splats {
         self.means.stride()
     }
 
-    /// Highest SH degree there is room for.
+    /// Highest SH degree that fits.
     pub fn sh_degree(&self) -> u32 {
         (0..=sh::MAX_DEGREE)
             .find(|d| 3 * sh::coefficients(*d) == self.sh.count())
@@ -112,7 +112,7 @@ impl Splats {
         ]
     }
 
-    /// The five columns, to be written.
+    /// The five columns, mutable.
     pub fn columns_mut(&mut self) -> [&mut Planes; 5] {
         [
             &mut self.means,
@@ -135,7 +135,7 @@ impl Splats {
         }
     }
 
-    /// Adds `other` behind these.
+    /// Appends `other`.
     pub fn append(&mut self, other: &Self) {
         for (to, from) in self.columns_mut().into_iter().zip(other.columns()) {
             to.append(from);
@@ -147,16 +147,16 @@ impl Splats {
         std::array::from_fn(|c| self.means.plane(c)[i])
     }
 
-    /// The unit axis along which splat `i` is thinnest, in the world: of flat ones the normal, of either sign.
+    /// The unit axis along which splat `i` is thinnest, world: for flat splats the normal, of arbitrary sign.
     pub fn shortest_axis(&self, i: usize) -> [f32; 3] {
         let [w, x, y, z] = std::array::from_fn(|c| self.quats.plane(c)[i]);
         let scale = |axis: &usize| self.log_scales.plane(*axis)[i];
         let thinnest = (0..3).min_by(|a, b| scale(a).total_cmp(&scale(b))).unwrap_or(0);
-        let turned = Quat::from_xyzw(x, y, z, w) * Vec3::AXES[thinnest];
-        turned.normalize_or(Vec3::Z).to_array()
+        let normal = Quat::from_xyzw(x, y, z, w) * Vec3::AXES[thinnest];
+        normal.normalize_or(Vec3::Z).to_array()
     }
 
-    /// What the splats `indices` stand for, in that order.
+    /// The surface elements of the splats `indices`, in that order.
     pub fn surfaces(&self, indices: &[u32]) -> Vec<Surface> {
         let surface = |i: &u32| Surface {
             mean: self.mean(*i as usize),
@@ -165,7 +165,7 @@ impl Splats {
         indices.iter().map(surface).collect()
     }
 
-    /// Bytes held.
+    /// Allocated bytes.
     pub fn bytes(&self) -> usize {
         self.columns().iter().map(|c| c.bytes()).sum()
     }

@@ -5,37 +5,37 @@ use irradia_compute::adam::{Active, AdamStep, adam};
 use irradia_compute::simd::Level;
 use rayon::prelude::*;
 
-/// Splats being trained, with everything that must stay in step with them.
+/// Splats in training, with all per-splat arrays that must stay consistent with them.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct SplatState {
     /// The parameters.
     pub splats: Splats,
     /// Adam's first and second moments.
     pub moments: [Splats; 2],
-    /// What density control has gathered since it last acted: planes [`SplatState::GRADIENT`], [`SplatState::SEEN`],
+    /// Statistics accumulated since the last round of density control: planes [`SplatState::GRADIENT`], [`SplatState::SEEN`],
     /// [`SplatState::EXTENT`], [`SplatState::ERROR`], [`SplatState::WEIGHT`].
     pub statistics: Planes,
     /// Variance of each splat's 3D smoothing filter, world units squared, 1 plane; zeros where the recipe has no filter.
     pub filter: Planes,
 }
 
-/// What [`SplatState::gather_statistics`] is to add up.
+/// What [`SplatState::gather_statistics`] accumulates.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Statistics {
     /// The norm of the screen gradient (3DGS).
     Gradient,
-    /// The norm of the screen gradient whose fragments were taken absolutely (AbsGS).
+    /// The norm of the screen gradient with absolute values summed over fragments (AbsGS).
     AbsoluteGradient,
-    /// The norm of the screen gradient, the error shown and the weight.
+    /// The norm of the screen gradient, the error and the blending weight.
     Error,
 }
 
-/// Adam in one step.
+/// Adam's options in one step.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Optimizer {
     /// Its constants.
     pub step: AdamStep,
-    /// Splats without a gradient, those out of view first of all, step with a gradient of zero (3DGS); otherwise they keep
+    /// Whether splats without a gradient, such as those out of view, step with a gradient of zero (3DGS); otherwise they keep
     /// parameters and moments.
     pub dense: bool,
 }
@@ -43,7 +43,7 @@ pub struct Optimizer {
 /// Learning rates of one step.
 #[derive(Clone, Copy, Debug, PartialEq, Default)]
 pub struct Rates {
-    /// Of the means, world units a step.
+    /// Of the means, world units per step.
     pub means: f32,
     /// Of the raw quaternions.
     pub quats: f32,
@@ -51,7 +51,7 @@ pub struct Rates {
     pub log_scales: f32,
     /// Of the opacity logits.
     pub opacities: f32,
-    /// Of the SH's DC coefficients.
+    /// Of the SH DC coefficients.
     pub sh_dc: f32,
     /// Of the other SH coefficients.
     pub sh_rest: f32,
@@ -64,14 +64,14 @@ impl SplatState {
     pub const SEEN: usize = 1;
     /// Statistics plane: largest half size on screen, pixels.
     pub const EXTENT: usize = 2;
-    /// Statistics plane: sum over frames of the error that the splat showed, pixels times the error's unit.
+    /// Statistics plane: sum over frames of the error in the pixels that the splat covers, pixels times the error's unit.
     pub const ERROR: usize = 3;
     /// Statistics plane: sum over frames of its blending weights, pixels.
     pub const WEIGHT: usize = 4;
-    /// Statistics planes.
+    /// Number of statistics planes.
     pub const STATISTICS: usize = 5;
 
-    /// Fresh moments and statistics for `splats`, which are put into Morton order.
+    /// Zero moments and statistics for `splats`, which are put into Morton order.
     pub fn new(splats: Splats) -> Self {
         let (n, degree) = (splats.len(), splats.sh_degree());
         let mut state = Self {
@@ -80,11 +80,11 @@ impl SplatState {
             statistics: Planes::zeros(Self::STATISTICS, n),
             filter: Planes::zeros(1, n),
         };
-        state.sort_by_place();
+        state.sort_morton();
         state
     }
 
-    /// How many splats.
+    /// Number of splats.
     pub fn len(&self) -> usize {
         self.splats.len()
     }
@@ -102,7 +102,7 @@ impl SplatState {
         self.filter = self.filter.gather(indices);
     }
 
-    /// Adds `splats` with moments and statistics of zero.
+    /// Appends `splats` with moments and statistics of zero.
     pub fn append(&mut self, splats: &Splats) {
         let zeros = Splats::zeros(splats.len(), splats.sh_degree());
         self.splats.append(splats);
@@ -113,8 +113,8 @@ impl SplatState {
         self.filter.append(&Planes::zeros(1, splats.len()));
     }
 
-    /// Sets the moments of splat `i` back to zero.
-    pub fn forget_moments(&mut self, i: usize) {
+    /// Resets the moments of splat `i` to zero.
+    pub fn reset_moments(&mut self, i: usize) {
         for moment in &mut self.moments {
             for column in moment.columns_mut() {
                 for c in 0..column.count() {
@@ -124,20 +124,20 @@ impl SplatState {
         }
     }
 
-    /// Statistics plane `plane` of splat `i`, the mean over the frames that saw it.
+    /// Statistics plane `plane` of splat `i`, averaged over the frames in which it was visible.
     pub fn mean_statistic(&self, plane: usize, i: usize) -> f32 {
         self.statistics.get(plane, i) / self.statistics.get(Self::SEEN, i).max(1.0)
     }
 
-    /// Puts neighbours in space beside each other in memory (Morton order of the means), so that a vector of splats is
-    /// visible, or not, together, and tiles read few cache lines.
-    pub fn sort_by_place(&mut self) {
+    /// Sorts the splats in Morton order of the means, so that neighbours in space are neighbours in memory: vectors of splats are
+    /// visible or invisible together, and tiles read few cache lines.
+    pub fn sort_morton(&mut self) {
         let order = morton_order(&self.splats.means);
         self.gather(&order);
     }
 
-    /// One Adam step with `gradients`. SH bands above `sh_degree` rest. `regularized` says of which splats the gradients of
-    /// ln scales and opacity logits are: of the active ones, or of all.
+    /// One Adam step with `gradients`. SH bands above `sh_degree` are not updated. `regularized` tells which splats have gradients of
+    /// ln scales and opacity logits: the active ones, or all.
     pub fn step(
         &mut self,
         level: Level,
@@ -188,7 +188,7 @@ impl SplatState {
     }
 
     /// Adds one frame's gradients to the statistics. `width` and `height` are the frame's, pixels; `extent(i)` is splat
-    /// i's half size on screen. All but [`Statistics::Gradient`] need what backward was asked to gather for them.
+    /// i's half size on screen, pixels. All but [`Statistics::Gradient`] require the matching [`crate::Gather`] in the backward pass.
     pub fn gather_statistics(
         &mut self,
         what: Statistics,
@@ -205,7 +205,7 @@ impl SplatState {
         };
         let (x, y) = (screen.plane(0), screen.plane(1));
         let (error, weight) = (gradients.gathered.plane(0), gradients.gathered.plane(1));
-        // Pixels to normalised device coordinates, whose range is 2.
+        // Pixels to normalised device coordinates, whose range has length 2.
         let scale = [0.5 * width as f32, 0.5 * height as f32];
         let mut planes = self.statistics.as_mut_slice().chunks_mut(stride.max(1));
         let mut plane = || &mut planes.next().expect("a plane for each statistic")[..n];
@@ -231,8 +231,8 @@ impl SplatState {
     }
 }
 
-/// Indices in Morton (Z-curve) order of the positions, 10 bits an axis, over the box that holds the middle 98 % of each
-/// axis (a few points far out would otherwise share the whole scene's cell).
+/// Indices in Morton (Z-curve) order of the positions, 10 bits per axis, over the box of the central 98 % of each axis (otherwise
+/// a few outliers would compress the scene into one cell).
 fn morton_order(means: &Planes) -> Vec<u32> {
     let n = means.len();
     let mut codes = vec![0u32; n];
@@ -259,7 +259,7 @@ fn morton_order(means: &Planes) -> Vec<u32> {
     order
 }
 
-/// Ten bits to every third bit of thirty.
+/// Spreads ten bits to every third bit of thirty.
 fn spread(v: u32) -> u32 {
     let v = (v | v << 16) & 0x0300_00ff;
     let v = (v | v << 8) & 0x0300_f00f;

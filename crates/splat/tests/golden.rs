@@ -5,8 +5,8 @@ use irradia_scene::GaussianCloud;
 use irradia_splat::{Gather, OutputGradient, RenderOptions, Renderer, SplatGradients, Splats, ViewParams};
 use irradia_testkit::{Golden, max_abs_difference, relative_difference, shared};
 
-/// The cases in this project's conventions. `c1` (off-centre principal point) and `c4` hold the projection's clamp; their
-/// `symclamp` twins hold Inria's, about the axis, which is not used here.
+/// The cases in this project's conventions. `c1` (off-centre principal point) and `c4` test the projection's clamp; their
+/// `symclamp` variants test Inria's, symmetric about the axis, which is not used here.
 const CASES: [&str; 5] = [
     "c0_n50_64x64_sh0",
     "c1_n500_128x96_sh1",
@@ -15,8 +15,8 @@ const CASES: [&str; 5] = [
     "c4_n60_edge_77x53_sh3",
 ];
 
-/// A gradient's elements must be right to two thousandths of themselves and of this part of the array's largest: what single
-/// precision leaves of sums over hundreds of pixels that cancel (1.7e-3 was seen).
+/// A gradient's elements must be accurate to two thousandths of their value plus this fraction of the array's largest: the error of
+/// single precision in cancelling sums over hundreds of pixels (1.7e-3 was seen).
 const FLOOR: f64 = 1e-3;
 
 fn splats(golden: &Golden) -> Splats {
@@ -83,7 +83,7 @@ fn images_agree() {
         for level in Level::all() {
             let mut renderer = Renderer::with_level(level);
             renderer.render(&splats(&golden), &view(&golden), &options(&golden));
-            // The issue asks for 1e-4; 2e-5 is what single precision can hold (golden/README.md).
+            // 1e-4 would do; 2e-5 is what single precision achieves (golden/README.md).
             for (name, got, channels, scale) in [
                 ("out_rgb", interleaved(renderer.color()), 3, 1.0),
                 ("out_alpha", wide(renderer.alpha()), 1, 1.0),
@@ -148,7 +148,7 @@ fn gradients_agree() {
                     println!("{case} {} {set}_{name}: {:.2e}", level.name(), d.worst);
                     assert!(d.worst < 2e-3, "{case} {} {set}_{name}: {d:?}", level.name());
                 }
-                let camera = gradients.camera.expect("asked for");
+                let camera = gradients.camera.expect("requested");
                 // The last row, 0 0 0 1, is not a parameter here.
                 let mut got = vec![0.0; 12];
                 for i in 0..3 {

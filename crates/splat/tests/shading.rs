@@ -1,9 +1,9 @@
-//! What something else adds to the splats' colours.
+//! Colours added to the splats' own.
 
 use irradia_scene::{Camera, Intrinsics, Pose, Rng, sh};
 use irradia_splat::{OutputGradient, RenderOptions, Renderer, SplatGradients, Splats, ViewParams};
 
-/// Splats before a camera at the origin, some of them outside its view, some with colours below 0.
+/// Splats in front of a camera at the origin, some of them outside its view, some with colours below 0.
 fn scene() -> (Splats, ViewParams) {
     let mut rng = Rng::new(7, 0);
     let mut splats = Splats::zeros(60, 1);
@@ -31,7 +31,7 @@ fn scene() -> (Splats, ViewParams) {
 }
 
 #[test]
-fn what_is_added_counts_as_the_dc_coefficient_does_forward_and_back() {
+fn an_added_colour_equals_a_change_of_the_dc_coefficient_forward_and_backward() {
     let (splats, view) = scene();
     let options = RenderOptions::default();
     let added = |i: u32| [0, 1, 2].map(|c| 0.2 * ((i + c) as f32).sin());

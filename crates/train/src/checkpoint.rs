@@ -1,5 +1,5 @@
-//! A run on disk: everything that the next step depends on, so that a resumed run writes the bytes that an unbroken one
-//! would have written. Only bytes are made and read here; where they go is the caller's.
+//! A run on disk: the whole state on which the next step depends, so that a resumed run writes the same bytes as an
+//! uninterrupted one. This module only serialises and parses bytes; the caller stores them.
 
 mod carried;
 #[cfg(test)]
@@ -7,7 +7,7 @@ mod tests;
 
 use crate::field_file;
 use crate::recipe::Recipe;
-use crate::schedule::{Clock, Watch};
+use crate::schedule::{Clock, ConvergenceMonitor};
 use crate::tensor_file::{NamedTensor, TensorSource};
 use crate::times::Times;
 use crate::trainer::{TrainError, TrainOptions, Trainer};
@@ -19,11 +19,11 @@ use std::collections::HashMap;
 use std::sync::Arc;
 
 const FORMAT: &str = "irradia-checkpoint-5";
-/// The format before, which is still read ([`carried`]).
+/// The previous format, which is still read ([`carried`]).
 const FORMAT_4: &str = "irradia-checkpoint-4";
-/// What the names of a field's tensors begin with.
+/// Prefix of the names of a field's tensors.
 const FIELD: &str = "field.";
-/// Where the time went; earlier checkpoints do not have it.
+/// The time breakdown; absent from earlier checkpoints.
 const TIMES: &str = "times";
 const OWNERS: [&str; 3] = ["splats", "first_moments", "second_moments"];
 
@@ -70,17 +70,17 @@ pub fn to_bytes(trainer: &Trainer) -> Vec<u8> {
         clock.stage as u64,
         clock.stage_step,
         u64::from(clock.was_reset),
-        clock.watch.steps,
+        clock.monitor.steps,
     ];
     let real = [
         clock.time,
         clock.stage_time,
         clock.progress,
         clock.stretch,
-        clock.watch.mean,
-        clock.watch.start,
-        clock.watch.best,
-        clock.watch.best_time,
+        clock.monitor.mean,
+        clock.monitor.start,
+        clock.monitor.best,
+        clock.monitor.best_time,
         trainer.pace,
         trainer.seconds,
         trainer.cpu_seconds,
@@ -120,7 +120,7 @@ pub fn to_bytes(trainer: &Trainer) -> Vec<u8> {
     safetensors::serialize(views, Some(metadata)).expect("in memory")
 }
 
-/// The recipe that a checkpoint was made with.
+/// The recipe and the seed of a checkpoint.
 ///
 /// # Errors
 /// When the bytes are not a checkpoint of this program.
@@ -141,10 +141,10 @@ pub fn recipe_of(bytes: &[u8]) -> Result<(Recipe, u64), TrainError> {
     Ok((recipe, seed))
 }
 
-/// The trainer that [`to_bytes`] saw, on the same `dataset`.
+/// The inverse of [`to_bytes`], on the same `dataset`.
 ///
 /// # Errors
-/// When the bytes are not a whole checkpoint.
+/// When the bytes are not a complete checkpoint.
 pub fn from_bytes(bytes: &[u8], dataset: Arc<Dataset>, options: TrainOptions) -> Result<Trainer, TrainError> {
     let wrong = |why: String| TrainError::Checkpoint(format!("the checkpoint is damaged: {why}"));
     let (recipe, seed) = recipe_of(bytes)?;
@@ -254,7 +254,7 @@ pub fn from_bytes(bytes: &[u8], dataset: Arc<Dataset>, options: TrainOptions) ->
         stage_step: *stage_step,
         carried,
         was_reset: *was_reset != 0,
-        watch: Watch {
+        monitor: ConvergenceMonitor {
             mean: *mean,
             steps: *watched,
             start: *start,
@@ -266,12 +266,12 @@ pub fn from_bytes(bytes: &[u8], dataset: Arc<Dataset>, options: TrainOptions) ->
     Ok(trainer)
 }
 
-/// Little-endian whole numbers.
+/// Little-endian integers.
 fn words(bytes: &[u8]) -> Vec<u64> {
     bytes.as_chunks().0.iter().map(|b| u64::from_le_bytes(*b)).collect()
 }
 
-/// Little-endian numbers in double precision.
+/// Little-endian double-precision numbers.
 fn reals(bytes: &[u8]) -> Vec<f64> {
     bytes.as_chunks().0.iter().map(|b| f64::from_le_bytes(*b)).collect()
 }

@@ -1,12 +1,12 @@
-//! Where a photograph has edges: part of the saliency by which Taming 3DGS (Mallick et al. 2024) scores splats.
+//! Edges of a photograph: part of the saliency by which Taming 3DGS (Mallick et al. 2024) scores splats.
 
 use crate::photos::Prepared;
 use rayon::prelude::*;
 
-/// Luma of ITU-R 601-2, by which the authors' code makes a photograph grey.
+/// Luma of ITU-R 601-2, with which the authors' code converts a photograph to grey.
 const LUMA: [f32; 3] = [0.299, 0.587, 0.114];
 
-/// Eight times each pixel's luma less that of its neighbours, clamped to \[0, 1\], `[H, W]`; 0 on the image's border.
+/// Eight times each pixel's luma minus that of its neighbours, clamped to \[0, 1\], `[H, W]`; 0 on the image's border.
 pub(crate) fn edges(photo: &Prepared, edges: &mut Vec<f32>) {
     let (width, height) = (photo.width as usize, photo.height as usize);
     let luma = |x: usize, y: usize| {
@@ -28,7 +28,7 @@ pub(crate) fn edges(photo: &Prepared, edges: &mut Vec<f32>) {
     });
 }
 
-/// The least of `values`, and the factor that makes their range 1; 0 where they are all the same.
+/// The minimum of `values`, and the factor that scales their range to 1; 0 if they are all equal.
 pub(crate) fn unit_range(values: &[f32]) -> [f32; 2] {
     let least = values.iter().copied().fold(f32::INFINITY, f32::min);
     let largest = values.iter().copied().fold(f32::NEG_INFINITY, f32::max);
@@ -41,7 +41,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn an_edge_lies_on_the_brighter_side_of_a_step() {
+    fn an_edge_is_on_the_brighter_side_of_a_step() {
         let (width, height) = (8, 5);
         let rgb = (0..width * height)
             .flat_map(|i| [if i % 8 < 4 { 51 } else { 102 }; 3])

@@ -1,4 +1,4 @@
-//! Looking at held-out views.
+//! Evaluation of held-out views.
 
 use crate::half_fit::{HalfFit, HeldOut, half_fit_psnr};
 use crate::model::{Model, RenderOptions};
@@ -10,21 +10,21 @@ use irradia_splat::Renderer;
 use irradia_splat::init::camera_extent;
 use std::ops::ControlFlow;
 
-/// The PSNR, in dB, above which views are not told apart: that of equal images, whose own is infinite. A frame of 8 bits in
-/// which one value in 2,000 is off by one has 81 dB.
-pub const MOST_PSNR: f64 = 100.0;
+/// Upper limit of PSNR, dB: that of equal images is infinite. A frame of 8 bits in which one value in 2,000 is off by one has
+/// 81 dB.
+pub const MAX_PSNR: f64 = 100.0;
 
-/// One view's outcome with its pictures, `[H, W, 3]`.
+/// The result of one view with its images, `[H, W, 3]`.
 pub struct EvaluatedView {
     /// The view's name.
     pub name: String,
-    /// Its metrics, PSNR at most [`MOST_PSNR`]; NaN and `None` where its mask leaves no pixel.
+    /// Its metrics, PSNR at most [`MAX_PSNR`]; NaN and `None` if its mask excludes all pixels.
     pub metrics: Evaluation,
     /// The photograph over the background.
     pub truth: Image,
-    /// What the scene shows there.
+    /// The rendered view.
     pub render: Image,
-    /// `[H, W]`, 0 where the photograph does not count.
+    /// `[H, W]`, 0 for pixels to ignore.
     pub mask: Option<Vec<u8>>,
 }
 
@@ -38,24 +38,24 @@ impl EvaluatedView {
 /// Which metrics to compute.
 #[derive(Clone, Copy)]
 pub enum Metrics<'a> {
-    /// PSNR alone (the others are NaN and `None`): a look while training.
+    /// PSNR only (the others are NaN and `None`): for evaluation during training.
     Psnr,
-    /// All, LPIPS where there are weights.
+    /// All, including LPIPS if network weights are available.
     All(Option<&'a Lpips>),
 }
 
 /// How views are evaluated.
 #[derive(Clone, Copy)]
 pub struct EvalOptions<'a> {
-    /// How they are rendered.
+    /// How views are rendered.
     pub render: RenderOptions,
-    /// What is computed of each.
+    /// The metrics of each view.
     pub metrics: Metrics<'a>,
-    /// What is fitted on the left half of each for its `half_fit_psnr`.
+    /// The parameters to fit on the left half of each view for its `half_fit_psnr`.
     pub half_fit: HalfFit,
 }
 
-/// Renders `model` from the views `indices` of `dataset` and compares; each is given to `see` when it is done, which may end it.
+/// Renders `model` from the views `indices` of `dataset` and compares; passes each result to `see`, which may end the evaluation.
 ///
 /// # Errors
 /// When a photograph cannot be read.
@@ -97,9 +97,9 @@ pub fn evaluate_views(
         if fit.any() && !blank {
             metrics.half_fit_psnr = half_fit_psnr(model, &mut renderer, &held_out, fit);
         }
-        // Not `f64::min`, of which NaN would come out as the other.
-        metrics.psnr = metrics.psnr.clamp(f64::NEG_INFINITY, MOST_PSNR);
-        metrics.half_fit_psnr = metrics.half_fit_psnr.map(|psnr| psnr.min(MOST_PSNR));
+        // Not `f64::min`, which returns the other operand for NaN.
+        metrics.psnr = metrics.psnr.clamp(f64::NEG_INFINITY, MAX_PSNR);
+        metrics.half_fit_psnr = metrics.half_fit_psnr.map(|psnr| psnr.min(MAX_PSNR));
         let seen = see(EvaluatedView {
             name: view.name.clone(),
             metrics,
@@ -132,8 +132,8 @@ const NOT_MEASURED: Evaluation = Evaluation {
     half_fit_psnr: None,
 };
 
-/// The mean of the metrics over the views that were measured: LPIPS where all of them have it, what was measured after a fit
-/// over those that have it. NaN and `None` when there are none.
+/// The mean of the metrics over the measured views: LPIPS if all of them have it, half-fit PSNR over those that have it. NaN and
+/// `None` if there are none.
 pub fn mean(metrics: &[Evaluation]) -> Evaluation {
     let measured: Vec<&Evaluation> = metrics.iter().filter(|m| !m.psnr.is_nan()).collect();
     let mean = |values: Vec<f64>| (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64);
@@ -156,7 +156,7 @@ mod tests {
     use std::borrow::Cow;
     use std::sync::Arc;
 
-    /// Three black photographs of nothing: met exactly, masked wholly, and off by a tenth in half of the pixels that count.
+    /// Three photographs of a scene that renders black: exact, fully masked, and off by a fifth everywhere.
     fn dataset() -> Dataset {
         let pose = Pose {
             rotation: Quat::IDENTITY,
@@ -220,7 +220,7 @@ mod tests {
             // A fifth off everywhere: 20 log10(5) = 13.98 dB.
             let off = 20.0 * 5f64.log10();
             let mean = mean(&metrics);
-            assert!((mean.psnr - 0.5 * (MOST_PSNR + off)).abs() < 1e-6, "{mean:?}");
+            assert!((mean.psnr - 0.5 * (MAX_PSNR + off)).abs() < 1e-6, "{mean:?}");
             assert!(mean.ssim.is_finite() && mean.half_fit_psnr.is_none_or(f64::is_finite));
             assert_eq!(mean.half_fit_psnr.is_some(), half_fit.any());
         }

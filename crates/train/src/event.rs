@@ -1,23 +1,23 @@
-//! What the outside sees of a run.
+//! The events of a run and its observers.
 
 use irradia_splat::densify::DensityChange;
 use serde::Serialize;
 
-/// Something that happened.
+/// An event of a run.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 #[serde(tag = "event", rename_all = "snake_case")]
 pub enum Event {
-    /// Training begins or goes on.
+    /// Training begins or resumes.
     Started {
         /// Recipe's name.
         recipe: String,
         /// Steps made so far.
         step: u64,
-        /// Steps there will be, as far as is known.
+        /// Total number of steps, as far as known.
         total_steps: u64,
-        /// Splats now.
+        /// Current number of splats.
         splats: usize,
-        /// Numbers of the field, where one is trained.
+        /// Number of parameters of the field, if one is trained.
         #[serde(skip_serializing_if = "Option::is_none")]
         parameters: Option<usize>,
         /// Training views.
@@ -32,7 +32,7 @@ pub enum Event {
         /// Seconds of training so far.
         seconds: f64,
     },
-    /// A step was made.
+    /// A step was completed.
     Step(StepReport),
     /// Density control acted.
     Densified {
@@ -44,10 +44,10 @@ pub enum Event {
         split: usize,
         /// Splats removed.
         pruned: usize,
-        /// Splats now.
+        /// Current number of splats.
         splats: usize,
     },
-    /// Held-out views were looked at.
+    /// The held-out views were evaluated.
     Evaluated {
         /// Steps made so far.
         step: u64,
@@ -55,9 +55,9 @@ pub enum Event {
         seconds: f64,
         /// Mean over the held-out views, dB.
         psnr: f64,
-        /// Splats now.
+        /// Current number of splats.
         splats: usize,
-        /// Numbers of the field, where one is trained.
+        /// Number of parameters of the field, if one is trained.
         #[serde(skip_serializing_if = "Option::is_none")]
         parameters: Option<usize>,
     },
@@ -65,20 +65,20 @@ pub enum Event {
     Saved {
         /// Steps made so far.
         step: u64,
-        /// Where, relative to the run.
+        /// Its path, relative to the run's folder.
         path: String,
     },
-    /// The run waits, because an observer asked for it.
+    /// The run is paused at an observer's request.
     Paused {
         /// Steps made so far.
         step: u64,
     },
-    /// The run goes on after a pause.
+    /// The run resumes after a pause.
     Resumed {
         /// Steps made so far.
         step: u64,
     },
-    /// Something that should be known and does not end the run.
+    /// A warning: the run continues.
     Warned {
         /// One line.
         message: String,
@@ -101,26 +101,26 @@ pub struct StepReport {
     pub step: u64,
     /// Seconds of training so far.
     pub seconds: f64,
-    /// Seconds of training still to come, as far as is known.
+    /// Predicted remaining seconds of training.
     pub seconds_left: f64,
-    /// Between which that lies in nine of ten runs.
+    /// Range that contains the remaining seconds in nine of ten runs.
     pub seconds_left_range: [f64; 2],
-    /// Recipe steps that went by in it.
+    /// Recipe steps per step.
     pub pace: f64,
     /// Index of the view in the dataset.
     pub view: usize,
-    /// The loss, weighted.
+    /// The weighted loss.
     pub loss: f64,
     /// Mean squared error of the training view; `-10 log10` of it is its PSNR.
     pub mse: f64,
-    /// Splats now.
+    /// Current number of splats.
     pub splats: usize,
-    /// Numbers of the field, where one is trained.
+    /// Number of parameters of the field, if one is trained.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub parameters: Option<usize>,
-    /// Splats that the view saw.
+    /// Splats visible in the view.
     pub visible: usize,
-    /// Splats whose gradient was not finite and that therefore rested.
+    /// Splats skipped because their gradient was not finite.
     pub non_finite: usize,
 }
 
@@ -138,44 +138,44 @@ impl Event {
     }
 }
 
-/// What an observer wants. Of several observers' answers all are followed; [`Signal::Stop`] ends a pause too.
+/// The request of an observer. Requests of several observers are combined; [`Signal::Stop`] also ends a pause.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Default)]
 pub enum Signal {
-    /// Nothing.
+    /// No request.
     #[default]
     Continue,
-    /// A checkpoint, now.
+    /// Write a checkpoint now.
     Save,
-    /// The run to wait until [`Observer::while_paused`] of no observer answers this any more.
+    /// Pause until [`Observer::while_paused`] returns this for no observer.
     Pause,
-    /// The run to end, with everything saved.
+    /// Stop, with everything saved.
     Stop,
 }
 
-/// Someone who watches a run. Watching can never end it but by [`Signal::Stop`].
+/// An observer of a run, which can end it only with [`Signal::Stop`].
 pub trait Observer {
-    /// Sees `event`; `trainer` is as it stands after it.
+    /// Receives `event`; `trainer` is its state after the event.
     fn on_event(&mut self, event: &Event, trainer: &crate::Trainer) -> Signal;
 
-    /// Whether the run is to end; asked between views while held-out views are evaluated, where no event comes.
+    /// Whether to stop; polled between views while held-out views are evaluated, when there are no events.
     fn wants_stop(&self) -> bool {
         false
     }
 
-    /// Asked several times a second while the run is paused, whoever paused it.
+    /// Polled several times per second while the run is paused, whichever observer paused it.
     fn while_paused(&mut self, _trainer: &crate::Trainer) -> Signal {
         Signal::Continue
     }
 
-    /// Something that went wrong with watching, once; asked after every event and told as [`Event::Warned`].
+    /// A problem of the observer, reported once; polled after every event and forwarded as [`Event::Warned`].
     fn warning(&mut self) -> Option<String> {
         None
     }
 
-    /// Writes a checkpoint, if that is this observer's business; its place, relative to the run.
+    /// Writes a checkpoint, if this observer is responsible for it; returns its path, relative to the run's folder.
     ///
     /// # Errors
-    /// One line; it is told as [`Event::Warned`] and training goes on.
+    /// One line, which is forwarded as [`Event::Warned`]; training continues.
     fn save(&mut self, _trainer: &crate::Trainer) -> Result<Option<String>, String> {
         Ok(None)
     }

@@ -1,4 +1,4 @@
-//! `field.safetensors`: a radiance field that can be looked at again, with its configuration in the header.
+//! `field.safetensors`: a trained radiance field, with its configuration in the header.
 
 use crate::tensor_file::{self, NamedTensor, TensorSource};
 use crate::trainer::TrainError;
@@ -6,11 +6,11 @@ use irradia_field::{Field, FieldConfig, FieldState, Space};
 use safetensors::tensor::SafeTensors;
 use serde::{Deserialize, Serialize};
 
-/// The header's one key.
+/// The header's only key.
 const KEY: &str = "irradia_field";
 const FORMAT: u32 = 1;
 
-/// What the header says.
+/// The content of the header.
 #[derive(Serialize, Deserialize)]
 struct Header {
     format: u32,
@@ -33,10 +33,10 @@ pub fn to_bytes(field: &Field) -> Vec<u8> {
     tensor_file::to_bytes(&tensors, (KEY, header))
 }
 
-/// The field of [`to_bytes`].
+/// The inverse of [`to_bytes`].
 ///
 /// # Errors
-/// When the bytes are not such a file, or not a whole one.
+/// When the bytes are not such a file, or a truncated one.
 pub fn from_bytes(bytes: &[u8]) -> Result<Field, TrainError> {
     let wrong = |why: String| TrainError::Checkpoint(format!("not a field of this program: {why}"));
     let (_, header) = SafeTensors::read_metadata(bytes).map_err(|e| wrong(e.to_string()))?;
@@ -48,7 +48,7 @@ pub fn from_bytes(bytes: &[u8]) -> Result<Field, TrainError> {
         return Err(wrong(format!("format {} and not {FORMAT}", header.format)));
     }
     header.config.check()?;
-    // Before there is memory for what the header only claims.
+    // Before allocating what the header merely claims.
     let (wanted, found) = (header.config.numbers(), bytes.len() / size_of::<f32>());
     if wanted > found {
         return Err(wrong(format!(
@@ -57,7 +57,7 @@ pub fn from_bytes(bytes: &[u8]) -> Result<Field, TrainError> {
     }
     let Space { center, scale, .. } = header.space;
     if !(scale > 0.0 && scale.is_finite() && center.iter().all(|c| c.is_finite())) {
-        return Err(wrong("its space has no size".into()));
+        return Err(wrong("its space is empty".into()));
     }
     let tensors = TensorSource::new(&file, "");
     Ok(Field::from_tensors(header.config, header.space, |name| {
@@ -75,7 +75,7 @@ pub(crate) fn state_tensors(state: &FieldState) -> Vec<NamedTensor> {
         .collect()
 }
 
-/// The state that [`state_tensors`] gave, of a field of this configuration.
+/// The inverse of [`state_tensors`], for a field of this configuration.
 ///
 /// # Errors
 /// One line, when a tensor is missing or has another length.

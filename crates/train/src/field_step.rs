@@ -1,8 +1,8 @@
-//! A stage of radiance field: its steps, and how splats begin where it ends.
+//! A stage of radiance field: its steps, and the initialisation of splats after it.
 
 use crate::photos::Prepared;
 use crate::recipe::{FieldKnobs, FieldSpace, Param, Recipe};
-use crate::schedule::{Signal, StepPlan, coming_views, plan};
+use crate::schedule::{StepMetrics, StepPlan, plan, upcoming_views};
 use crate::trainer::{TrainError, Trainer};
 use crate::{event::StepReport, recipe::Represents};
 use cpu_time::ProcessTime;
@@ -14,21 +14,21 @@ use irradia_splat::{SplatState, init};
 use std::sync::Arc;
 use std::time::Instant;
 
-/// Streams of the run's seed.
+/// Random streams, derived from the run's seed.
 const STREAM_FIELD: u64 = 6;
 const STREAM_POINTS: u64 = 7;
-/// Photographs of a step where all of them do not fit into memory.
+/// Photographs per step if not all of them fit into memory.
 const SHARED: usize = 16;
-/// Share of the depth bounds' near plane that is left as a margin (NeRF's code: 0.9).
+/// Factor on the near plane of the depth bounds, which leaves a margin (NeRF's code: 0.9).
 const NEAR_MARGIN: f32 = 0.9;
 
-/// Whether the stage that a run stands in trains a field.
+/// Whether stage `stage` trains a field.
 pub fn is_field(recipe: &Recipe, stage: usize) -> bool {
     let stage = &recipe.stage[stage.min(recipe.stage.len() - 1)];
     stage.represents == Represents::Field
 }
 
-/// The field that `knobs` ask for around what `cameras` see.
+/// The field of `knobs` in the space determined by `cameras`.
 pub fn first_field(
     knobs: &FieldKnobs,
     dataset: &Dataset,
@@ -64,10 +64,10 @@ pub fn first_field(
 
 impl Trainer {
     /// One step of the field: rays, loss, gradients, update.
-    pub(crate) fn field_step(&mut self) -> Result<(StepReport, Signal), TrainError> {
+    pub(crate) fn field_step(&mut self) -> Result<(StepReport, StepMetrics), TrainError> {
         let plan = plan(&self.recipe, &self.clock);
         let chosen = self.field_views();
-        // What comes next is named, so that the photographs load side by side.
+        // The upcoming views are passed on, so that the photographs load in parallel.
         let photos: Vec<Arc<Prepared>> = (0..chosen.len())
             .map(|i| self.photos.get(&chosen[i..], plan.image_scale))
             .collect::<Result<_, _>>()?;
@@ -127,7 +127,7 @@ impl Trainer {
         let loss = train_views(state, &views, &options);
         self.seconds += started.elapsed().as_secs_f64();
         self.cpu_seconds += cpu_started.elapsed().as_secs_f64();
-        let signal = Signal {
+        let metrics = StepMetrics {
             error: loss.color.sqrt(),
             measured: None,
             views: train.len() as u64,
@@ -146,10 +146,10 @@ impl Trainer {
             visible: 0,
             non_finite: 0,
         };
-        Ok((report, signal))
+        Ok((report, metrics))
     }
 
-    /// What [`Trainer::known_depths`] says of a view, worked out once a size: all views take part in each step.
+    /// [`Trainer::known_depths`] of a view, computed once per size: all views are used in each step.
     fn field_depths(&mut self, view: usize, camera: &Camera, plan: &StepPlan) -> Arc<[KnownDepth]> {
         if plan.value(Param::DepthWeight) <= 0.0 {
             return Arc::default();
@@ -169,7 +169,7 @@ impl Trainer {
         known
     }
 
-    /// All training views where their photographs fit into memory, else those that come next.
+    /// All training views if their photographs fit into memory, else the upcoming ones.
     fn field_views(&self) -> Vec<usize> {
         let bytes: usize = self
             .dataset
@@ -183,15 +183,15 @@ impl Trainer {
         if bytes <= self.options.photo_budget {
             return self.dataset.train.clone();
         }
-        let mut coming = coming_views(&self.dataset.train, self.options.seed, &self.clock);
-        coming.truncate(SHARED);
-        coming
+        let mut upcoming = upcoming_views(&self.dataset.train, self.options.seed, &self.clock);
+        upcoming.truncate(SHARED);
+        upcoming
     }
 
-    /// Begins the splats of the stage that the run stands in with the surfaces of the field that was trained before.
+    /// Initialises the splats of the current stage on the surfaces of the field trained before.
     ///
     /// # Errors
-    /// When the field shows no surface.
+    /// When the field has no surface.
     pub(crate) fn field_to_splats(&mut self) -> Result<(), TrainError> {
         let (Some(state), Some(knobs)) = (self.field.take(), &self.recipe.field) else {
             return Ok(());
@@ -229,8 +229,8 @@ mod tests {
 
     const SIDE: u32 = 32;
 
-    /// A grey wall at z = 0, of which photographs tell no depth, seen from an arc before it; every second of its points is known to
-    /// be seen, the others are held out.
+    /// A grey wall at z = 0, whose photographs contain no depth cue, seen from an arc in front of it; every second of its points is
+    /// known to be visible, the others are held out.
     fn wall() -> Dataset {
         let mut rng = Rng::new(1, 1);
         let positions: Vec<Vec3> = (0..400)
@@ -270,7 +270,7 @@ mod tests {
     }
 
     #[test]
-    fn a_depth_weight_brings_a_field_to_where_points_were_seen() {
+    fn a_depth_weight_draws_a_field_to_known_points() {
         let dataset = Arc::new(wall());
         let text = Recipe::built_in("hashgrid").expect("it is");
         let error = |weight: f32| {
@@ -279,7 +279,7 @@ mod tests {
                 "field.sampler.side=32".to_owned(),
                 "field.net.encoding.log2_table=12".to_owned(),
                 "field.space=\"bounded\"".to_owned(),
-                // So few steps do not clear away a field that begins dense.
+                // So few steps do not clear a field that is initially dense.
                 "field.opaque_density_bias=-1".to_owned(),
                 format!("params.depth_weight={weight}"),
             ];
@@ -301,7 +301,7 @@ mod tests {
             for view in &dataset.views {
                 let frame = trainer.scene().render(&mut Renderer::new(), &view.camera, &look);
                 for point in positions.iter().skip(1).step_by(2) {
-                    let (pixel, depth) = view.camera.project(*point).expect("before the camera");
+                    let (pixel, depth) = view.camera.project(*point).expect("in front of the camera");
                     if pixel.min_element() >= 0.0 && pixel.max_element() < SIDE as f32 {
                         let at = pixel.y as usize * SIDE as usize + pixel.x as usize;
                         errors.push((frame.depth[at] / frame.alpha[at].max(1e-6) - depth).abs());

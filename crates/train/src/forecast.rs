@@ -1,60 +1,59 @@
-//! How long the rest of a run takes, and the pace at which it takes as long as it may.
+//! Predicts the duration of the rest of a run, and the pace that fits it into a budget.
 //!
-//! A recipe's steps do not cost the same: images grow, splats grow in number and colour. What is left of the recipe is looked
-//! through with a model of a step's work, of which one constant is measured as the run goes, and of how its strategy adds
-//! splats.
+//! A recipe's steps differ in cost: images grow, and splats grow in number and colour. The rest of the recipe is evaluated with a
+//! model of the work of a step, one constant of which is measured as the run proceeds, and of how its strategy adds splats.
 
-use crate::recipe::{Density, Recipe, Represents};
-use crate::schedule::{Ahead, Clock, StepPlan, ahead};
+use crate::recipe::{DensityControl, Recipe, Represents};
+use crate::schedule::{Clock, StepPlan, UpcomingStretch, upcoming};
 use crate::trainer::Trainer;
 
-/// Work of a step, microseconds of a core (AVX-512), by least squares of the relative error over the first 250 to 500 steps of
-/// six runs: chair with `classic`, `fast` and `curriculum`, fox_colmap with `fast`, fern with `mcmc`, demo with `classic`. A step
-/// was 0.65 to 1.22 of this. A pixel,
+/// Work of a step, microseconds on one core (AVX-512), by least squares of the relative error over the first 250 to 500 steps of
+/// six runs: chair with `classic`, `fast` and `curriculum`, fox_colmap with `fast`, fern with `mcmc`, demo with `classic`. Measured
+/// steps were 0.65 to 1.22 of the prediction. Per pixel,
 const PIXEL: f64 = 0.09;
-/// a splat-pixel pair that blending visits,
+/// per splat-pixel pair visited by blending,
 const PAIR: f64 = 0.00065;
-/// a splat,
+/// per splat,
 const SPLAT: f64 = 0.26;
-/// each of its parameters in use,
+/// per parameter of a splat in use,
 const PARAMETER: f64 = 0.0016;
-/// a pixel that LPIPS compares,
+/// per pixel of the LPIPS crop,
 const PERCEPTUAL_PIXEL: f64 = 1.15;
-/// and a sample of a field.
+/// and per sample of a field.
 const SAMPLE: f64 = 2.0;
-/// Parameters of a splat beside its harmonics.
+/// Parameters of a splat other than its harmonics.
 const GEOMETRY: f64 = 11.0;
-/// Pairs of a pixel go with the number of splats and against the images' sides, both to this power (31 to 780 were seen);
+/// Pairs per pixel grow with the number of splats and shrink with the images' sides, both to this power (31 to 780 were seen);
 const PAIRS_POWER: f64 = 0.5;
-/// `mcmc` adds splats as large as those it copies (0.7 to 0.9 on fox, lund_door, maryRose).
+/// `mcmc` adds splats as large as those that it copies (0.7 to 0.9 on fox, lund_door, maryRose).
 const MCMC_PAIRS_POWER: f64 = 0.75;
-/// Parts into which the rest of the run is cut.
+/// Number of points in time at which the rest of the run is evaluated.
 const PARTS: usize = 48;
 /// Steps between two measurements of a run without a budget, since each walks all tile entries and the rest of the recipe: at
-/// most so many,
+/// most this many,
 const MEASURE_EVERY: usize = 16;
-/// and this part of the steps made, for costs change fast at first.
+/// and at most this fraction (one over it) of the steps completed, since costs change fast at first.
 const MEASURE_PART: usize = 16;
-/// Steps over which costs are averaged: so many, but not more than the last quarter, for they change fast at first.
+/// Steps over which costs are averaged, but at most the last quarter, since costs change fast at first.
 const WINDOW: usize = 50;
-/// What overdraw falls to in the end is not foretold below this share of what it is.
-const LEAST_SETTLED: f64 = 0.25;
-/// What a round of `classic` adds grows by this over its first rounds (1.5 on chair, 2.3 on fox_colmap, of 1000 and 2000 steps).
+/// Overdraw is not predicted to fall below this fraction of its current value.
+const MIN_SETTLED: f64 = 0.25;
+/// Growth factor of the splats added per round of `classic` in its first rounds (1.5 on chair, 2.3 on fox_colmap, of 1000 and 2000 steps).
 const FIRST_ROUNDS_GROW: f64 = 1.5;
 const FIRST_ROUNDS: u32 = 3;
-/// Then it fades, to an e-th in so many steps (1,300 on demo, 3,300 on fox_colmap, 5,000 on chair, 6,000 on fern).
+/// Then it decays, to 1 / e in this many steps (1,300 on demo, 3,300 on fox_colmap, 5,000 on chair, 6,000 on fern).
 const GROWTH_FADES: f64 = 3000.0;
-/// The strategy `fast` ends with so many splats more where images grow: pixels to this power (2.3 times for images of twice
-/// the side; 1.8 to 2.6 on five scenes),
+/// The strategy `fast` converges to a number of splats that grows with the images: pixels to this power (2.3 times for images of
+/// twice the side; 1.8 to 2.6 on five scenes),
 const SPLATS_BY_PIXELS: f64 = 0.6;
-/// within this share of the recipe.
+/// within this fraction of the recipe.
 const SPLATS_FOLLOW: f64 = 0.12;
 
-/// How far off a forecast may be, as a factor either way, up to a tenth of the recipe and from nine tenths on; in between it falls
-/// evenly in the logarithm. Seen after a tenth: 0.5 to 2.2 times what it took, on eight runs of four recipes.
+/// Uncertainty of a forecast, as a factor in both directions, up to a tenth of the recipe and from nine tenths on; in between it
+/// falls linearly in the logarithm. Seen after a tenth: 0.5 to 2.2 times the actual duration, on eight runs of four recipes.
 const UNCERTAINTY: [f64; 2] = [2.2, 1.1];
 
-/// Between which values the time that is left lies in nine of ten runs, where `left` seconds were predicted.
+/// Range of the remaining time in nine of ten runs, if `left` seconds were predicted.
 pub fn range(left: f64, recipe: &Recipe, clock: &Clock) -> [f64; 2] {
     let passed = clock.time / recipe.total_steps() as f64;
     let t = ((passed - 0.1) / 0.8).clamp(0.0, 1.0);
@@ -62,49 +61,49 @@ pub fn range(left: f64, recipe: &Recipe, clock: &Clock) -> [f64; 2] {
     [left / factor, left * factor]
 }
 
-/// What has been learnt of a run's cost and growth.
+/// Measured cost and growth of a run.
 #[derive(Clone, Debug, Default)]
 pub struct Forecast {
-    /// Steps seen.
+    /// Steps observed.
     steps: usize,
     /// The trainer's seconds at the last measurement.
     seconds: f64,
     /// Steps since then.
     since: usize,
-    /// The step that comes and its number of splats.
-    next: Option<(Ahead, f64)>,
-    /// Pairs a pixel of each step on splats, at an image scale and a number of splats of 1.
+    /// The next step and its number of splats.
+    next: Option<(UpcomingStretch, f64)>,
+    /// Pairs per pixel of each splat step, normalised to an image scale and a number of splats of 1.
     overdraws: Vec<f64>,
-    /// Seconds to a unit of work, a moving mean.
+    /// Seconds per unit of work, a moving average.
     unit: Option<f64>,
-    /// Seconds that the rest of the run takes, were each recipe step a step.
+    /// Seconds that the rest of the run takes at a pace of 1.
     whole: f64,
     /// Mean pixels of a training image.
     pixels: f64,
     /// Recipe time and number of splats when that number last changed, or the stage began.
     last_round: Option<(usize, f64, f64)>,
-    /// Splats that the last round of density control added for each recipe step since the one before.
+    /// Splats added per recipe step by the last round of density control.
     rate: f64,
-    /// Rounds seen in this stage.
+    /// Rounds observed in this stage.
     rounds: u32,
     /// Size of the training images.
     image_scale: f64,
-    /// Where `fast` is going since images have grown.
+    /// Target of `fast` since images have grown.
     aim: Option<Aim>,
 }
 
-/// A number of splats that is being reached.
+/// A target number of splats.
 #[derive(Clone, Copy, Debug)]
 struct Aim {
     count: f64,
-    /// Splats added in a recipe step.
+    /// Splats added per recipe step.
     rate: f64,
-    /// Recipe time at which it is reached or given up.
+    /// Recipe time at which the target is reached or abandoned.
     until: f64,
 }
 
 impl Aim {
-    /// That of images whose sides grow by `factor` at `time`, when there are `count` splats.
+    /// The target after the sides of images grow by `factor` at `time`, with `count` splats.
     fn new(trainer: &Trainer, factor: f64, time: f64, count: f64) -> Self {
         let follow = SPLATS_FOLLOW * trainer.recipe.total_steps() as f64;
         let aim = count * factor.powi(2).powf(SPLATS_BY_PIXELS);
@@ -117,8 +116,8 @@ impl Aim {
 }
 
 impl Forecast {
-    /// Takes in what the last steps cost; to be called before each step, of which `plan` is the plan. A run whose pace follows
-    /// the forecast measures every step (`closely`), others ever fewer, down to one in [`MEASURE_EVERY`].
+    /// Measures the cost of the last steps; called before each step with its `plan`. A run whose pace follows the forecast measures
+    /// every step (`closely`), others ever less often, down to one in [`MEASURE_EVERY`].
     pub fn observe(&mut self, trainer: &Trainer, plan: &StepPlan, closely: bool) {
         if self.pixels == 0.0 {
             let cameras = trainer.train_cameras();
@@ -128,7 +127,7 @@ impl Forecast {
         }
         self.since += usize::from(self.next.is_some());
         self.follow_growth(trainer, plan);
-        // Another size of image or another stage costs another time: what was measured until then must not be mixed with it.
+        // Another image size or stage changes the cost: earlier measurements must not be mixed in.
         let other = self.next.is_some_and(|(step, _)| {
             step.stage != trainer.clock.stage || (f64::from(plan.image_scale) / step.image_scale - 1.0).abs() > 0.05
         });
@@ -140,7 +139,7 @@ impl Forecast {
             self.steps += self.since;
             let share = (self.since as f64 / window(self.steps) as f64).min(1.0);
             let pairs = trainer.engine.pairs() as f64 / (self.pixels * step.image_scale.powi(2));
-            // A field has none, and tells nothing of the splats that come after it.
+            // A field has no pairs, and does not predict those of later splats.
             if pairs > 0.0 {
                 let power = pairs_power(trainer);
                 let overdraw = pairs / (count.max(1.0) / step.image_scale).powf(power);
@@ -152,12 +151,12 @@ impl Forecast {
             self.unit = Some(self.unit.map_or(unit, |mean| mean + share * (unit - mean)));
         }
         (self.seconds, self.since) = (trainer.seconds, 0);
-        let ahead = ahead(&trainer.recipe, &trainer.clock, PARTS);
-        self.next = ahead.first().map(|next| (*next, trainer.engine.len() as f64));
-        self.whole = self.look_ahead(trainer, &ahead);
+        let upcoming = upcoming(&trainer.recipe, &trainer.clock, PARTS);
+        self.next = upcoming.first().map(|next| (*next, trainer.engine.len() as f64));
+        self.whole = self.predict(trainer, &upcoming);
     }
 
-    /// Takes in the number of splats and the size of images that the coming step has.
+    /// Updates growth with the number of splats and the image size of the next step.
     fn follow_growth(&mut self, trainer: &Trainer, plan: &StepPlan) {
         let (stage, time, count) = (trainer.clock.stage, trainer.clock.time, trainer.engine.len() as f64);
         match self.last_round {
@@ -177,8 +176,8 @@ impl Forecast {
         self.image_scale = image_scale;
     }
 
-    /// [`Self::whole`] for the recipe that is left.
-    fn look_ahead(&self, trainer: &Trainer, ahead: &[Ahead]) -> f64 {
+    /// Predicts [`Self::whole`] for the rest of the recipe.
+    fn predict(&self, trainer: &Trainer, upcoming: &[UpcomingStretch]) -> f64 {
         let unit = self.unit.unwrap_or(1e-6 / rayon::current_num_threads() as f64);
         let mut growth = Growth {
             rate: self.growth_rate(trainer),
@@ -190,8 +189,8 @@ impl Forecast {
         let (now, settled) = self.overdraw();
         let (seen, power) = (self.overdraws.len() as f64, pairs_power(trainer));
         let (mut sum, mut steps) = (0.0, seen);
-        for stretch in ahead {
-            growth.pass(trainer, stretch);
+        for stretch in upcoming {
+            growth.advance(trainer, stretch);
             steps += stretch.duration / trainer.pace;
             let overdraw = settled + (now - settled) * seen / steps.max(1.0);
             let pairs = overdraw * (growth.count / stretch.image_scale).powf(power);
@@ -200,8 +199,8 @@ impl Forecast {
         unit * sum
     }
 
-    /// [`Self::overdraws`] of late, and what it falls to: random first splats overlap, and have five to twelve times the pairs of what
-    /// they become. They fall as `a + b / step` does, nearly, so that the mean of late and that of half-way tell `a`.
+    /// Recent mean of [`Self::overdraws`], and its predicted limit: random initial splats overlap, with five to twelve times the pairs
+    /// of the trained ones. Overdraw falls approximately as `a + b / step`, so that the recent mean and that at half-way determine `a`.
     fn overdraw(&self) -> (f64, f64) {
         let mean = |end: usize| {
             let last = &self.overdraws[end - window(end).min(end)..end];
@@ -209,11 +208,11 @@ impl Forecast {
         };
         let seen = self.overdraws.len();
         let (now, halfway) = (mean(seen), mean(seen.div_ceil(2)));
-        (now, (2.0 * now - halfway).clamp(LEAST_SETTLED * now, now))
+        (now, (2.0 * now - halfway).clamp(MIN_SETTLED * now, now))
     }
 
-    /// Splats added in a recipe step from now on: as in the last round, and more where `classic` has just begun. Without an
-    /// example the stage may double their number; where it falls (random points that nothing needed) it stays as it is.
+    /// Splats added per recipe step from now on: as in the last round, and more if `classic` has just begun. Before the first round
+    /// the stage may double their number; if the number falls (random points that were not needed) it is predicted constant.
     fn growth_rate(&self, trainer: &Trainer) -> f64 {
         let Some(stage) = trainer.recipe.stage.get(trainer.clock.stage) else {
             return 0.0;
@@ -224,12 +223,12 @@ impl Forecast {
         if self.rate == 0.0 {
             return trainer.engine.len() as f64 / stage.steps as f64;
         }
-        let begins = matches!(stage.density, Some(Density::Classic(_))) && self.rounds < FIRST_ROUNDS;
+        let begins = matches!(stage.density, Some(DensityControl::Classic(_))) && self.rounds < FIRST_ROUNDS;
         self.rate * if begins { FIRST_ROUNDS_GROW } else { 1.0 }
     }
 
-    /// Work of a step on `count` splats with so many pairs a pixel, microseconds.
-    fn work(&self, trainer: &Trainer, step: &Ahead, count: f64, pairs: f64) -> f64 {
+    /// Work of a step on `count` splats with `pairs` pairs per pixel, microseconds.
+    fn work(&self, trainer: &Trainer, step: &UpcomingStretch, count: f64, pairs: f64) -> f64 {
         if let (Represents::Field, Some(knobs)) = (trainer.recipe.stage[step.stage].represents, &trainer.recipe.field) {
             return SAMPLE * knobs.samples as f64;
         }
@@ -243,7 +242,7 @@ impl Forecast {
         pixels * (PIXEL + PAIR * pairs) + count.max(1.0) * (SPLAT + PARAMETER * parameters) + perceptual
     }
 
-    /// Seconds that the rest of the run takes at its present pace.
+    /// Seconds that the rest of the run takes at its current pace.
     pub fn seconds_left(&self, trainer: &Trainer) -> f64 {
         (self.whole / trainer.pace - (trainer.seconds - self.seconds)).max(0.0)
     }
@@ -251,18 +250,18 @@ impl Forecast {
     /// The pace at which the rest of the run takes `seconds`.
     pub fn pace(&self, trainer: &Trainer, seconds: f64) -> f64 {
         let left = trainer.recipe.total_steps() as f64 - trainer.clock.time;
-        // At least one more step, whatever has become of the time.
+        // At least one more step, even without time left.
         (self.whole / seconds.max(1e-6)).min(left)
     }
 }
 
-/// How many of the last steps count.
+/// Number of recent steps to average over.
 fn window(steps: usize) -> usize {
     (steps / 4).clamp(1, WINDOW)
 }
 
 fn pairs_power(trainer: &Trainer) -> f64 {
-    let copies = |density: &Option<Density>| matches!(density, Some(Density::Mcmc(_)));
+    let copies = |density: &Option<DensityControl>| matches!(density, Some(DensityControl::Mcmc(_)));
     if trainer.recipe.stage.iter().any(|stage| copies(&stage.density)) {
         MCMC_PAIRS_POWER
     } else {
@@ -270,7 +269,7 @@ fn pairs_power(trainer: &Trainer) -> f64 {
     }
 }
 
-/// The number of splats over what is left of a run.
+/// Predicts the number of splats over the rest of a run.
 struct Growth {
     /// [`Forecast::growth_rate`].
     rate: f64,
@@ -281,21 +280,21 @@ struct Growth {
 }
 
 impl Growth {
-    /// Lets the stretch go by.
-    fn pass(&mut self, trainer: &Trainer, stretch: &Ahead) {
+    /// Advances by `stretch`.
+    fn advance(&mut self, trainer: &Trainer, stretch: &UpcomingStretch) {
         let stage = &trainer.recipe.stage[stretch.stage];
         let limit = (trainer.limit(stretch.stage, stretch.count_share) as f64).max(self.count);
         let grown = match &stage.density {
             None => self.count,
-            Some(Density::Mcmc(knobs)) => {
+            Some(DensityControl::Mcmc(knobs)) => {
                 self.count * f64::from(knobs.growth).powf(stretch.duration / knobs.every as f64)
             }
-            Some(Density::Taming(_)) => {
-                let before = stretch.share - stretch.duration / stage.steps as f64;
-                let left = (1.0 - stretch.share).max(0.0) / (1.0 - before).max(1e-9);
+            Some(DensityControl::Taming(_)) => {
+                let before = stretch.completed - stretch.duration / stage.steps as f64;
+                let left = (1.0 - stretch.completed).max(0.0) / (1.0 - before).max(1e-9);
                 limit - (limit - self.count) * left.powi(2)
             }
-            Some(Density::Fast(_)) => {
+            Some(DensityControl::Fast(_)) => {
                 let factor = stretch.image_scale / self.image_scale;
                 if factor > 1.0 {
                     self.aim = Some(Aim::new(trainer, factor, self.time, self.count));
@@ -308,7 +307,7 @@ impl Growth {
                     Some(_) => self.count,
                 }
             }
-            Some(Density::Classic(_)) => {
+            Some(DensityControl::Classic(_)) => {
                 let fades = GROWTH_FADES * trainer.pace;
                 let left = (-stretch.duration / fades).exp();
                 let added = self.rate * fades * (1.0 - left);

@@ -1,27 +1,27 @@
-//! What a held-out photograph alone can say of itself is fitted on its left half, and the right half is measured.
+//! Fits per-image parameters on the left half of a held-out photograph and measures the right half.
 //!
-//! Training cannot know the exposure or the exact pose of a photograph that it never saw. Where a recipe learns these for
-//! its training views, held-out views are therefore given theirs from pixels that are then not scored (Martin-Brualla et
-//! al. 2021, "NeRF in the Wild", section 5, do so for appearance codes).
+//! Training cannot determine the exposure or the exact pose of a photograph that it never saw. If a recipe learns these for its
+//! training views, those of held-out views are therefore fitted to pixels that are then not scored (Martin-Brualla et al. 2021,
+//! "NeRF in the Wild", section 5, do so for appearance codes).
 
 use crate::model::{Model, RenderOptions};
-use crate::socket::{PerViewAdam, tangent_gradient, turned};
+use crate::socket::{PerViewAdam, corrected, tangent_gradient};
 use irradia_measure::{Affine, psnr_masked};
 use irradia_scene::{Camera, Image, Photo};
 use irradia_splat::{OutputGradient, Renderer, SplatGradients};
 
-/// What is fitted.
+/// The parameters to fit.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct HalfFit {
     /// An affine map of colours.
     pub exposure: bool,
-    /// The camera's pose; of a field it stays as it is.
+    /// The camera's pose; not for fields.
     pub pose: bool,
 }
 
-/// Steps of the pose's descent: the first half of them at half size.
+/// Gradient steps of the pose: the first half at half resolution.
 const STEPS: usize = 100;
-/// Their rates in radians, and in units of the scene's extent: from, to.
+/// Initial and final learning rate, in radians and in units of the scene's extent.
 const RATES: [f32; 2] = [1e-3, 1e-5];
 
 impl HalfFit {
@@ -31,23 +31,23 @@ impl HalfFit {
     }
 }
 
-/// A photograph that was not trained on.
+/// A held-out photograph.
 #[derive(Clone, Copy)]
 pub struct HeldOut<'a> {
     /// Its camera, as the dataset has it.
     pub camera: &'a Camera,
     /// The photograph over the background, `[H, W, 3]`.
     pub truth: &'a Image,
-    /// `[H, W]`, 0 where the photograph does not count.
+    /// `[H, W]`, 0 for pixels to ignore.
     pub mask: Option<&'a [u8]>,
     /// How the scene is rendered.
     pub options: &'a RenderOptions,
-    /// Size of the scene, world units.
+    /// Extent of the scene, world units.
     pub extent: f32,
 }
 
-/// PSNR in dB over the right half of a held-out view, after what `fit` says was fitted on its left half; `None` where the mask
-/// leaves no pixel of a half.
+/// PSNR in dB over the right half of a held-out view, after fitting the parameters of `fit` on its left half; `None` if the mask
+/// excludes all pixels of a half.
 pub fn half_fit_psnr(model: &Model, renderer: &mut Renderer, view: &HeldOut, fit: HalfFit) -> Option<f64> {
     let HeldOut {
         truth, mask, options, ..
@@ -79,7 +79,7 @@ fn is_left(pixel: usize, width: usize) -> bool {
     pixel % width < width / 2
 }
 
-/// The pose at which the left half is met best, by gradient descent from `camera`.
+/// The pose that fits the left half best, by gradient descent from `camera`.
 fn fitted_pose(model: &Model, renderer: &mut Renderer, view: &HeldOut, fit: HalfFit) -> Camera {
     let HeldOut {
         truth,
@@ -130,13 +130,13 @@ fn fitted_pose(model: &Model, renderer: &mut Renderer, view: &HeldOut, fit: Half
         let shift = rate * extent;
         let v = tangent_gradient(&camera, &gradient);
         let change = adam.step(0, v, [rate, rate, rate, shift, shift, shift]);
-        camera = turned(&camera, change);
+        camera = corrected(&camera, change);
     }
     camera.intrinsics = size;
     camera
 }
 
-/// The gradient `[3, H, W]` of the sum of squared differences between `map` of `render` and `truth` over the pixels that count.
+/// The gradient `[3, H, W]` of the sum of squared differences between `map` of `render` and `truth` over the pixels of `counts`.
 fn squared_error_gradient(render: &Image, truth: &Image, map: &Affine, counts: impl Fn(usize) -> bool) -> Vec<f32> {
     let pixels = (render.width * render.height) as usize;
     let mut v_color = vec![0.0; 3 * pixels];
@@ -161,7 +161,7 @@ mod tests {
     use irradia_splat::Splats;
     use std::borrow::Cow;
 
-    /// Opaque blobs of many colours before a camera.
+    /// Opaque blobs of many colours in front of a camera.
     fn scene() -> (Model<'static>, Camera) {
         let mut rng = Rng::new(5, 5);
         let mut splats = Splats::zeros(400, 0);
@@ -183,13 +183,13 @@ mod tests {
     }
 
     #[test]
-    fn a_turned_camera_and_a_darker_photograph_are_found_from_the_left_half() {
+    fn a_rotated_camera_and_a_darker_photograph_are_recovered_from_the_left_half() {
         let (model, camera) = scene();
         let (mut renderer, options) = (Renderer::new(), RenderOptions::default());
         let mut truth = model.render(&mut renderer, &camera, &options).color;
         truth.data.iter_mut().for_each(|v| *v *= 0.7);
         let truth = truth.rounded_to_8_bits();
-        let off = turned(&camera, [0.006, -0.008, 0.004, 0.01, 0.0, -0.01]);
+        let off = corrected(&camera, [0.006, -0.008, 0.004, 0.01, 0.0, -0.01]);
         let mut psnr = |exposure, pose| {
             let fit = HalfFit { exposure, pose };
             let view = HeldOut {
@@ -209,6 +209,6 @@ mod tests {
         ];
         eprintln!("neither {neither:.1}, exposure {exposure:.1}, pose {pose:.1}, both {both:.1} dB");
         assert!(exposure > neither + 2.0 && both > exposure + 8.0 && both > pose + 8.0);
-        assert!(both > 38.0, "8 bits allow about 50 dB, the descent's last rate less");
+        assert!(both > 38.0, "8 bits allow about 50 dB, the final learning rate less");
     }
 }

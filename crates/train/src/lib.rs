@@ -1,4 +1,4 @@
-//! Training: recipes, the schedule, the loop, checkpoints and reports. Read [`Trainer::step`] first.
+//! Training: recipes, the schedule, the loop, checkpoints and reports. Start at [`Trainer::step`].
 #![forbid(unsafe_code)]
 
 pub mod checkpoint;

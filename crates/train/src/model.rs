@@ -1,4 +1,4 @@
-//! What a run makes: splats or a field. Every place that renders them differently is here.
+//! The result of a run: splats or a field. All code that renders them differently is here.
 
 use crate::socket::added_colors;
 use irradia_field::{Field, render_view};
@@ -13,29 +13,29 @@ pub enum Model<'a> {
     Splats {
         /// The Gaussians.
         splats: Cow<'a, Splats>,
-        /// What adds to their colours.
+        /// The field that adds to their colours.
         residual: Option<Box<Field>>,
     },
     /// A radiance field.
     Field(Cow<'a, Field>),
 }
 
-/// How a [`Model`] is rendered; what does not concern its kind is ignored.
+/// How a [`Model`] is rendered; options that do not apply to its kind are ignored.
 pub type RenderOptions = irradia_splat::RenderOptions;
 
-/// What a camera sees of a [`Model`].
+/// A rendered frame of a [`Model`].
 #[derive(Clone, Debug)]
 pub struct Frame {
     /// Colour over the background, `[H, W, 3]`, sRGB.
     pub color: Image,
-    /// How much of each pixel is covered, `[H * W]`.
+    /// Coverage of each pixel, `[H * W]`.
     pub alpha: Vec<f32>,
-    /// Depth along the camera's +Z times alpha, `[H * W]`, world units; empty where it was not asked for.
+    /// Depth along the camera's +Z times alpha, `[H * W]`, world units; empty if not requested.
     pub depth: Vec<f32>,
 }
 
 impl Model<'_> {
-    /// What `camera` sees; `renderer` keeps its buffers from frame to frame.
+    /// Renders the view of `camera`; `renderer` reuses its buffers from frame to frame.
     pub fn render(&self, renderer: &mut Renderer, camera: &Camera, options: &RenderOptions) -> Frame {
         let (width, height) = (camera.intrinsics.width, camera.intrinsics.height);
         let pixels = width as usize * height as usize;
@@ -82,7 +82,7 @@ impl Model<'_> {
         }
     }
 
-    /// The same model, owned; only what is borrowed is copied.
+    /// The same model, owned; only borrowed parts are copied.
     pub fn into_owned(self) -> Model<'static> {
         match self {
             Model::Splats { splats, residual } => Model::Splats {
@@ -93,7 +93,7 @@ impl Model<'_> {
         }
     }
 
-    /// Gaussians, where that is what it is.
+    /// The Gaussians, if it consists of splats.
     pub fn splats(&self) -> Option<&Splats> {
         match self {
             Model::Splats { splats, .. } => Some(splats),
@@ -101,7 +101,7 @@ impl Model<'_> {
         }
     }
 
-    /// The field, where that is what it is.
+    /// The field, if it is one.
     pub fn field(&self) -> Option<&Field> {
         match self {
             Model::Splats { .. } => None,

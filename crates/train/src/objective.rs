@@ -1,4 +1,4 @@
-//! What a frame is compared by: every loss of the plan, added up with its gradients.
+//! The training objective: every loss of the plan, summed, with gradients.
 
 use crate::edges::{edges, unit_range};
 use crate::photos::Prepared;
@@ -13,21 +13,21 @@ use irradia_splat::{FramePlanes, Gather, OutputGradient};
 use rayon::prelude::*;
 use std::sync::Arc;
 
-/// Side of the square that LPIPS looks at in a step, pixels.
+/// Side of the random LPIPS crop of a step, pixels.
 pub(crate) const PATCH: usize = 128;
-/// How sharply an edge of the photograph permits one in depth: of 0.1 counts 1 / e (Godard et al. 2017 have 1 for colours
-/// that were normalised otherwise).
+/// Edge sensitivity of depth smoothness: a colour edge of 0.1 reduces it to 1 / e (Godard et al. 2017 use 1 for colours normalised
+/// differently).
 const EDGE_SHARPNESS: f32 = 10.0;
 
-/// All losses with their working memory, and the gradients that the last frame had.
+/// All losses with their working memory, and the gradients of the last frame.
 pub struct Objective {
-    /// Weights of the perceptual loss, which is left out without them.
+    /// Weights of the perceptual loss, which is skipped without them.
     pub lpips: Option<Arc<Lpips>>,
     photometric: PhotometricLoss,
     coarse: CoarseLoss,
     depth: DepthLoss,
     smooth: SmoothLoss,
-    /// The photograph over a background that is not its own.
+    /// The photograph over the random background.
     recolored: Vec<u8>,
     v_color: Vec<f32>,
     v_alpha: Vec<f32>,
@@ -37,14 +37,14 @@ pub struct Objective {
     has: Has,
 }
 
-/// Which gradients the last frame had.
+/// Which gradients the last frame has.
 #[derive(Clone, Copy, Default)]
 struct Has {
     alpha: bool,
     depth: bool,
 }
 
-/// What a frame's loss was.
+/// The loss of a frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ObjectiveValues {
     /// The weighted sum.
@@ -55,18 +55,18 @@ pub struct ObjectiveValues {
     pub mse: f64,
 }
 
-/// What a frame is compared with.
+/// The reference of a frame.
 pub struct Reference<'a> {
     /// The photograph.
     pub photo: &'a Prepared,
-    /// What lies behind the photograph and behind the frame, where that changes from step to step.
+    /// Background of the photograph and of the frame, if it is random per step.
     pub background: Option<[f32; 3]>,
     /// Known depths.
     pub depths: &'a [DepthSample],
 }
 
 impl Objective {
-    /// With nothing evaluated.
+    /// With no frame evaluated.
     pub fn new(lpips: Option<Arc<Lpips>>) -> Self {
         Self {
             lpips,
@@ -84,7 +84,7 @@ impl Objective {
         }
     }
 
-    /// Compares `frame`; where depth has a weight it was rendered with depth.
+    /// Evaluates `frame`; if depth has a weight it must have been rendered with depth.
     pub fn evaluate(
         &mut self,
         frame: FramePlanes,
@@ -126,7 +126,7 @@ impl Objective {
         let weight = plan.value(Param::PerceptualWeight);
         if let Some(lpips) = self.lpips.as_ref().filter(|_| weight > 0.0) {
             let crop = Crop::random(width, height, PATCH, rng);
-            // An image too small for the network has no perceptual loss.
+            // Images too small for the network are skipped.
             if let Ok(loss) = perceptual(lpips, color, &target, crop, weight, &mut self.v_color) {
                 total += f64::from(weight) * loss;
             }
@@ -178,7 +178,7 @@ impl Objective {
         }
     }
 
-    /// The mean absolute difference of each pixel of the frame last evaluated, for [`Gather::Error`].
+    /// Computes the mean absolute difference of each pixel of the frame last evaluated, for [`Gather::Error`].
     pub fn error(&mut self, color: &[f32], photo: &Prepared, recolored: bool) {
         let (width, pixels) = (photo.width as usize, photo.rgb.len() / 3);
         let rgb = if recolored { &self.recolored } else { &photo.rgb };
@@ -197,30 +197,30 @@ impl Objective {
         });
     }
 
-    /// Mixes the photograph's edges into what [`Objective::error`] left, as the saliency of Taming 3DGS has them: each from
-    /// its least to its largest, `share` of edges to 1 - `share` of error.
-    pub fn add_edges(&mut self, photo: &Prepared, share: f32) {
+    /// Mixes the photograph's edges into the result of [`Objective::error`], as the saliency of Taming 3DGS does: each is normalised to
+    /// its range, then weighted by `fraction` for edges and 1 - `fraction` for the error.
+    pub fn add_edges(&mut self, photo: &Prepared, fraction: f32) {
         edges(photo, &mut self.edges);
         let (of_error, of_edges) = (unit_range(&self.error), unit_range(&self.edges));
         for (i, (error, edge)) in self.error.iter_mut().zip(&self.edges).enumerate() {
             let counts = photo.mask.as_ref().is_none_or(|mask| mask[i] != 0);
             let mixed =
-                (1.0 - share) * (*error - of_error[0]) * of_error[1] + share * (edge - of_edges[0]) * of_edges[1];
+                (1.0 - fraction) * (*error - of_error[0]) * of_error[1] + fraction * (edge - of_edges[0]) * of_edges[1];
             *error = if counts { mixed } else { 0.0 };
         }
     }
 
-    /// The mean of what [`Objective::error`] left.
+    /// The mean of the result of [`Objective::error`].
     pub fn mean_error(&self) -> f64 {
         self.error.iter().map(|e| f64::from(*e)).sum::<f64>() / self.error.len().max(1) as f64
     }
 
-    /// The gradient of the colour last evaluated, `[3, H, W]`, for what sits between it and the scene's own.
+    /// The gradient of the colour last evaluated, `[3, H, W]`, for components between it and the scene's colour.
     pub fn v_color_mut(&mut self) -> &mut [f32] {
         &mut self.v_color
     }
 
-    /// The gradients of the frame last evaluated; `gather` and `camera` are left to the caller.
+    /// The gradients of the frame last evaluated; `gather` and `camera` are left for the caller to set.
     pub fn gradient(&self) -> OutputGradient<'_> {
         OutputGradient {
             alpha: self.has.alpha.then_some(&self.v_alpha[..]),
@@ -229,7 +229,7 @@ impl Objective {
         }
     }
 
-    /// What [`Objective::error`] left.
+    /// The result of [`Objective::error`].
     pub fn gather_error(&self) -> Gather<'_> {
         Gather::Error(&self.error)
     }

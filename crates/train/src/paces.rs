@@ -1,16 +1,16 @@
-//! The pace of each step as it was: with a budget it depends on the clock, and everything that is trained on it.
+//! The pace of each step of a run: with a budget it depends on the clock, and with it all results of training.
 
-/// Paces in the order of steps: from a step on, until the next pair. A run that repeats them writes the bytes of the run that
-/// they were taken from, whatever the clock says.
+/// Paces in the order of steps: each holds from its step until the next pair. A run that repeats them writes the same bytes as
+/// the original run, independent of the clock.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Paces(Vec<(u64, f64)>);
 
 impl Paces {
-    /// Reads lines of `step pace`, the step being the first (from 1) that has the pace. What follows the last newline was cut
-    /// and does not count.
+    /// Parses lines of `step pace`, where step is the first (from 1) with that pace. Text after the last newline is a truncated line
+    /// and is ignored.
     ///
     /// # Errors
-    /// One line that names the number of the line that is none of these, or says that there is none.
+    /// One line that names the number of the invalid line, or says that there are no lines.
     pub fn parse(text: &str) -> Result<Self, String> {
         let whole = text.rfind('\n').map_or("", |end| &text[..end]);
         let pair = |(number, line): (usize, &str)| {
@@ -18,7 +18,7 @@ impl Paces {
                 let pace: f64 = pace.parse().ok()?;
                 Some((step.parse().ok()?, pace)).filter(|_| pace > 0.0 && pace.is_finite())
             });
-            pair.ok_or_else(|| format!("line {} is no step and pace", number + 1))
+            pair.ok_or_else(|| format!("line {} is not a step and a pace", number + 1))
         };
         let pairs: Vec<(u64, f64)> = whole.lines().enumerate().map(pair).collect::<Result<_, _>>()?;
         let ascend = pairs.windows(2).all(|pair| pair[0].0 < pair[1].0);
@@ -28,12 +28,12 @@ impl Paces {
         }
     }
 
-    /// The line of a step that has another pace than the one before. The pace is written so that it reads back to the bit.
+    /// The line of a step whose pace differs from the previous one. The pace is written such that it parses to the same bits.
     pub fn line(step: u64, pace: f64) -> String {
         format!("{step} {pace}\n")
     }
 
-    /// The pace of `step`, from 1; behind the last one its own.
+    /// The pace of `step`, from 1; after the last pair, its pace.
     pub(crate) fn at(&self, step: u64) -> Option<f64> {
         let next = self.0.partition_point(|(first, _)| *first <= step);
         Some(self.0[next.checked_sub(1)?].1)
@@ -45,7 +45,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn paces_read_back_to_the_bit_and_hold_until_the_next() {
+    fn paces_round_trip_bit_for_bit_and_hold_until_the_next() {
         let (third, tiny) = (1.0 / 3.0, f64::MIN_POSITIVE);
         let text = Paces::line(1, third) + &Paces::line(4, tiny) + &Paces::line(9, 1e300) + "12 0.5";
         let paces = Paces::parse(&text).unwrap();

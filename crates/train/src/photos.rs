@@ -1,4 +1,4 @@
-//! The training photographs in memory, as 8 bits, within a budget: a scene larger than memory still trains.
+//! Training photographs in memory, as 8 bits, within a budget: scenes larger than memory can be trained.
 
 use irradia_scene::{Dataset, LoadError, Photo};
 use rayon::prelude::*;
@@ -17,9 +17,9 @@ pub struct Prepared {
     pub rgb: Vec<u8>,
     /// `[H, W]`, where the photograph has an alpha channel.
     pub alpha: Option<Vec<u8>>,
-    /// `[H, W]`, 0 where the pixel must not be trained on.
+    /// `[H, W]`, 0 for pixels excluded from training.
     pub mask: Option<Vec<u8>>,
-    /// What `rgb` lies over.
+    /// The background of `rgb`.
     pub background: [f32; 3],
 }
 
@@ -52,21 +52,21 @@ impl Prepared {
     }
 }
 
-/// Photographs that are loaded when needed and dropped when they would exceed the budget.
+/// Photographs that are loaded on demand and evicted when they would exceed the budget.
 pub struct PhotoCache {
     dataset: Arc<Dataset>,
     background: [f32; 3],
     budget: usize,
     held: HashMap<usize, Arc<Prepared>>,
     bytes: usize,
-    /// Size relative to the data's; a change drops everything.
+    /// Size relative to the data's; a change evicts everything.
     scale: f32,
-    /// Seconds spent on loading since [`Self::take_seconds`] asked.
+    /// Seconds spent on loading since the last [`Self::take_seconds`].
     seconds: f64,
 }
 
 impl PhotoCache {
-    /// Holds at most `budget` bytes, but always the photograph in use.
+    /// Holds at most `budget` bytes, but always at least the current photograph.
     pub fn new(dataset: Arc<Dataset>, background: [f32; 3], budget: usize) -> Self {
         Self {
             dataset,
@@ -79,28 +79,28 @@ impl PhotoCache {
         }
     }
 
-    /// Wall-clock seconds that loading took since this was last asked.
+    /// Wall-clock seconds of loading since the last call.
     pub fn take_seconds(&mut self) -> f64 {
         std::mem::take(&mut self.seconds)
     }
 
-    /// View `coming[0]`'s photograph at `scale`. When it must be loaded, those that come next are too, in parallel, as
-    /// many as there is room for; those that come last, or not at all, make room.
+    /// The photograph of view `upcoming[0]` at `scale`. If it must be loaded, the next ones are loaded with it, in parallel, as
+    /// far as there is room; those needed last, or not at all, are evicted.
     ///
     /// # Errors
     /// When a photograph cannot be read.
-    pub fn get(&mut self, coming: &[usize], scale: f32) -> Result<Arc<Prepared>, LoadError> {
+    pub fn get(&mut self, upcoming: &[usize], scale: f32) -> Result<Arc<Prepared>, LoadError> {
         if scale != self.scale {
             self.held.clear();
             self.bytes = 0;
             self.scale = scale;
         }
-        let view = coming[0];
+        let view = upcoming[0];
         if let Some(photo) = self.held.get(&view) {
             return Ok(photo.clone());
         }
         let started = Instant::now();
-        let wanted = self.plan_loads(coming);
+        let wanted = self.plan_loads(upcoming);
         let (dataset, background) = (&self.dataset, self.background);
         let loaded: Vec<(usize, Result<Prepared, LoadError>)> = wanted
             .into_par_iter()
@@ -119,31 +119,31 @@ impl PhotoCache {
     pub fn scale_that_fits(&self, views: &[usize]) -> f32 {
         let total = |scale: f32| -> usize { views.iter().map(|view| self.size(*view, scale)).sum() };
         let mut scale = 1.0;
-        // Sides are rounded, so that a second try or a third may be needed; at a pixel each, it stays as it is.
+        // Sides are rounded, so that a second or third iteration may be needed; at one pixel each, this ends.
         while total(scale) > self.budget && scale > 1e-3 {
             scale *= 0.98 * (self.budget as f32 / total(scale) as f32).sqrt();
         }
         scale
     }
 
-    /// Most bytes that a view's photograph takes at `scale`.
+    /// Maximum number of bytes of a view's photograph at `scale`.
     fn size(&self, view: usize, scale: f32) -> usize {
         let k = self.dataset.views[view].camera.intrinsics.scaled(scale);
         4 * k.width as usize * k.height as usize
     }
 
-    /// Which views to load now: as many of the coming ones as fit beside what is needed sooner. Makes the room.
-    fn plan_loads(&mut self, coming: &[usize]) -> Vec<usize> {
+    /// Selects the views to load now: as many of the upcoming ones as fit beside those needed sooner. Evicts others to make room.
+    fn plan_loads(&mut self, upcoming: &[usize]) -> Vec<usize> {
         let mut planned = 0;
-        let keep: Vec<usize> = coming
+        let keep: Vec<usize> = upcoming
             .iter()
             .copied()
             .take_while(|view| {
                 planned += self.size(*view, self.scale);
-                planned <= self.budget || *view == coming[0]
+                planned <= self.budget || *view == upcoming[0]
             })
             .collect();
-        let all_fit = keep.len() == coming.len();
+        let all_fit = keep.len() == upcoming.len();
         if !all_fit || self.bytes + planned > self.budget {
             let bytes = &mut self.bytes;
             self.held.retain(|view, photo| {
@@ -154,7 +154,7 @@ impl PhotoCache {
                 stays
             });
         }
-        // When not everything fits, a batch of a few a thread keeps the threads busy without waiting long.
+        // If not everything fits, a batch of a few per thread keeps the threads busy without a long wait.
         let batch = if all_fit {
             keep.len()
         } else {
@@ -235,7 +235,7 @@ mod tests {
     }
 
     #[test]
-    fn another_background_shows_through_where_it_is_clear() {
+    fn a_new_background_shows_through_transparent_pixels() {
         let photo = Photo {
             width: 3,
             height: 1,
@@ -255,8 +255,8 @@ mod tests {
         let mut cache = PhotoCache::new(data, [0.0; 3], 1 << 20);
         for epoch in 0..3 {
             for i in 0..20 {
-                let coming: Vec<usize> = (0..20).map(|k| (i + k + epoch) % 20).collect();
-                assert_eq!(cache.get(&coming, 1.0).unwrap().rgb[0] as usize, coming[0]);
+                let upcoming: Vec<usize> = (0..20).map(|k| (i + k + epoch) % 20).collect();
+                assert_eq!(cache.get(&upcoming, 1.0).unwrap().rgb[0] as usize, upcoming[0]);
             }
         }
         assert_eq!(loads(&sources), 20);
@@ -264,12 +264,12 @@ mod tests {
     }
 
     #[test]
-    fn without_room_it_stays_within_the_budget_and_still_serves() {
+    fn without_room_the_budget_is_respected() {
         let (data, sources) = dataset(20);
         let mut cache = PhotoCache::new(data, [0.0; 3], 2000);
         for i in 0..40 {
-            let coming: Vec<usize> = (0..20).map(|k| (i + k) % 20).collect();
-            assert_eq!(cache.get(&coming, 1.0).unwrap().rgb[0] as usize, coming[0]);
+            let upcoming: Vec<usize> = (0..20).map(|k| (i + k) % 20).collect();
+            assert_eq!(cache.get(&upcoming, 1.0).unwrap().rgb[0] as usize, upcoming[0]);
             assert!(cache.bytes <= 2000 && cache.bytes == cache.held.values().map(|p| p.bytes()).sum::<usize>());
         }
         assert!(loads(&sources) >= 35);

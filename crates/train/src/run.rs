@@ -1,4 +1,4 @@
-//! The loop around [`Trainer::step`]: when to stop, when to look, whom to tell.
+//! The loop around [`Trainer::step`]: when to stop and to evaluate, and events to observers.
 
 use crate::eval::{EvalOptions, Metrics, evaluate_views, mean};
 use crate::event::{Event, Observer, Signal, StepReport};
@@ -10,32 +10,32 @@ use crate::trainer::{TrainError, Trainer};
 use std::ops::ControlFlow;
 use std::time::{Duration, Instant};
 
-/// When a run ends before its recipe does, and what sets its pace.
+/// When a run ends before its recipe is complete, and what sets its pace.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct RunLimits {
     /// Held-out PSNR in dB at which to stop.
     pub until_psnr: Option<f64>,
-    /// Seconds of training into which the whole recipe is to be fitted.
+    /// Seconds of training into which the whole recipe is fitted.
     pub budget: Option<f64>,
-    /// Paces to repeat; they go before a budget.
+    /// Paces to repeat; they take precedence over a budget.
     pub paces: Option<Paces>,
 }
 
-/// Steps between looks at the held-out views when `until_psnr` waits for them.
+/// Steps between evaluations of the held-out views for `until_psnr`.
 const UNTIL_PSNR_EVERY: u64 = 50;
 
-/// Time between questions to the observers of a paused run: short for a person, and no load.
+/// Interval at which observers of a paused run are polled: imperceptible to a person, and a negligible load.
 const PAUSE_INTERVAL: Duration = Duration::from_millis(20);
 
-/// What the observers want, taken together.
+/// The combined requests of the observers.
 #[derive(Clone, Copy, Default)]
-struct Wishes {
+struct Requests {
     save: bool,
     pause: bool,
     stop: bool,
 }
 
-impl Wishes {
+impl Requests {
     fn add(&mut self, signal: Signal) {
         match signal {
             Signal::Continue => {}
@@ -46,7 +46,7 @@ impl Wishes {
     }
 }
 
-/// Trains until the recipe is over, a limit is reached or an observer says stop; returns why it ended.
+/// Trains until the recipe is complete, a limit is reached or an observer requests a stop; returns the reason.
 ///
 /// # Errors
 /// When a photograph cannot be read.
@@ -72,13 +72,13 @@ pub fn run(
         });
     }
     let mut forecast = Forecast::default();
-    let mut wishes = tell(trainer, &mut events, observers);
-    wait_while_paused(trainer, &mut wishes, &mut events, observers);
+    let mut requests = tell(trainer, &mut events, observers);
+    wait_while_paused(trainer, &mut requests, &mut events, observers);
     let mut reason = None;
-    // What the first splats took to load is not between the steps.
+    // Loading for the first splats is not part of the steps.
     trainer.photos.take_seconds();
     let (began, before) = (Instant::now(), trainer.times.wall);
-    while reason.is_none() && !wishes.stop && !trainer.finished() {
+    while reason.is_none() && !requests.stop && !trainer.finished() {
         let due = plan(&trainer.recipe, &trainer.clock);
         forecast.observe(trainer, &due, limits.budget.is_some());
         if let Some(budget) = limits.budget {
@@ -87,10 +87,10 @@ pub fn run(
         if let Some(pace) = limits.paces.as_ref().and_then(|paces| paces.at(trainer.clock.step + 1)) {
             trainer.pace = pace;
         }
-        let looks = due.evaluate || (limits.until_psnr.is_some() && is_due(&trainer.clock, UNTIL_PSNR_EVERY));
+        let evaluates = due.evaluate || (limits.until_psnr.is_some() && is_due(&trainer.clock, UNTIL_PSNR_EVERY));
         let left = forecast.seconds_left(trainer);
         let range = match limits.budget {
-            // The pace is set such that it holds.
+            // The pace follows the budget.
             Some(_) => [left; 2],
             None => forecast::range(left, &trainer.recipe, &trainer.clock),
         };
@@ -101,7 +101,7 @@ pub fn run(
         };
         trainer.times.loading += trainer.photos.take_seconds();
         events.insert(0, Event::Step(report));
-        if looks && !trainer.dataset.test.is_empty() {
+        if evaluates && !trainer.dataset.test.is_empty() {
             let (step, seconds, splats) = (trainer.clock.step, trainer.seconds, trainer.engine.len());
             let started = Instant::now();
             let psnr = held_out_psnr(trainer, observers)?;
@@ -119,21 +119,21 @@ pub fn run(
                 reason = Some("held-out PSNR reached");
             }
         }
-        wishes = tell(trainer, &mut events, observers);
+        requests = tell(trainer, &mut events, observers);
         trainer.times.wall = before + began.elapsed().as_secs_f64();
-        if due.checkpoint || wishes.save || wishes.stop {
+        if due.checkpoint || requests.save || requests.stop {
             let started = Instant::now();
             save(trainer, &mut events, observers);
             trainer.times.saving += started.elapsed().as_secs_f64();
         }
         if reason.is_none() && !trainer.finished() {
             let started = Instant::now();
-            wait_while_paused(trainer, &mut wishes, &mut events, observers);
+            wait_while_paused(trainer, &mut requests, &mut events, observers);
             trainer.times.paused += started.elapsed().as_secs_f64();
         }
         trainer.times.wall = before + began.elapsed().as_secs_f64();
     }
-    let stopped = if wishes.stop { "stopped" } else { "recipe complete" };
+    let stopped = if requests.stop { "stopped" } else { "recipe complete" };
     let reason = reason.unwrap_or(stopped).to_owned();
     events.push(Event::Finished {
         step: trainer.clock.step,
@@ -159,48 +159,48 @@ fn save(trainer: &Trainer, events: &mut Vec<Event>, observers: &mut [&mut dyn Ob
     }
 }
 
-fn tell(trainer: &Trainer, events: &mut Vec<Event>, observers: &mut [&mut dyn Observer]) -> Wishes {
-    let mut wishes = Wishes::default();
+fn tell(trainer: &Trainer, events: &mut Vec<Event>, observers: &mut [&mut dyn Observer]) -> Requests {
+    let mut requests = Requests::default();
     for event in events.drain(..) {
         for observer in observers.iter_mut() {
-            wishes.add(observer.on_event(&event, trainer));
+            requests.add(observer.on_event(&event, trainer));
         }
     }
     let warnings = observers.iter_mut().filter_map(|observer| observer.warning());
     events.extend(warnings.map(|message| Event::Warned { message }));
-    wishes
+    requests
 }
 
-/// Sleeps while an observer wants a pause and none wants to stop.
+/// Waits while an observer requests a pause and none requests a stop.
 fn wait_while_paused(
     trainer: &Trainer,
-    wishes: &mut Wishes,
+    requests: &mut Requests,
     events: &mut Vec<Event>,
     observers: &mut [&mut dyn Observer],
 ) {
-    if !wishes.pause || wishes.stop {
+    if !requests.pause || requests.stop {
         return;
     }
     let step = trainer.clock.step;
     events.push(Event::Paused { step });
-    wishes.stop |= tell(trainer, events, observers).stop;
-    while wishes.pause && !wishes.stop {
+    requests.stop |= tell(trainer, events, observers).stop;
+    while requests.pause && !requests.stop {
         std::thread::sleep(PAUSE_INTERVAL);
-        *wishes = Wishes::default();
+        *requests = Requests::default();
         for observer in observers.iter_mut() {
-            wishes.add(observer.while_paused(trainer));
+            requests.add(observer.while_paused(trainer));
         }
-        if wishes.save || wishes.stop {
+        if requests.save || requests.stop {
             save(trainer, events, observers);
-            wishes.stop |= tell(trainer, events, observers).stop;
+            requests.stop |= tell(trainer, events, observers).stop;
         }
     }
     events.push(Event::Resumed { step });
-    wishes.stop |= tell(trainer, events, observers).stop;
+    requests.stop |= tell(trainer, events, observers).stop;
 }
 
-/// Mean PSNR over the held-out views, with the SH bands in use now; NaN where none could be measured or an
-/// observer wants to stop meanwhile.
+/// Mean PSNR over the held-out views, with the SH bands currently in use; NaN if none could be measured or an observer
+/// requests a stop meanwhile.
 fn held_out_psnr(trainer: &Trainer, observers: &[&mut dyn Observer]) -> Result<f64, TrainError> {
     let options = EvalOptions {
         render: trainer.render_options(plan(&trainer.recipe, &trainer.clock).sh_degree),

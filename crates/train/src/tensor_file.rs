@@ -1,9 +1,9 @@
-//! Named tensors in safetensors files: of checkpoints, and of what lies beside a scene.
+//! Named tensors in safetensors files: of checkpoints, and of files beside a scene.
 
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use std::collections::HashMap;
 
-/// Numbers with a name and a shape.
+/// A named array of numbers.
 #[derive(Clone, Debug, PartialEq)]
 pub struct NamedTensor {
     /// Unique within its owner.
@@ -15,7 +15,7 @@ pub struct NamedTensor {
 }
 
 impl NamedTensor {
-    /// Of 32-bit floats, as many as `shape` has.
+    /// 32-bit floats, as many as `shape` holds.
     pub fn real(name: impl Into<String>, shape: Vec<usize>, values: &[f32]) -> Self {
         Self {
             name: name.into(),
@@ -25,7 +25,7 @@ impl NamedTensor {
         }
     }
 
-    /// Of counts, in one dimension.
+    /// Integers, one-dimensional.
     pub fn whole(name: impl Into<String>, values: &[u64]) -> Self {
         Self {
             name: name.into(),
@@ -41,24 +41,23 @@ impl NamedTensor {
         Self { name, ..self }
     }
 
-    /// Its name, and itself as the safetensors crate takes it.
+    /// Its name, and its view for the safetensors crate.
     ///
     /// # Panics
-    /// When shape and values do not agree: a bug of its owner.
+    /// When shape and values do not match: a bug in its owner.
     pub(crate) fn view(&self) -> (&str, TensorView<'_>) {
         let view = TensorView::new(self.dtype, self.shape.clone(), &self.bytes).expect("shape and values agree");
         (&self.name, view)
     }
 }
 
-/// `tensors` as a safetensors file with `metadata` in its header: one pair, since the order of several would differ from run
-/// to run.
+/// `tensors` as a safetensors file with `metadata` in its header: one pair, since the order of several would vary between runs.
 pub fn to_bytes(tensors: &[NamedTensor], (key, value): (&str, String)) -> Vec<u8> {
     let metadata = HashMap::from([(key.to_owned(), value)]);
     safetensors::serialize(tensors.iter().map(NamedTensor::view), Some(metadata)).expect("in memory")
 }
 
-/// The tensors of a file whose names begin with a prefix.
+/// The tensors of a file with a common prefix.
 #[derive(Clone, Copy)]
 pub struct TensorSource<'a> {
     file: &'a SafeTensors<'a>,
@@ -66,7 +65,7 @@ pub struct TensorSource<'a> {
 }
 
 impl<'a> TensorSource<'a> {
-    /// Those of `file` that begin with `prefix`.
+    /// The tensors of `file` that begin with `prefix`.
     pub fn new(file: &'a SafeTensors<'a>, prefix: &'a str) -> Self {
         Self { file, prefix }
     }
@@ -76,7 +75,7 @@ impl<'a> TensorSource<'a> {
         (view.dtype() == dtype).then_some(view)
     }
 
-    /// The 32-bit floats called `name`.
+    /// The 32-bit floats named `name`.
     pub fn real(&self, name: &str) -> Option<Vec<f32>> {
         let view = self.view(name, Dtype::F32)?;
         Some(
@@ -89,10 +88,10 @@ impl<'a> TensorSource<'a> {
         )
     }
 
-    /// The 32-bit floats called `name`, of the shape `[rows, N]`.
+    /// The 32-bit floats named `name`, of shape `[rows, N]`.
     ///
     /// # Errors
-    /// One line, when they are missing or have another shape.
+    /// One line, when they are missing or of another shape.
     pub fn rows<const N: usize>(&self, name: &str, rows: usize) -> Result<Vec<[f32; N]>, String> {
         let view = self.view(name, Dtype::F32).ok_or(format!("{name} is missing"))?;
         if view.shape() != [rows, N] {
@@ -102,7 +101,7 @@ impl<'a> TensorSource<'a> {
         Ok(values.as_chunks().0.to_vec())
     }
 
-    /// The counts called `name`.
+    /// The integers named `name`.
     pub fn whole(&self, name: &str) -> Option<Vec<u64>> {
         let view = self.view(name, Dtype::U64)?;
         Some(

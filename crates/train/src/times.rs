@@ -1,14 +1,13 @@
-//! Where the time of a run goes.
+//! The time breakdown of a run.
 
-/// Wall-clock seconds between a run's first step and its last, and what they went into; over all sessions of a run that was
-/// resumed.
+/// Wall-clock seconds between a run's first step and its last, with their breakdown; over all sessions of a resumed run.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Times {
-    /// Everything; what is not named below and not in `Trainer::seconds` is spent on events and forecasts.
+    /// Total; the part in neither the fields below nor `Trainer::seconds` is spent on events and forecasts.
     pub wall: f64,
-    /// Waiting for photographs.
+    /// Loading photographs.
     pub loading: f64,
-    /// Density control, which `Trainer::seconds` holds too.
+    /// Density control, which `Trainer::seconds` includes.
     pub density: f64,
     /// Evaluating held-out views.
     pub evaluating: f64,

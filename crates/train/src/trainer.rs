@@ -1,4 +1,4 @@
-//! Read this first: [`Trainer::step`] is one step from batch to update.
+//! Start here: [`Trainer::step`] is one step from batch to update.
 
 use crate::event::{Event, StepReport};
 use crate::field_step::{first_field, is_field};
@@ -6,8 +6,8 @@ use crate::half_fit::HalfFit;
 use crate::model::Model;
 use crate::objective::{Objective, Reference};
 use crate::photos::{PhotoCache, Prepared};
-use crate::recipe::{AdamKind, Density, LengthUnit, Param, Recipe};
-use crate::schedule::{Clock, Round, Signal, StepPlan, coming_views, plan};
+use crate::recipe::{AdamKind, DensityControl, LengthUnit, Param, Recipe};
+use crate::schedule::{Clock, Round, StepMetrics, StepPlan, plan, upcoming_views};
 use crate::socket::{Residual, Sockets};
 use crate::times::Times;
 use cpu_time::ProcessTime;
@@ -16,7 +16,7 @@ use irradia_field::{FieldError, FieldState, KnownDepth};
 use irradia_measure::{DepthSample, Lpips};
 use irradia_scene::{Camera, Dataset, LoadError, PointCloud, Rng, View, sh};
 use irradia_splat::densify::{DensityChange, classic, fast, mcmc, merge, taming};
-use irradia_splat::init::{self, InitOptions, Look};
+use irradia_splat::init::{self, InitOptions, PixelClass};
 use irradia_splat::{
     Engine, FramePlanes, Gather, Noise, Optimizer, RenderOptions, SplatState, Splats, Statistics, Update, ViewParams,
     filter,
@@ -26,27 +26,27 @@ use std::collections::HashMap;
 use std::sync::Arc;
 use std::time::Instant;
 
-/// Why training could not go on: one line.
+/// Why training failed: one line.
 #[derive(Debug, thiserror::Error)]
 pub enum TrainError {
     /// A photograph could not be read.
     #[error(transparent)]
     Photo(#[from] LoadError),
-    /// There is nothing to train on.
+    /// There are no training views.
     #[error("the dataset has {0} training views; at least 1 is needed after holding some out")]
     NoViews(usize),
-    /// There is nothing to start from.
+    /// There are no initial points.
     #[error(
-        "there is nothing to start from: no points, and no space that the cameras share and the masks leave; check poses and masks"
+        "no initial points: the dataset has none, and the unmasked camera frusta do not overlap; check poses and masks"
     )]
     NoPoints,
-    /// There is no space for a field.
-    #[error("there is no space for a field: the cameras do not look at anything together; check poses")]
+    /// The cameras determine no space for a field.
+    #[error("the cameras determine no space for a field: they do not look at a common region; check poses")]
     NoSpace,
-    /// A field has nothing to hand on.
-    #[error("the field shows no surface that splats could begin as: give its stage more steps")]
+    /// A field has no surface.
+    #[error("the field has no surface on which splats could be initialised: give its stage more steps")]
     NoSurface,
-    /// A field cannot be.
+    /// The field configuration is invalid.
     #[error(transparent)]
     Field(#[from] FieldError),
     /// A checkpoint does not fit.
@@ -54,21 +54,21 @@ pub enum TrainError {
     Checkpoint(String),
 }
 
-/// What a run is asked for beside its recipe.
+/// Options of a run beside its recipe.
 #[derive(Clone)]
 pub struct TrainOptions {
-    /// Everything random follows from it.
+    /// Random seed.
     pub seed: u64,
     /// Steps of the run; the recipe's own number when `None`.
     pub steps: Option<u64>,
-    /// Bytes that photographs may take.
+    /// Memory budget for photographs, bytes.
     pub photo_budget: usize,
-    /// Weights of the perceptual loss; a recipe's is left out without them.
+    /// Weights of the perceptual loss; without them a recipe's perceptual loss is skipped.
     pub lpips: Option<Arc<Lpips>>,
 }
 
 impl Default for TrainOptions {
-    /// Seed 0, the recipe's steps, 2 GiB of photographs (5,500 of 360 x 360: what fits beside the rest on an 8 GiB machine).
+    /// Seed 0, the recipe's steps, 2 GiB of photographs (5,500 of 360 x 360: what remains on an 8 GiB machine).
     fn default() -> Self {
         Self {
             seed: 0,
@@ -79,53 +79,53 @@ impl Default for TrainOptions {
     }
 }
 
-/// Streams of the run's seed; each use of chance has its own.
+/// Random streams derived from the run's seed, one per use.
 const STREAM_INIT: u64 = 1;
 const STREAM_DENSIFY: u64 = 2;
 const STREAM_STEP: u64 = 5;
 
-/// Training views over which the error is measured.
+/// Training views over which the convergence error is measured.
 const MEASURED_VIEWS: usize = 8;
 
-/// A run in the making.
+/// A run's whole state.
 pub struct Trainer {
-    /// The recipe, resolved.
+    /// The resolved recipe.
     pub recipe: Recipe,
-    /// The data.
+    /// The dataset.
     pub dataset: Arc<Dataset>,
     /// The splats; none while a field is trained.
     pub engine: Engine,
-    /// The field, in the stages that train one.
+    /// The field, in stages that train one.
     pub field: Option<FieldState>,
-    /// What is trained beside the splats.
+    /// The trained components beside the splats.
     pub sockets: Sockets,
-    /// Where the run stands.
+    /// Position in the schedule.
     pub clock: Clock,
-    /// As given.
+    /// The options of the run.
     pub options: TrainOptions,
-    /// Recipe steps that go by in one step.
+    /// Recipe steps per step.
     pub pace: f64,
-    /// Size of the scene, world units: 1.1 times the largest distance of a camera from their mean (3DGS).
+    /// Extent of the scene, world units: 1.1 times the largest distance of a camera from their mean (3DGS).
     pub extent: f32,
-    /// Wall time of all steps so far; loading photographs and looking at held-out views are not in it.
+    /// Wall time of all steps so far, excluding the loading of photographs and the evaluation of held-out views.
     pub seconds: f64,
-    /// Processor time likewise, over all threads.
+    /// CPU time of all steps so far, over all threads.
     pub cpu_seconds: f64,
-    /// Wall time between the first step and the last, and where it went.
+    /// Wall time between the first step and the last, and its breakdown.
     pub times: Times,
-    /// Never more splats than this: the recipe's limits for this data.
+    /// Maximum number of splats: the recipe's limits for this dataset.
     pub cap: usize,
     pub(crate) photos: PhotoCache,
-    /// What is known of depth in the views that a field is trained on, by view, width and height.
+    /// Known depths of the views on which a field is trained, by view, width and height.
     pub(crate) depths: HashMap<(usize, u32, u32), Arc<[KnownDepth]>>,
     objective: Objective,
 }
 
 impl Trainer {
-    /// Makes the first splats.
+    /// Creates the first splats.
     ///
     /// # Errors
-    /// When there is nothing to train on or to start from, or photographs needed for colours cannot be read.
+    /// When there are no training views or no initial points, or photographs needed for colours cannot be read.
     pub fn new(dataset: Arc<Dataset>, recipe: Recipe, options: TrainOptions) -> Result<Self, TrainError> {
         let mut trainer = Self::unfilled(dataset, recipe, options)?;
         if is_field(&trainer.recipe, 0) {
@@ -138,7 +138,7 @@ impl Trainer {
         Ok(trainer)
     }
 
-    /// A trainer whose state is still to be filled, as a checkpoint does.
+    /// A trainer whose state is yet to be filled in, by a checkpoint for example.
     pub(crate) fn unfilled(dataset: Arc<Dataset>, recipe: Recipe, options: TrainOptions) -> Result<Self, TrainError> {
         if dataset.train.is_empty() {
             return Err(TrainError::NoViews(0));
@@ -165,7 +165,7 @@ impl Trainer {
         })
     }
 
-    /// The recipe's field, nothing learnt yet.
+    /// The recipe's field, untrained.
     pub(crate) fn first_field(&mut self) -> Result<FieldState, TrainError> {
         let transparent = self.transparent()?;
         let cameras = self.train_cameras();
@@ -177,19 +177,19 @@ impl Trainer {
         first_field(knobs, &self.dataset, &cameras, transparent, self.options.seed)
     }
 
-    /// What the recipe has in the sockets of a step, nothing learnt yet.
+    /// The recipe's components in the sockets of a step, untrained.
     pub(crate) fn first_sockets(&mut self) -> Result<Sockets, TrainError> {
-        // Only a residual field's space depends on it; photographs are not read for the others.
+        // Only a residual field's space depends on transparency; photographs are not read for the others.
         let transparent = self.recipe.residual.is_some() && self.transparent()?;
         Sockets::new(&self.recipe, &self.dataset, transparent, self.options.seed)
     }
 
-    /// Whether photographs have alpha, as the first one has or has not.
+    /// Whether photographs have alpha, judged by the first one.
     pub(crate) fn transparent(&mut self) -> Result<bool, TrainError> {
         Ok(self.photos.get(&self.dataset.train[..1], 1.0)?.alpha.is_some())
     }
 
-    /// How the first splats look.
+    /// Options of the first splats.
     pub(crate) fn init_options(&self) -> InitOptions {
         InitOptions {
             opacity: self.recipe.init.opacity,
@@ -203,7 +203,7 @@ impl Trainer {
         let dataset = self.dataset.clone();
         let most = self.recipe.max_splats;
         let splats = match dataset.points.as_ref().filter(|points| points.len() >= 10) {
-            // Evenly over the file: SfM writes points as it finds them, place by place.
+            // Evenly over the file: SfM writes points in the order in which it finds them, region by region.
             Some(points) if points.len() > most => {
                 let chosen = (0..most).map(|i| i * points.len() / most);
                 let (positions, colors) = chosen.map(|i| (points.positions[i], points.colors[i])).unzip();
@@ -215,11 +215,11 @@ impl Trainer {
                 let cameras: Vec<Camera> = views.iter().map(|v| v.camera).collect();
                 let bounds: Vec<Option<[f32; 2]>> = views.iter().map(|v| v.depth_bounds).collect();
                 let mut photos: Vec<Option<Arc<Prepared>>> = vec![None; views.len()];
-                // Colours are taken from all photographs in turn: where they do not fit, from smaller ones.
+                // Colours are taken from all photographs in turn: downscaled if they do not fit into memory.
                 let scale = self.photos.scale_that_fits(&dataset.train);
                 for (i, photo) in photos.iter_mut().enumerate() {
-                    let coming: Vec<usize> = dataset.train[i..].to_vec();
-                    *photo = Some(self.photos.get(&coming, scale)?);
+                    let upcoming: Vec<usize> = dataset.train[i..].to_vec();
+                    *photo = Some(self.photos.get(&upcoming, scale)?);
                 }
                 let mut rng = Rng::new(self.options.seed, STREAM_INIT);
                 let points = init::random_points(
@@ -235,11 +235,11 @@ impl Trainer {
                         let at = y * photo.width as usize + x;
                         let zero = |plane: &Option<Vec<u8>>| plane.as_ref().is_some_and(|plane| plane[at] == 0);
                         if zero(&photo.mask) {
-                            Look::Masked
+                            PixelClass::Masked
                         } else if zero(&photo.alpha) {
-                            Look::Empty
+                            PixelClass::Empty
                         } else {
-                            Look::Color([0, 1, 2].map(|c| photo.rgb[3 * at + c]))
+                            PixelClass::Color([0, 1, 2].map(|c| photo.rgb[3 * at + c]))
                         }
                     },
                 );
@@ -253,23 +253,23 @@ impl Trainer {
         Ok(splats)
     }
 
-    /// Steps this run will make, as far as is known.
+    /// Number of steps of this run, as far as known.
     pub fn total_steps(&self) -> u64 {
         let left = (self.recipe.total_steps() as f64 - self.clock.time).max(0.0);
         self.clock.step + (left / self.pace - 1e-6).ceil().max(0.0) as u64
     }
 
-    /// Whether the recipe is over.
+    /// Whether the recipe is complete.
     pub fn finished(&self) -> bool {
         self.clock.finished(&self.recipe)
     }
 
-    /// Numbers of the field, in the stages that train one.
+    /// Number of parameters of the field, in stages that train one.
     pub fn parameters(&self) -> Option<usize> {
         self.field.as_ref().map(|state| state.field.len())
     }
 
-    /// Name of the present stage.
+    /// Name of the current stage.
     pub fn stage_name(&self) -> &str {
         let stages = &self.recipe.stage;
         &stages[self.clock.stage.min(stages.len() - 1)].name
@@ -280,12 +280,12 @@ impl Trainer {
     /// # Errors
     /// When a photograph cannot be read.
     pub fn step(&mut self, events: &mut Vec<Event>) -> Result<StepReport, TrainError> {
-        let (report, signal) = if self.field.is_some() {
+        let (report, metrics) = if self.field.is_some() {
             self.field_step()?
         } else {
             self.splat_step(events)?
         };
-        if self.tick(signal) && !self.finished() {
+        if self.tick(metrics) && !self.finished() {
             events.push(Event::StageEntered {
                 stage: self.stage_name().to_owned(),
                 step: self.clock.step,
@@ -298,13 +298,13 @@ impl Trainer {
         Ok(report)
     }
 
-    fn splat_step(&mut self, events: &mut Vec<Event>) -> Result<(StepReport, Signal), TrainError> {
+    fn splat_step(&mut self, events: &mut Vec<Event>) -> Result<(StepReport, StepMetrics), TrainError> {
         let plan = plan(&self.recipe, &self.clock);
-        let coming = coming_views(&self.dataset.train, self.options.seed, &self.clock);
-        let photo = self.photos.get(&coming, plan.image_scale)?;
+        let upcoming = upcoming_views(&self.dataset.train, self.options.seed, &self.clock);
+        let photo = self.photos.get(&upcoming, plan.image_scale)?;
         let (started, cpu_started) = (Instant::now(), ProcessTime::now());
         let mut rng = Rng::new(self.options.seed ^ self.clock.step << 20, STREAM_STEP);
-        let view = coming[0];
+        let view = upcoming[0];
         let placement = self.sockets.place(view, &self.scaled_camera(view, plan.image_scale));
         let camera = placement.camera;
         if plan.refilter {
@@ -358,10 +358,10 @@ impl Trainer {
         self.seconds += started.elapsed().as_secs_f64();
         self.cpu_seconds += cpu_started.elapsed().as_secs_f64();
 
-        let signal = Signal {
+        let metrics = StepMetrics {
             error: loss.l1,
             measured: if plan.measure {
-                Some(self.measure_error(&coming, &plan)?)
+                Some(self.measure_error(&upcoming, &plan)?)
             } else {
                 None
             },
@@ -381,10 +381,10 @@ impl Trainer {
             visible: self.engine.visible(),
             non_finite: self.engine.non_finite(),
         };
-        Ok((report, signal))
+        Ok((report, metrics))
     }
 
-    /// What this step does to the splats with their gradients.
+    /// The splat update of this step.
     fn update(&self, plan: &StepPlan) -> Update {
         let mut rates = plan.rates();
         rates.means *= self.extent;
@@ -444,26 +444,26 @@ impl Trainer {
         let mut rng = Rng::new(self.options.seed ^ self.clock.step << 20, STREAM_DENSIFY);
         let state = self.engine.state_mut();
         match round.density {
-            Density::Classic(knobs) => {
+            DensityControl::Classic(knobs) => {
                 let options = knobs.options(self.extent, round.prune_large, limit);
                 classic::densify(state, &options, &mut rng)
             }
-            Density::Mcmc(knobs) => mcmc::densify(state, &knobs.options(self.pace, limit), &mut rng),
-            Density::Taming(knobs) => {
-                let target = taming::next_count(state.len(), limit, round.share);
+            DensityControl::Mcmc(knobs) => mcmc::densify(state, &knobs.options(self.pace, limit), &mut rng),
+            DensityControl::Taming(knobs) => {
+                let target = taming::next_count(state.len(), limit, round.completed);
                 let options = knobs.options(self.extent, round.prune_large, round.number, target);
                 taming::densify(state, &options, &mut rng)
             }
-            Density::Fast(knobs) => fast::densify(state, &knobs.options(self.pace, limit)),
+            DensityControl::Fast(knobs) => fast::densify(state, &knobs.options(self.pace, limit)),
         }
     }
 
-    /// Splats that stage `stage` may have at a share of the cap.
+    /// Maximum number of splats of stage `stage` at `count_share`, a fraction of the cap.
     pub(crate) fn limit(&self, stage: usize, count_share: f64) -> usize {
         let limit = self.cap as f64 * count_share;
         let stage = &self.recipe.stage[stage.min(self.recipe.stage.len() - 1)];
-        let share = stage.density.map_or(1.0, |density| density.limit_share(self.pace));
-        ((limit * share) as usize).max(1)
+        let fraction = stage.density.map_or(1.0, |density| density.limit_fraction(self.pace));
+        ((limit * fraction) as usize).max(1)
     }
 
     fn update_filter(&mut self) {
@@ -477,7 +477,7 @@ impl Trainer {
         self.restore_filter();
     }
 
-    /// Gives the state's filter to the renderer.
+    /// Passes the state's filter to the renderer.
     pub(crate) fn restore_filter(&mut self) {
         self.engine.use_filter(self.recipe.render.smoothing_filter);
     }
@@ -493,7 +493,7 @@ impl Trainer {
         camera
     }
 
-    /// Depths of the points that view number `view` is known to see, where the plan has a use for them.
+    /// Depths of the points that view `view` is known to see, if the plan uses them.
     pub(crate) fn known_depths(&self, view: usize, camera: &Camera, plan: &StepPlan) -> Vec<DepthSample> {
         let Some(points) = self
             .dataset
@@ -519,14 +519,14 @@ impl Trainer {
             .collect()
     }
 
-    /// Mean L1 error over some training views, evenly chosen, as the plan renders them.
-    fn measure_error(&mut self, coming: &[usize], plan: &StepPlan) -> Result<f64, TrainError> {
+    /// Mean L1 error over some training views, evenly spaced, as the plan renders them.
+    fn measure_error(&mut self, upcoming: &[usize], plan: &StepPlan) -> Result<f64, TrainError> {
         let train = self.dataset.train.clone();
         let stride = train.len().div_ceil(MEASURED_VIEWS).max(1);
         let (mut sum, mut count) = (0.0, 0);
         for view in train.into_iter().step_by(stride) {
             let order: Vec<usize> = std::iter::once(view)
-                .chain(coming.iter().copied().filter(|other| *other != view))
+                .chain(upcoming.iter().copied().filter(|other| *other != view))
                 .collect();
             let photo = self.photos.get(&order, plan.image_scale)?;
             let (started, cpu_started) = (Instant::now(), ProcessTime::now());
@@ -543,10 +543,10 @@ impl Trainer {
         Ok(sum / f64::from(count.max(1)))
     }
 
-    /// Moves the clock; steps that an early end of a stage sets free go to the stages that are left.
-    fn tick(&mut self, signal: Signal) -> bool {
+    /// Advances the clock; steps saved by an early end of a stage go to the remaining stages.
+    fn tick(&mut self, metrics: StepMetrics) -> bool {
         let stretch = self.clock.stretch;
-        let ended = self.clock.tick(&self.recipe, self.pace, signal);
+        let ended = self.clock.tick(&self.recipe, self.pace, metrics);
         if let Some(steps) = self.options.steps.filter(|_| self.clock.stretch != stretch)
             && steps > self.clock.step
         {
@@ -565,12 +565,12 @@ impl Trainer {
         }
     }
 
-    /// Camera number `view` of the dataset, at full size, as the run has come to know it.
+    /// Camera `view` of the dataset, at full size, with its refinement.
     pub fn camera(&self, view: usize) -> Camera {
         self.sockets.place(view, &self.dataset.views[view].camera).camera
     }
 
-    /// What of the held-out views must be fitted to them before they can be compared.
+    /// The per-image parameters to fit on held-out views before comparison.
     pub fn half_fit(&self) -> HalfFit {
         HalfFit {
             exposure: self.sockets.exposure.is_some(),
@@ -578,17 +578,17 @@ impl Trainer {
         }
     }
 
-    /// What the recipe makes no use of and should be known: one line each.
+    /// Parts of the dataset that the recipe ignores: one line each.
     pub fn warnings(&self) -> Vec<String> {
         let moves = self.dataset.train.iter().any(|i| self.dataset.views[*i].time.is_some());
         let line = format!(
-            "the photographs were taken at different times and recipe {} has no use for time: what moves becomes a blur",
+            "the photographs were taken at different times, which recipe {} ignores: moving objects become blurred",
             self.recipe.name
         );
         if moves { vec![line] } else { Vec::new() }
     }
 
-    /// The scene as a file holds it and held-out views show it: with the smoothing filter made part of it.
+    /// The scene as exported and evaluated: with the smoothing filter baked in.
     pub fn scene(&self) -> Model<'_> {
         if let Some(state) = &self.field {
             return Model::Field(Cow::Borrowed(&state.field));
@@ -622,6 +622,6 @@ fn cap(recipe: &Recipe, cameras: &[Camera]) -> usize {
     let mean = pixels / cameras.len().max(1) as f64;
     let by_pixels = recipe
         .splats_per_pixel
-        .map_or(usize::MAX, |share| (f64::from(share) * mean) as usize);
+        .map_or(usize::MAX, |per_pixel| (f64::from(per_pixel) * mean) as usize);
     recipe.max_splats.min(by_pixels).max(1)
 }

@@ -1,4 +1,4 @@
-//! How fast networks and encodings are, beside what the machine can do.
+//! Speed of networks and encodings, beside the limits of the machine.
 
 use crate::memory;
 use anyhow::Result;
@@ -10,8 +10,8 @@ use irradia_field::encoding::HashGrid;
 use irradia_field::mlp::{Mlp, MlpShape, MlpTape, PANEL};
 use irradia_scene::Rng;
 
-/// CPU seconds of one call: the best of `repeats` after one to warm up. What else runs on the machine can only slow a call
-/// down, by what it takes from the caches.
+/// CPU seconds of one call: the best of `repeats` after one to warm up. Other load on the machine can only slow a call down,
+/// through the caches.
 pub fn time(repeats: u32, mut work: impl FnMut()) -> f64 {
     work();
     let calls = (0..repeats).map(|_| {
@@ -25,7 +25,7 @@ pub fn time(repeats: u32, mut work: impl FnMut()) -> f64 {
 pub fn run() -> Result<()> {
     let level = Level::detect();
     let peak = (0..ROUNDS).map(|_| level.run(Peak)).fold(0.0, f64::max);
-    println!("{}: {peak:.1} GFLOP/s a core in registers", level.name());
+    println!("{}: {peak:.1} GFLOP/s per core in registers", level.name());
     for (inputs, outputs, width, depth) in [
         (32, 16, 32, 1),
         (32, 3, 32, 2),
@@ -55,7 +55,7 @@ pub fn run() -> Result<()> {
     Ok(())
 }
 
-/// The most multiply-adds that one core does, in registers.
+/// Peak rate of multiply-adds of one core, in registers.
 struct Peak;
 
 impl Kernel for Peak {
@@ -84,7 +84,7 @@ impl Kernel for Peak {
     }
 }
 
-/// Rounds of a measurement, of which the best counts.
+/// Rounds of a measurement; the best one counts.
 const ROUNDS: u32 = 5;
 
 /// GFLOP/s forward and backward through a network, 512 samples at a time.
@@ -113,7 +113,7 @@ impl Kernel for Through {
         let work = (mlp.products() * panels * PANEL * 2) as f64;
         let repeats = (5e9 / work) as u32;
         let (mut forward, mut backward) = (f64::INFINITY, f64::INFINITY);
-        // Loops written out, since a closure would not be compiled for these lanes.
+        // Explicit loops, since a closure would not be compiled for these lanes.
         for _ in 0..ROUNDS {
             let began = ProcessTime::now();
             for _ in 0..repeats {
@@ -134,7 +134,7 @@ impl Kernel for Through {
     }
 }
 
-/// Millions of samples a second through a hash grid, forward and with the way back, one core, and what memory allows.
+/// Millions of samples per second through a hash grid, forward and including backward, one core, and the limits of memory.
 fn encoding(level: Level, (levels, features, log2_table): (usize, usize, u32)) {
     let grid = HashGrid {
         levels,
@@ -146,7 +146,7 @@ fn encoding(level: Level, (levels, features, log2_table): (usize, usize, u32)) {
     let mut rng = Rng::new(3, 4);
     let samples = 1 << 15;
     let mut points: Vec<f32> = Vec::new();
-    // Samples as rays have them: steps of 1/300 along straight lines.
+    // Samples as along rays: steps of 1/300 on straight lines.
     let mut at = [[0.0f32; 3]; 2];
     for i in 0..samples {
         if i % 16 == 0 {
@@ -186,14 +186,14 @@ fn encoding(level: Level, (levels, features, log2_table): (usize, usize, u32)) {
     let million = samples as f64 / 1e6;
     let corners = (samples * levels * 8) as f64;
     println!(
-        "{levels} levels of {features}, tables of 2^{log2_table}: {:.2} M samples/s forward, {:.2} backward, {:.2} both, a core; {:.2} ns a corner",
+        "{levels} levels of {features}, tables of 2^{log2_table}: {:.2} M samples/s forward, {:.2} backward, {:.2} both, per core; {:.2} ns per corner",
         million / forward,
         million / backward,
         million / (forward + backward),
         (forward + backward) * 1e9 / (2.0 * corners),
     );
     println!(
-        "    memory alone, at random places: {:.2} forward ({:.0} %), {:.2} backward ({:.0} %), {:.2} both ({:.0} %); {:.2} ns a read, {:.2} an update",
+        "    memory alone, at random places: {:.2} forward ({:.0} %), {:.2} backward ({:.0} %), {:.2} both ({:.0} %); {:.2} ns per read, {:.2} per update",
         million / limits.forward,
         100.0 * limits.forward / forward,
         million / limits.backward,
@@ -205,7 +205,7 @@ fn encoding(level: Level, (levels, features, log2_table): (usize, usize, u32)) {
     );
     let gigabytes = (grid.parameters() * size_of::<f32>()) as f64 / 1e9;
     println!(
-        "    from one end to the other: {:.1} GB/s read, {:.1} GB/s read and written",
+        "    sequentially: {:.1} GB/s read, {:.1} GB/s read and written",
         gigabytes / limits.read,
         2.0 * gigabytes / limits.update,
     );

@@ -6,7 +6,7 @@
 //!     [--space bounded|unbounded|ndc] [--out FOLDER]
 //! ```
 //!
-//! CPU time stands beside wall time: on a shared machine it is the steadier of the two, and `--seconds` counts it.
+//! CPU time is given beside wall time: on a shared machine it is more stable, and `--seconds` counts it.
 
 mod bench;
 mod memory;
@@ -29,7 +29,7 @@ fn main() -> Result<()> {
         Some("bench") => bench::run(),
         Some("train") => train(&args[1..]),
         _ => bail!(
-            "say: bench, or train DATA [--downscale N] [--seconds S] [--recipe NAME] [--space NAME] [--out FOLDER]"
+            "usage: bench, or train DATA [--downscale N] [--seconds S] [--recipe NAME] [--space NAME] [--out FOLDER]"
         ),
     }
 }
@@ -52,7 +52,7 @@ struct Held {
 }
 
 fn train(args: &[String]) -> Result<()> {
-    let data = args.first().context("which data?")?;
+    let data = args.first().context("expected a dataset after `train`")?;
     let downscale: f32 = flag(args, "--downscale", 1.0)?;
     let seconds: f64 = flag(args, "--seconds", 90.0)?;
     let recipe: String = flag(args, "--recipe", "hashgrid".to_owned())?;
@@ -102,7 +102,7 @@ fn train(args: &[String]) -> Result<()> {
         ("unbounded", _) | ("auto", false) => Space::around(&cameras, true),
         _ => Space::around(&cameras, false),
     }
-    .context("the cameras do not look at anything together")?;
+    .context("the cameras do not look at a common region")?;
     println!(
         "{}x{}, {} + {} views, {space:?}",
         photos[0].width,
@@ -127,14 +127,14 @@ fn train(args: &[String]) -> Result<()> {
         ..StepOptions::default()
     };
     let mut spent = 0.0;
-    // A field that has learnt nothing is dear to look at.
+    // An untrained field is expensive to render.
     let mut next = seconds / 12.0;
     let mut smooth = 0.0f64;
     let mut looks = (1..=16).cycle();
     while spent < seconds {
         let began = ProcessTime::now();
         let time = spent / seconds;
-        // Down to a thirtieth, evenly in the logarithm, over the last two thirds.
+        // Decay to a thirtieth, linearly in the logarithm, over the last two thirds.
         let decay = 0.033f32.powf(((time as f32 - 0.33) / 0.67).max(0.0));
         let options = StepOptions {
             net_rate: base.net_rate * decay,

@@ -1,7 +1,7 @@
-//! What memory alone allows a hash grid: its accesses at random places, and nothing else.
+//! Memory-bound limits of a hash grid: only its accesses at random places.
 //!
-//! No share of a limit is out of reach: neighbours on a ray share corners, and the coarse levels' cells, so that an encoding
-//! finds more in the first cache than random places do.
+//! A limit can be exceeded: neighbours on a ray share corners, and the coarse levels' cells, so that an encoding finds more in
+//! the first-level cache than random accesses do.
 
 use crate::bench::time;
 use cpu_time::ProcessTime;
@@ -13,17 +13,17 @@ use std::hint::black_box;
 
 /// Seconds of one core.
 pub struct Limits {
-    /// Eight reads a level and sample.
+    /// Eight reads per level and sample.
     pub forward: f64,
-    /// Eight reads with a write at the same place a level and sample.
+    /// Eight reads with a write at the same place per level and sample.
     pub backward: f64,
-    /// Reading all tables from one end to the other.
+    /// Reading all tables sequentially.
     pub read: f64,
-    /// The same with a write.
+    /// Reading and writing all tables sequentially.
     pub update: f64,
 }
 
-/// The limits for `samples` samples through `grid`, level after level as the encoding goes.
+/// The limits for `samples` samples through `grid`, level by level like the encoding.
 pub fn limits(grid: &HashGrid, samples: usize) -> Limits {
     match grid.features {
         2 => of_features::<2>(grid, samples),
@@ -36,7 +36,7 @@ fn of_features<const F: usize>(grid: &HashGrid, samples: usize) -> Limits {
     let levels = grid.level_table();
     let mut table = vec![[1.0f32; F]; grid.parameters() / F];
     let mut rng = Rng::new(5, 6);
-    // Few enough for the first cache; moved on from turn to turn, so that they meet all of a table.
+    // Few enough for the first-level cache; shifted from turn to turn, so that they cover all of a table.
     let places: Vec<[u32; 8]> = (0..512).map(|_| std::array::from_fn(|_| rng.below(u32::MAX))).collect();
     let turn = |t: usize| (t as u32).wrapping_mul(2_654_435_761);
     let place =
@@ -84,7 +84,7 @@ fn of_features<const F: usize>(grid: &HashGrid, samples: usize) -> Limits {
     }
 }
 
-/// Seconds to read all numbers in turn, and to read and write them.
+/// Seconds to read all numbers in order, and to read and write them.
 struct Stream<'a> {
     numbers: &'a mut [f32],
 }

@@ -1,7 +1,7 @@
 //! `irradia compare`
 //!
-//! Every training is a process of its own, this same program's `train`: memory is measured by itself, and what goes wrong in
-//! one run stays there.
+//! Each run is a separate process of this program's `train`, so that memory is measured separately and a failure does not
+//! affect other runs.
 
 use super::train::parse_seconds;
 use super::{DataArgs, by_option, thread_count};
@@ -31,100 +31,100 @@ pub struct Args {
     /// Folders of posed photographs
     #[arg(required = true)]
     pub data: Vec<PathBuf>,
-    /// Recipes to compare, separated by commas: built-in or .toml files, each with changes behind colons, such as
+    /// Recipes to compare, separated by commas: built-in or .toml files, each with overrides after colons, such as
     /// classic,fast:max_splats=50000
     #[arg(long, value_name = "NAME[:KEY=VALUE]..", value_delimiter = ',', required = true)]
     pub recipes: Vec<String>,
-    /// Trainings of each recipe on each dataset, with the seeds 0, 1, ..
+    /// Runs of each recipe on each dataset, with the seeds 0, 1, ..
     #[arg(long, value_name = "N", default_value_t = 3, value_parser = clap::value_parser!(u64).range(1..=1000))]
     pub seeds: u64,
-    /// Fit the recipes into so many steps
+    /// Fit the recipes into this number of steps
     #[arg(long, value_name = "N", conflicts_with = "budget", value_parser = clap::value_parser!(u64).range(1..))]
     pub steps: Option<u64>,
-    /// Fit the recipes into a time of training, such as 90s or 5m
+    /// Fit the recipes into a training time, such as 90s or 5m
     #[arg(long, value_name = "TIME", value_parser = parse_seconds)]
     pub budget: Option<f64>,
-    /// Never more splats than this
+    /// Maximum number of splats
     #[arg(long, value_name = "N", value_parser = RangedU64ValueParser::<usize>::new().range(1..))]
     pub max_splats: Option<usize>,
-    /// Steps between looks at the held-out views, which are not counted as training; a fortieth of --steps, or 100, when
-    /// absent
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
-    pub look_every: Option<u64>,
-    /// Folder for the runs and the outcome; finished runs that it holds are read and not repeated
+    /// Steps between evaluations of the held-out views, which are not counted as training; when absent a fortieth of --steps,
+    /// or 100
+    #[arg(long, alias = "look-every", value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
+    pub eval_every: Option<u64>,
+    /// Folder for the runs and the results; finished runs in it are read and not repeated
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
     /// Repeat the runs in DIR that were made under other conditions
     #[arg(long)]
     pub overwrite: bool,
-    /// Threads of each training; all cores when absent
+    /// Threads of each run; all cores when absent
     #[arg(long, value_name = "N", value_parser = thread_count())]
     pub threads: Option<usize>,
     /// LPIPS weights: a file, or a folder of them; see irradia lpips
     #[arg(long, value_name = "PATH")]
     pub lpips: Option<PathBuf>,
-    /// white, black or random (trained over random colours, scored over white): what photographs with alpha are laid over;
-    /// white for Blender scenes and the recipe's own for others when absent
+    /// Background of photographs with alpha: white, black or random (random colours in training, white in evaluation); when
+    /// absent white for Blender scenes and the recipe's own for others
     #[arg(long, value_name = "COLOR")]
     pub background: Option<Background>,
     #[command(flatten)]
     pub reading: DataArgs,
 }
 
-/// A recipe as it takes part.
-struct Way {
+/// A recipe with overrides.
+struct Variant {
     /// As the user wrote it.
     text: String,
     /// Name or file.
     recipe: String,
-    /// `key=value`.
-    changes: Vec<String>,
-    /// Of the resolved recipe.
+    /// Overrides, each `key=value`.
+    overrides: Vec<String>,
+    /// Hash of the resolved recipe.
     hash: String,
     /// Name of its folder.
     folder: String,
 }
 
-/// What a run was asked for, kept in its folder: a finished run is read again only if nothing of it changed.
+/// The request of a run, stored in its folder: a finished run is reused only if its request is unchanged.
 #[derive(PartialEq, Serialize, Deserialize)]
 struct Request {
-    /// Of `irradia`, without `--out`.
+    /// Arguments of `irradia`, without `--out`.
     arguments: Vec<String>,
     recipe_hash: String,
-    /// Of this program's file; empty where an earlier version wrote it.
+    /// Hash of this program's file; empty if an earlier version wrote it.
     #[serde(default)]
     program: String,
-    /// Of the dataset; empty where it could not be read, or an earlier version wrote it.
+    /// Hash of the dataset; empty if it could not be read, or an earlier version wrote it.
     #[serde(default)]
     data: String,
 }
 
 impl Request {
-    /// Why a run that was made for `self` cannot stand for one that is made for `wanted`.
-    fn misfit(&self, wanted: &Self) -> Option<&'static str> {
+    /// Why a run made for `self` cannot be reused for `wanted`.
+    fn mismatch(&self, wanted: &Self) -> Option<&'static str> {
         let same = (&self.arguments, &self.recipe_hash) == (&wanted.arguments, &wanted.recipe_hash);
         match (same, self.program == wanted.program, self.data == wanted.data) {
             (false, ..) => Some("under other conditions"),
-            (true, _, false) => Some("on data that changed since"),
+            (true, _, false) => Some("on data that has changed since"),
             (true, false, true) => Some("by another build of this program"),
             (true, true, true) => None,
         }
     }
 }
 
-/// A dataset as it takes part.
+/// A dataset of the comparison.
 struct Source {
     /// As the user wrote it.
     data: PathBuf,
     /// Name of its folder.
     name: String,
-    /// Of what it holds; empty where it cannot be read, which its runs then say.
+    /// Hash of its content; empty if it cannot be read, which its runs then report.
     fingerprint: String,
 }
 
 const REQUEST: &str = "request.json";
 
-/// A run with all that is known of it.
+/// A run with its report.
 struct Trained {
     run: Run,
     report: Option<Report>,
@@ -137,31 +137,32 @@ enum Outcome {
 }
 
 pub fn run(args: &Args) -> Result<()> {
-    let ways = ways(args)?;
+    let variants = variants(args)?;
     if let Some(data) = args.data.iter().find(|data| !data.exists()) {
-        return Err(Usage(format!("{} does not exist: give a dataset's folder", data.display())).into());
+        return Err(Usage(format!("{} does not exist; name a dataset folder", data.display())).into());
     }
     let sources = sources(args)?;
     let program = program_fingerprint().context("cannot read this program's file")?;
     if !args.overwrite {
-        check_earlier(args, &program, &ways, &sources)?;
+        check_earlier(args, &program, &variants, &sources)?;
     }
-    fs::create_dir_all(&args.out).with_context(|| format!("cannot make {}; give another --out", args.out.display()))?;
+    fs::create_dir_all(&args.out)
+        .with_context(|| format!("cannot create {}; choose another --out", args.out.display()))?;
     let stop = stop_flag();
 
-    let total = args.data.len() * ways.len() * args.seeds as usize;
+    let total = args.data.len() * variants.len() * args.seeds as usize;
     let (mut scenes, mut number) = (Vec::new(), 0);
     let (mut device, mut done) = (String::new(), 0);
     for source in &sources {
         let name = &source.name;
-        let mut trained: Vec<Vec<Trained>> = ways.iter().map(|_| Vec::new()).collect();
-        // Recipes within seeds: what else the machine does meanwhile falls on all of them alike.
+        let mut trained: Vec<Vec<Trained>> = variants.iter().map(|_| Vec::new()).collect();
+        // Recipes within seeds: other load on the machine then affects all recipes alike.
         for seed in 0..args.seeds {
-            for (way, trained) in ways.iter().zip(&mut trained) {
+            for (variant, trained) in variants.iter().zip(&mut trained) {
                 number += 1;
-                let what = format!("[{number}/{total}] {name}, {}, seed {seed}", way.text);
-                let folder = format!("{name}/{}/seed_{seed}", way.folder);
-                let request = request(args, &program, source, way, seed);
+                let what = format!("[{number}/{total}] {name}, {}, seed {seed}", variant.text);
+                let folder = format!("{name}/{}/seed_{seed}", variant.folder);
+                let request = request(args, &program, source, variant, seed);
                 let outcome = one_run(request, &args.out.join(&folder), &what, &stop)?;
                 let (error, report) = match outcome {
                     Outcome::Stopped => break,
@@ -197,7 +198,7 @@ pub fn run(args: &Args) -> Result<()> {
         }
         if trained.iter().any(|runs| !runs.is_empty()) {
             let view = held_out_view(&args.out, &trained);
-            let texts = ways.iter().map(|way| way.text.clone());
+            let texts = variants.iter().map(|variant| variant.text.clone());
             let runs = texts.zip(
                 trained
                     .into_iter()
@@ -224,17 +225,14 @@ pub fn run(args: &Args) -> Result<()> {
     };
     write(args, &comparison)?;
     if stop.load(Ordering::Relaxed) {
-        say("stopped: the same command goes on behind the runs that are finished")?;
+        say("stopped; run the same command to continue after the finished runs")?;
     } else if done == 0 {
-        bail!(
-            "no run came to an end; look at the .log files in {}",
-            args.out.display()
-        );
+        bail!("no run was completed; see the .log files in {}", args.out.display());
     }
     Ok(())
 }
 
-/// The datasets of the command line; those that can be read must have views that score the runs.
+/// The datasets of the command line; those that can be read must have held-out views.
 fn sources(args: &Args) -> Result<Vec<Source>> {
     let reading = args.reading.reading();
     reading.check().map_err(by_option)?;
@@ -243,7 +241,7 @@ fn sources(args: &Args) -> Result<Vec<Source>> {
         let dataset = reading.read(data).ok();
         if dataset.as_ref().is_some_and(|dataset| dataset.test.is_empty()) {
             let message = format!(
-                "{}: no view is held out, so that nothing can be compared",
+                "{}: no view is held out, so that recipes cannot be compared",
                 data.display()
             );
             return Err(Usage(message).into());
@@ -257,42 +255,42 @@ fn sources(args: &Args) -> Result<Vec<Source>> {
     args.data.iter().zip(names).map(source).collect()
 }
 
-/// The recipes of the command line, each read, so that a mistake in the last one is not found after hours.
-fn ways(args: &Args) -> Result<Vec<Way>> {
-    let looks = args.look_every.or(args.steps.map(|steps| (steps / 40).max(1)));
-    let looks = looks.unwrap_or(100);
-    let mut ways = Vec::new();
+/// The recipes of the command line, all read first, so that a mistake in the last one is found at once.
+fn variants(args: &Args) -> Result<Vec<Variant>> {
+    let eval_every = args.eval_every.or(args.steps.map(|steps| (steps / 40).max(1)));
+    let eval_every = eval_every.unwrap_or(100);
+    let mut variants = Vec::new();
     for text in &args.recipes {
         let (recipe, rest) = text.split_once(':').unwrap_or((text, ""));
-        let mut changes = vec![format!("eval_every={looks}")];
-        changes.extend(rest.split(':').filter(|change| !change.is_empty()).map(str::to_owned));
-        let resolved = read_recipe(recipe, &changes)?;
-        ways.push(Way {
+        let mut overrides = vec![format!("eval_every={eval_every}")];
+        overrides.extend(rest.split(':').filter(|change| !change.is_empty()).map(str::to_owned));
+        let resolved = read_recipe(recipe, &overrides)?;
+        variants.push(Variant {
             text: text.clone(),
             recipe: recipe.to_owned(),
-            changes,
+            overrides,
             hash: resolved.hash(),
             folder: folder_name(Path::new(text)),
         });
     }
-    let folders = distinct(ways.iter().map(|way| way.folder.clone()));
-    for (way, folder) in ways.iter_mut().zip(folders) {
-        way.folder = folder;
+    let folders = distinct(variants.iter().map(|variant| variant.folder.clone()));
+    for (variant, folder) in variants.iter_mut().zip(folders) {
+        variant.folder = folder;
     }
-    Ok(ways)
+    Ok(variants)
 }
 
-/// The last part of a path as the name of a folder, without what a file system may not like.
+/// The last part of a path as the name of a folder, without characters that file systems may reject.
 fn folder_name(path: &Path) -> String {
     let absolute = std::path::absolute(path).unwrap_or_else(|_| path.to_owned());
     let name = absolute.file_name().unwrap_or_default().to_string_lossy().into_owned();
     let name = name.replace(".toml", "");
-    // `file_stem` would take what stands behind a dot in a change for an extension.
+    // `file_stem` would treat the part after a dot in an override as an extension.
     let name = file_stem(&format!("{name}.x"));
     if name.is_empty() { "scene".into() } else { name }
 }
 
-fn request(args: &Args, program: &str, source: &Source, way: &Way, seed: u64) -> Request {
+fn request(args: &Args, program: &str, source: &Source, variant: &Variant, seed: u64) -> Request {
     let data = std::path::absolute(&source.data).unwrap_or_else(|_| source.data.clone());
     let mut arguments = vec!["train".to_owned(), data.display().to_string()];
     let mut option = |name: &str, value: Option<String>| {
@@ -300,8 +298,8 @@ fn request(args: &Args, program: &str, source: &Source, way: &Way, seed: u64) ->
             arguments.extend([name.to_owned(), value]);
         }
     };
-    option("--recipe", Some(way.recipe.clone()));
-    for change in &way.changes {
+    option("--recipe", Some(variant.recipe.clone()));
+    for change in &variant.overrides {
         option("--set", Some(change.clone()));
     }
     option("--seed", Some(seed.to_string()));
@@ -320,13 +318,13 @@ fn request(args: &Args, program: &str, source: &Source, way: &Way, seed: u64) ->
     option("--background", args.background.map(|b| b.name().to_owned()));
     Request {
         arguments,
-        recipe_hash: way.hash.clone(),
+        recipe_hash: variant.hash.clone(),
         program: program.to_owned(),
         data: source.fingerprint.clone(),
     }
 }
 
-/// The report of the finished run in `folder`; with what it was asked for.
+/// The report of the finished run in `folder`, with its request.
 fn finished(folder: &Path) -> Option<(Report, Option<Request>)> {
     let (run, record) = RunFolder::open(folder).ok()?;
     let read = |name: &str| fs::read_to_string(run.file(name)).ok();
@@ -335,20 +333,20 @@ fn finished(folder: &Path) -> Option<(Report, Option<Request>)> {
     record.complete.then_some((report, request))
 }
 
-/// Refuses, before anything is trained, finished runs that were asked for something else.
-fn check_earlier(args: &Args, program: &str, ways: &[Way], sources: &[Source]) -> Result<()> {
+/// Rejects, before any training, finished runs with another request.
+fn check_earlier(args: &Args, program: &str, variants: &[Variant], sources: &[Source]) -> Result<()> {
     for source in sources {
-        for way in ways {
+        for variant in variants {
             for seed in 0..args.seeds {
-                let folder = args.out.join(format!("{}/{}/seed_{seed}", source.name, way.folder));
+                let folder = args.out.join(format!("{}/{}/seed_{seed}", source.name, variant.folder));
                 let Some((_, earlier)) = finished(&folder) else {
                     continue;
                 };
-                let wanted = request(args, program, source, way, seed);
-                let misfit = earlier.map_or(Some("under other conditions"), |earlier| earlier.misfit(&wanted));
-                if let Some(how) = misfit {
+                let wanted = request(args, program, source, variant, seed);
+                let mismatch = earlier.map_or(Some("under other conditions"), |earlier| earlier.mismatch(&wanted));
+                if let Some(how) = mismatch {
                     let message = format!(
-                        "{} holds a run made {how}: give another --out, or --overwrite to repeat such runs",
+                        "{} holds a run made {how}; choose another --out, or --overwrite to repeat such runs",
                         folder.display()
                     );
                     return Err(Usage(message).into());
@@ -359,7 +357,7 @@ fn check_earlier(args: &Args, program: &str, ways: &[Way], sources: &[Source]) -
     Ok(())
 }
 
-/// Reads the run in `folder` if it is what is asked for, makes it otherwise.
+/// Reads the run in `folder` if its request matches, otherwise makes it.
 fn one_run(request: Request, folder: &Path, what: &str, stop: &AtomicBool) -> Result<Outcome> {
     if let Some((report, earlier)) = finished(folder)
         && earlier.as_ref() == Some(&request)
@@ -370,12 +368,12 @@ fn one_run(request: Request, folder: &Path, what: &str, stop: &AtomicBool) -> Re
         return Ok(Outcome::Stopped);
     }
     note(format_args!("{what} .."));
-    fs::create_dir_all(folder).with_context(|| format!("cannot make {}", folder.display()))?;
+    fs::create_dir_all(folder).with_context(|| format!("cannot create {}", folder.display()))?;
     let bytes = serde_json::to_vec_pretty(&request)?;
     write_atomic(&folder.join(REQUEST), |out| out.write_all(&bytes))?;
     let log = folder.with_extension("log");
     let output = File::create(&log).with_context(|| format!("cannot write {}", log.display()))?;
-    let program = std::env::current_exe().context("cannot find this program to run it again")?;
+    let program = std::env::current_exe().context("cannot find this program's own file")?;
     let mut child = Command::new(program)
         .args(&request.arguments)
         .args(["--overwrite".as_ref(), "--out".as_ref(), folder.as_os_str()])
@@ -383,13 +381,13 @@ fn one_run(request: Request, folder: &Path, what: &str, stop: &AtomicBool) -> Re
         .stdout(output.try_clone()?)
         .stderr(output)
         .spawn()
-        .context("cannot start a training")?;
+        .context("cannot start a run")?;
     let status = loop {
         if let Some(status) = child.try_wait()? {
             break status;
         }
         if stop.load(Ordering::Relaxed) {
-            // Half a run is of no use here: its time would not be that of an unbroken one.
+            // A partial run is useless here: its time would not be that of an uninterrupted one.
             let _ = child.kill();
             child.wait()?;
             return Ok(Outcome::Stopped);
@@ -401,7 +399,7 @@ fn one_run(request: Request, folder: &Path, what: &str, stop: &AtomicBool) -> Re
     {
         return Ok(Outcome::Done(Box::new(report)));
     }
-    // Ctrl-C reaches the training too, and perhaps before this process has taken note.
+    // Ctrl-C reaches the child process, too, perhaps before this process has noticed it.
     std::thread::sleep(Duration::from_millis(200));
     if stop.load(Ordering::Relaxed) {
         return Ok(Outcome::Stopped);
@@ -409,12 +407,12 @@ fn one_run(request: Request, folder: &Path, what: &str, stop: &AtomicBool) -> Re
     let said = fs::read_to_string(&log).unwrap_or_default();
     let error = said.lines().rev().find_map(|line| line.strip_prefix("error: "));
     Ok(Outcome::Failed(error.map_or_else(
-        || format!("the training ended early ({status}); see {}", log.display()),
+        || format!("the run ended early ({status}); see {}", log.display()),
         str::to_owned,
     )))
 }
 
-/// The held-out view of median PSNR in the first finished run, as the first finished run of each recipe shows it.
+/// The held-out view of median PSNR in the first finished run, with the renderings of the first finished run of each recipe.
 fn held_out_view(out: &Path, trained: &[Vec<Trained>]) -> Option<PictureRow> {
     let first = |runs: &'_ Vec<Trained>| runs.iter().position(|t| t.report.is_some());
     let firsts: Vec<Option<(&Run, &Report)>> = trained
@@ -444,7 +442,7 @@ fn held_out_view(out: &Path, trained: &[Vec<Trained>]) -> Option<PictureRow> {
     })
 }
 
-/// A picture as an address that holds it: a JPEG of good quality, no larger than a page shows.
+/// A picture as a `data:` URL: a JPEG of good quality, no larger than the page shows it.
 fn embed(path: &Path) -> Result<String> {
     const LARGEST: u32 = 1200;
     let mut shown = image::open(path).with_context(|| format!("cannot read {}", path.display()))?;
@@ -458,7 +456,7 @@ fn embed(path: &Path) -> Result<String> {
     Ok(picture(&bytes))
 }
 
-/// What was the same for all runs.
+/// The conditions common to all runs.
 fn conditions(args: &Args) -> Vec<String> {
     let length = match (args.steps, args.budget) {
         (Some(steps), _) => format!("{steps} steps"),
@@ -491,7 +489,7 @@ fn write(args: &Args, comparison: &Comparison) -> Result<()> {
         write_atomic(&args.out.join(name), |out| out.write_all(bytes))?;
     }
     say(to_text(comparison).trim_end())?;
-    say(format_args!("look at {}", args.out.join("compare.html").display()))
+    say(format_args!("see {}", args.out.join("compare.html").display()))
 }
 
 #[cfg(test)]
@@ -499,7 +497,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn names_of_folders_are_tame_and_distinct() {
+    fn folder_names_are_safe_and_distinct() {
         let names = [
             "a/room",
             "b/room/",

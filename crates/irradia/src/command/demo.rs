@@ -15,13 +15,13 @@ pub struct Args {
     /// Folder for the data and the run
     #[arg(long, default_value = "demo")]
     pub out: PathBuf,
-    /// Training views; one more in eight is held out
+    /// Training views; one in eight more is held out
     #[arg(long, value_name = "N", default_value_t = SynthOptions::default().views)]
     pub views: u32,
     /// Size of the images
     #[arg(long, value_name = "WxH", value_parser = parse_size, default_value = "256x256")]
     pub size: (u32, u32),
-    /// Steps of training
+    /// Training steps
     #[arg(long, default_value_t = 1500, value_parser = clap::value_parser!(u64).range(1..))]
     pub steps: u64,
     /// Threads; all cores when absent
@@ -33,13 +33,13 @@ pub struct Args {
 pub struct SynthArgs {
     /// Folder for the dataset
     pub out: PathBuf,
-    /// Training views; one more in eight is held out
+    /// Training views; one in eight more is held out
     #[arg(long, default_value_t = SynthOptions::default().views)]
     pub views: u32,
     /// Size of the images
     #[arg(long, value_name = "WxH", value_parser = parse_size, default_value = "256x256")]
     pub size: (u32, u32),
-    /// Everything random follows from it
+    /// Random seed
     #[arg(long, default_value_t = 0)]
     pub seed: u64,
 }
@@ -68,7 +68,7 @@ pub fn run(args: &Args) -> Result<()> {
         ..TrainInput::new(data, out.clone())
     })?;
     say(format_args!(
-        "the scene is {}; go round it with: irradia render {} --orbit 60 --out frames",
+        "the scene is {}; render an orbit of it with: irradia render {} --orbit 60 --out frames",
         out.join("scene.ply").display(),
         out.display()
     ))

@@ -17,21 +17,21 @@ use std::path::PathBuf;
 
 #[derive(clap::Args)]
 pub struct Args {
-    /// The scene: RUN, or a file; background and filters are taken from the run it lies in
+    /// The scene: RUN, or a file; background and filters are taken from the run that contains it
     pub scene: PathBuf,
-    /// The photographs
+    /// Dataset of photographs
     #[arg(long)]
     pub data: PathBuf,
-    /// Which views
+    /// Views to evaluate
     #[arg(long, value_enum, default_value_t = Split::Test)]
     pub split: Split,
-    /// Fit these on the left half of each view and measure its right half too
+    /// Fit these on the left half of each view and also measure its right half
     #[arg(long, value_enum, value_delimiter = ',', value_name = "WHAT")]
     pub half_fit: Vec<HalfFitOf>,
-    /// Write the figures here
+    /// Write the figures to this file
     #[arg(long, value_name = "FILE")]
     pub json: Option<PathBuf>,
-    /// Write the rendered views here
+    /// Write the rendered views to this folder
     #[arg(long, value_name = "DIR")]
     pub save_images: Option<PathBuf>,
     /// LPIPS weights: a file, or a folder of them; see irradia lpips
@@ -43,17 +43,17 @@ pub struct Args {
     /// Threads; all cores when absent
     #[arg(long, value_parser = thread_count())]
     pub threads: Option<usize>,
-    /// white or black: what is behind the scene; when absent that of its run, or white for Blender scenes with alpha
+    /// Background of the scene: white or black; when absent that of its run, or white for Blender scenes with alpha
     #[arg(long, value_name = "COLOR")]
     pub background: Option<Background>,
     #[command(flatten)]
     pub reading: DataArgs,
 }
 
-/// What may be fitted to a held-out view.
+/// Parameters that can be fitted to a held-out view.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 pub enum HalfFitOf {
-    /// An affine map of colours.
+    /// An affine colour map.
     Exposure,
     /// The camera's pose.
     Pose,
@@ -74,7 +74,7 @@ pub fn run(args: &Args) -> Result<()> {
     let run = RunFolder::around(&args.scene);
     let mut reading = args.reading.clone();
     if reading.holdout.is_none() {
-        // Other views than those that the run held out, it was trained on.
+        // The run was trained on all views except those that it held out.
         reading.holdout = run.as_ref().and_then(|record| record.input.reading.holdout.clone());
     }
     let dataset = reading.read(&args.data)?;
@@ -87,12 +87,12 @@ pub fn run(args: &Args) -> Result<()> {
     }
     let indices = args.split.of(&dataset);
     if indices.is_empty() {
-        return Err(Usage(format!("{} has no such views: try --split all", args.data.display())).into());
+        return Err(Usage(format!("{} has no such views; try --split all", args.data.display())).into());
     }
     let lpips = lpips(args.lpips.as_ref(), args.lpips_net)?;
     if lpips.is_none() {
         note(format_args!(
-            "LPIPS is not measured, since no weights were found: {HOW_TO_GET_LPIPS}"
+            "LPIPS is not measured: no LPIPS weights found;  {HOW_TO_GET_LPIPS}"
         ));
     }
     let net = lpips.as_ref().map(|lpips| lpips.net());
@@ -106,7 +106,7 @@ pub fn run(args: &Args) -> Result<()> {
     let mut stems = indices.iter().map(|i| &stems[*i]);
     let see = |view: &EvaluatedView| -> Result<()> {
         let m = view.metrics;
-        let stem = stems.next().expect("one for each view");
+        let stem = stems.next().expect("one per view");
         measured.push((view.name.clone(), view.is_measured()));
         if view.is_measured() {
             say(figures(&view.name, &m, net))?;
@@ -115,7 +115,7 @@ pub fn run(args: &Args) -> Result<()> {
             }));
         }
         if let Some(folder) = &args.save_images {
-            std::fs::create_dir_all(folder).with_context(|| format!("cannot make {}", folder.display()))?;
+            std::fs::create_dir_all(folder).with_context(|| format!("cannot create {}", folder.display()))?;
             write_image(folder.join(format!("{}.png", stem)), &view.render)?;
         }
         Ok(())

@@ -8,7 +8,7 @@ use std::path::PathBuf;
 
 #[derive(clap::Args)]
 pub struct InfoArgs {
-    /// A splat file, a field, a run, a point cloud or a dataset's folder
+    /// A splat file, a field, a run, a point cloud or a dataset folder
     pub path: PathBuf,
 }
 
@@ -16,7 +16,7 @@ pub struct InfoArgs {
 pub struct ConvertArgs {
     /// The scene to read
     pub input: PathBuf,
-    /// The file to write; its extension says which format
+    /// The file to write; its extension selects the format
     pub output: PathBuf,
 }
 
@@ -25,7 +25,7 @@ pub fn info(args: &InfoArgs) -> Result<()> {
 }
 
 pub fn convert(args: &ConvertArgs) -> Result<()> {
-    // Reading may take a while: what cannot be written is said first.
+    // Reading may take a while: an unknown output format is reported first.
     SplatFormat::of(&args.output)?;
     let cloud = read_splats(&scene_of(&args.input))?;
     write_splats(&args.output, &cloud)?;

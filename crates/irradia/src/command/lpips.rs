@@ -1,4 +1,4 @@
-//! Where the weights of LPIPS are found, and `irradia lpips`, which imports them.
+//! Finds LPIPS weights, and `irradia lpips`, which imports them.
 
 use crate::Usage;
 use crate::terminal::{note, say};
@@ -9,16 +9,16 @@ use irradia_runs::formats::{read_tensors, write_atomic};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-/// The variable that names a weights file, or a folder of them.
+/// The environment variable that names a weights file, or a folder of them.
 const VARIABLE: &str = "IRRADIA_LPIPS";
 
 #[derive(clap::Args)]
 pub struct Args {
-    /// Make a weights file of what the networks' authors publish: torchvision's SqueezeNet 1.1, AlexNet or VGG16, and the LPIPS
+    /// Create a weights file from the authors' published files: torchvision's SqueezeNet 1.1, AlexNet or VGG16, and the LPIPS
     /// v0.1 heads of the same network (weights/v0.1/squeeze.pth, alex.pth or vgg.pth), each as .pth or .safetensors
     #[arg(long, num_args = 2, value_names = ["FEATURES", "HEADS"])]
     pub import: Option<Vec<PathBuf>>,
-    /// Write the weights here instead of into the user's data directory
+    /// Write the weights to this file instead of the user's data directory
     #[arg(long, value_name = "FILE", requires = "import")]
     pub out: Option<PathBuf>,
 }
@@ -30,7 +30,7 @@ pub fn run(args: &Args) -> Result<()> {
     }
 }
 
-/// Says which weights are found.
+/// Prints which weights are found.
 fn show() -> Result<()> {
     let mut found = false;
     for net in LpipsNet::ALL {
@@ -42,7 +42,7 @@ fn show() -> Result<()> {
     if found {
         return Ok(());
     }
-    say(format_args!("no weights of LPIPS were found: {HOW}"))
+    say(format_args!("no LPIPS weights found; {HOW}"))
 }
 
 fn import(features: &Path, heads: &Path, out: Option<&Path>) -> Result<()> {
@@ -59,9 +59,9 @@ fn import(features: &Path, heads: &Path, out: Option<&Path>) -> Result<()> {
     let path = match out {
         Some(path) => path.to_owned(),
         None => {
-            let folder = data_folder().context("the system names no data directory; give --out FILE")?;
+            let folder = data_folder().context("the system has no user data directory; name a file with --out")?;
             std::fs::create_dir_all(&folder)
-                .with_context(|| format!("cannot make {}; give --out FILE", folder.display()))?;
+                .with_context(|| format!("cannot create {}; name a file with --out", folder.display()))?;
             folder.join(net.file_name())
         }
     };
@@ -69,14 +69,14 @@ fn import(features: &Path, heads: &Path, out: Option<&Path>) -> Result<()> {
     say(format_args!("LPIPS of {net}: {}", path.display()))
 }
 
-/// LPIPS's network, of `net` where one is asked for, and a note of where it was found; `None` when there is none.
+/// The LPIPS network, `net` if given, with a note of its file; `None` if there is none.
 pub fn lpips(given: Option<&PathBuf>, net: Option<LpipsNet>) -> Result<Option<Lpips>> {
     let Some(path) = find(given, net)? else { return Ok(None) };
     let lpips = Lpips::load(&path).context("LPIPS weights")?;
     if let Some(net) = net.filter(|net| *net != lpips.net()) {
         let (path, own) = (path.display(), lpips.net());
         return Err(Usage(format!(
-            "{path} holds the weights of {own} and not of {net}: name another file with --lpips"
+            "{path} contains the weights of {own}, not {net}; name another file with --lpips"
         ))
         .into());
     }
@@ -84,7 +84,7 @@ pub fn lpips(given: Option<&PathBuf>, net: Option<LpipsNet>) -> Result<Option<Lp
     Ok(Some(lpips))
 }
 
-/// Says which network is used, and where it was found.
+/// Prints which network is used, and its file.
 pub fn tell(lpips: &Lpips, path: &Path) {
     note(format_args!("LPIPS of {}: {}", lpips.net(), path.display()));
 }
@@ -94,8 +94,8 @@ pub fn lpips_path(given: Option<&PathBuf>) -> Result<Option<PathBuf>> {
     find(given, None)
 }
 
-/// `--lpips`, `IRRADIA_LPIPS`, then the user's data directory. A file is taken as it is; in a folder the files have their
-/// names, and of several the first of [`LpipsNet::ALL`] is taken unless one is asked for.
+/// Searches `--lpips`, `IRRADIA_LPIPS`, then the user's data directory. A path to a file is used directly; in a folder, files are
+/// found by their names, the first of [`LpipsNet::ALL`] unless a network is given.
 fn find(given: Option<&PathBuf>, net: Option<LpipsNet>) -> Result<Option<PathBuf>> {
     let variable = || {
         std::env::var_os(VARIABLE)
@@ -104,19 +104,19 @@ fn find(given: Option<&PathBuf>, net: Option<LpipsNet>) -> Result<Option<PathBuf
     };
     let named = given.cloned().or_else(variable);
     let missing = || match net {
-        Some(net) => format!("the weights of LPIPS with {net} ({})", net.file_name()),
-        None => "weights of LPIPS".to_owned(),
+        Some(net) => format!("LPIPS weights of {net} ({})", net.file_name()),
+        None => "LPIPS weights".to_owned(),
     };
     let path = match &named {
         Some(path) if path.is_dir() => {
             let found = within(path, net);
-            Some(found.ok_or_else(|| Usage(format!("{} does not hold {}: {HOW}", path.display(), missing())))?)
+            Some(found.ok_or_else(|| Usage(format!("{} does not contain {}; {HOW}", path.display(), missing())))?)
         }
         Some(path) => Some(path.clone()),
         None => data_folder().and_then(|folder| within(&folder, net)),
     };
     if let (None, Some(_)) = (&path, net) {
-        return Err(Usage(format!("{} were not found: {HOW}", missing())).into());
+        return Err(Usage(format!("no {} found; {HOW}", missing())).into());
     }
     Ok(path.map(|path| std::path::absolute(&path).unwrap_or(path)))
 }
@@ -128,7 +128,7 @@ fn within(folder: &Path, net: Option<LpipsNet>) -> Option<PathBuf> {
     nets.find_map(|net| Some(folder.join(net.file_name())).filter(|path| path.exists()))
 }
 
-/// `$XDG_DATA_HOME/irradia` or `~/.local/share/irradia`, and what other systems have in its place.
+/// `$XDG_DATA_HOME/irradia` or `~/.local/share/irradia`, and the equivalents on other systems.
 fn data_folder() -> Option<PathBuf> {
     Some(dirs::data_local_dir()?.join("irradia"))
 }

@@ -1,4 +1,4 @@
-//! One file a command, and what several of them ask of the command line.
+//! One file per command, and arguments common to several commands.
 
 pub mod compare;
 pub mod demo;
@@ -19,7 +19,7 @@ use irradia_runs::scene::Dataset;
 use irradia_runs::{Reading, RunError};
 use std::path::Path;
 
-/// Which part of a dataset.
+/// A part of a dataset.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 pub enum Split {
     /// Held-out views.
@@ -41,28 +41,28 @@ impl Split {
     }
 }
 
-/// How a dataset is read.
+/// Options for reading a dataset.
 #[derive(Clone, Debug, clap::Args)]
 pub struct DataArgs {
-    /// Divide the images' sides by this
+    /// Divide the images' sides by this factor
     #[arg(long, value_name = "F")]
     pub downscale: Option<f32>,
-    /// Scale images whose longer side has more pixels than this; 1600 when no size is asked for
+    /// Downscale images whose longer side has more pixels than this; 1600 when no size is requested
     #[arg(long, value_name = "PX", conflicts_with = "downscale", value_parser = clap::value_parser!(u32).range(1..))]
     pub max_side: Option<u32>,
-    /// Use images as large as they are
+    /// Use images at full size
     #[arg(long, conflicts_with_all = ["downscale", "max_side"])]
     pub full_size: bool,
-    /// Hold out every N-th view by name, none, or those that FILE lists; when absent the dataset's own split, or every 8th
+    /// Hold out every N-th view by name, none (0), or those listed in FILE; when absent the dataset's own split, or every 8th
     #[arg(long, value_name = "N|0|FILE")]
     pub holdout: Option<String>,
-    /// colmap, nerfstudio, blender or llff; recognised from the folder when absent
+    /// colmap, nerfstudio, blender or llff; detected from the folder when absent
     #[arg(long)]
     pub format: Option<String>,
 }
 
 impl DataArgs {
-    /// As the library takes it.
+    /// The library's form of these options.
     pub fn reading(&self) -> Reading {
         let usual = Reading::default();
         let sized = self.downscale.is_some() || self.full_size;
@@ -74,7 +74,7 @@ impl DataArgs {
         }
     }
 
-    /// Reads the dataset; its warnings go to standard error.
+    /// Reads the dataset; prints its warnings on standard error.
     pub fn read(&self, path: &Path) -> Result<Dataset> {
         let dataset = self.reading().read(path).map_err(by_option)?;
         warn(&dataset.warnings);
@@ -82,7 +82,7 @@ impl DataArgs {
     }
 }
 
-/// An error of a request, in the words of the command line.
+/// Converts an error of a request to the names of the command line.
 pub fn by_option(error: RunError) -> anyhow::Error {
     match error {
         RunError::Setting { name, value, message } => {
@@ -92,14 +92,14 @@ pub fn by_option(error: RunError) -> anyhow::Error {
     }
 }
 
-/// Shows warnings on standard error, one line each.
+/// Prints warnings on standard error, one line each.
 pub fn warn(warnings: &[String]) {
     for warning in warnings {
         note(format_args!("warning: {warning}"));
     }
 }
 
-/// What `--threads` takes.
+/// Parser of `--threads`.
 pub fn thread_count() -> RangedU64ValueParser<usize> {
     RangedU64ValueParser::new().range(1..=1024)
 }

@@ -1,34 +1,34 @@
-//! What a run shows on the terminal: a bar, or plain lines where there is no terminal.
+//! Progress of a run on the terminal: a bar, or plain lines without a terminal.
 
 use crate::terminal::note;
 use indicatif::{HumanDuration, ProgressBar, ProgressStyle};
 use irradia_train::Trainer;
-use irradia_train::eval::MOST_PSNR;
+use irradia_train::eval::MAX_PSNR;
 use irradia_train::event::{Event, Observer, Signal, StepReport};
 use std::io::IsTerminal;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-/// Shows progress and hands Ctrl-C on.
+/// Shows progress and forwards Ctrl-C.
 pub struct Progress {
     bar: Option<ProgressBar>,
     stop: Arc<AtomicBool>,
-    /// Moving mean of the training views' squared error.
+    /// Moving average of the training views' squared error.
     mse: Option<f64>,
     held_out: Option<f64>,
-    /// When the last plain line was printed.
+    /// Time of the last plain line.
     last_line: Instant,
     started: Instant,
     first_step: u64,
     stage: String,
 }
 
-/// Time between plain lines.
+/// Interval of plain lines.
 const LINE_EVERY: Duration = Duration::from_secs(5);
 
 impl Progress {
-    /// `stop` ends the run at the next step when it is set.
+    /// `stop`, once set, ends the run at the next step.
     pub fn new(stop: Arc<AtomicBool>) -> Self {
         Self {
             bar: std::io::stderr().is_terminal().then(|| {
@@ -68,7 +68,7 @@ impl Progress {
         let message = format!(
             "loss {:.4} psnr {:.2} dB{held_out} {} {rate:.1} steps/s {}",
             report.loss,
-            (-10.0 * mse.log10()).clamp(f64::NEG_INFINITY, MOST_PSNR),
+            (-10.0 * mse.log10()).clamp(f64::NEG_INFINITY, MAX_PSNR),
             size_in_words(report.splats as u64, report.parameters.map(|n| n as u64)),
             self.stage
         );
@@ -92,7 +92,7 @@ impl Progress {
     }
 }
 
-/// A range of seconds in words; one value where its ends are close.
+/// A range of seconds in words; one value if its ends are close.
 fn eta([low, high]: [f64; 2]) -> String {
     let words = |seconds: f64| format!("{:#}", HumanDuration(Duration::from_secs(seconds.round() as u64)));
     let (from, to) = (words(low), words(high));
@@ -103,7 +103,7 @@ fn eta([low, high]: [f64; 2]) -> String {
     }
 }
 
-/// How large a scene is: a field by its numbers, where it is one.
+/// The size of a scene: splats, or the parameters of a field.
 pub fn size_in_words(splats: u64, parameters: Option<u64>) -> String {
     parameters.map_or_else(|| format!("{splats} splats"), |n| format!("{n} parameters"))
 }

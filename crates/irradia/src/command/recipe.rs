@@ -5,9 +5,9 @@ use crate::terminal::say;
 use anyhow::Result;
 use irradia_runs::read_recipe;
 use irradia_train::Recipe;
-use irradia_train::recipe::{BUILT_IN, Density, Exit, Group, Param, Represents, Stage};
+use irradia_train::recipe::{BUILT_IN, DensityControl, Exit, Group, Param, Represents, Stage};
 use irradia_train::report::columns;
-use irradia_train::schedule::{Moment, outline};
+use irradia_train::schedule::{OutlinePoint, outline};
 
 #[derive(clap::Args)]
 pub struct Args {
@@ -17,11 +17,11 @@ pub struct Args {
 
 #[derive(clap::Subcommand)]
 enum Action {
-    /// Name the built-in recipes
+    /// List the built-in recipes
     List,
-    /// Show what a recipe does when
+    /// Show the schedule of a recipe
     Show(ShowArgs),
-    /// Say what may stand in a recipe: each key with unit, default, bounds and source
+    /// List the keys of recipes: each with unit, default, bounds and source
     Keys(recipe_keys::Args),
 }
 
@@ -30,13 +30,13 @@ pub struct ShowArgs {
     /// Built-in recipe or a .toml file
     #[arg(value_name = "NAME|FILE")]
     pub recipe: String,
-    /// Change one key of the recipe, such as stage.grow.params.ssim_weight=0.3
+    /// Override one key of the recipe, such as stage.grow.params.ssim_weight=0.3
     #[arg(long, value_name = "KEY=VALUE")]
     pub set: Vec<String>,
-    /// Fit the recipe into so many steps
+    /// Fit the recipe into this number of steps
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
     pub steps: Option<u64>,
-    /// Print the recipe itself instead, as a file to start from
+    /// Print the recipe as a file to start from instead
     #[arg(long, conflicts_with = "steps")]
     pub toml: bool,
 }
@@ -69,60 +69,60 @@ fn list() -> Result<()> {
     say(columns(&lines, 3).trim_end())
 }
 
-/// Times at which the knobs are shown, beside the ends of stages.
-const MOMENTS: usize = 6;
+/// Number of points in time at which parameters are shown, in addition to the ends of stages.
+const POINTS: usize = 6;
 
-/// What `recipe` does in `steps` steps, as tables.
+/// The schedule of `recipe` in `steps` steps, as tables.
 fn plan(recipe: &Recipe, steps: u64) -> String {
     let pace = recipe.total_steps() as f64 / steps as f64;
-    let moments = outline(recipe, MOMENTS);
+    let points = outline(recipe, POINTS);
     let mut text = format!("{}: {}\n{steps} steps", recipe.name, recipe.about);
     if steps != recipe.total_steps() {
         text += &format!(" for the recipe's {}", recipe.total_steps());
     }
     if recipe.stage.iter().any(|stage| stage.represents == Represents::Splats) {
         text += &format!(", at most {} splats", recipe.max_splats);
-        if let Some(share) = recipe.splats_per_pixel {
-            text += &format!(" or {share} for each pixel of an image");
+        if let Some(per_pixel) = recipe.splats_per_pixel {
+            text += &format!(" or {per_pixel} per pixel of an image");
         }
     }
     text += "\n\n";
-    text += &columns(&stages(recipe, &moments, pace), 6);
+    text += &columns(&stages(recipe, &points, pace), 6);
 
     let (still, moving): (Vec<Param>, Vec<Param>) = Param::ALL.into_iter().partition(|param| {
-        let value = |moment: &Moment| moment.values[*param];
-        moments.iter().all(|moment| value(moment) == value(&moments[0]))
+        let value = |point: &OutlinePoint| point.values[*param];
+        points.iter().all(|point| value(point) == value(&points[0]))
     });
-    let shown = distinct(&moments, pace);
+    let shown = distinct(&points, pace);
     if !moving.is_empty() {
         let mut heads = vec!["step".to_owned()];
-        heads.extend(shown.iter().map(|moment| format!("{:.0}", moment.time / pace)));
+        heads.extend(shown.iter().map(|point| format!("{:.0}", point.time / pace)));
         let mut names = vec!["stage".to_owned()];
-        names.extend(shown.iter().map(|moment| recipe.stage[moment.stage].name.clone()));
+        names.extend(shown.iter().map(|point| recipe.stage[point.stage].name.clone()));
         let mut lines = vec![heads, names];
         for param in moving {
             let mut line = vec![param.name().to_owned()];
-            line.extend(shown.iter().map(|moment| figure(moment.values[param])));
+            line.extend(shown.iter().map(|point| figure(point.values[param])));
             lines.push(line);
         }
-        text += &format!("\nWhat changes:\n{}", columns(&lines, 1));
+        text += &format!("\nChanging parameters:\n{}", columns(&lines, 1));
     }
     let lines: Vec<Vec<String>> = still
         .iter()
-        .filter(|param| moments[0].values[**param] != 0.0)
-        .map(|param| vec![param.name().to_owned(), figure(moments[0].values[*param])])
+        .filter(|param| points[0].values[**param] != 0.0)
+        .map(|param| vec![param.name().to_owned(), figure(points[0].values[*param])])
         .collect();
-    text + &format!("\nWhat stays:\n{}", columns(&lines, 1))
+    text + &format!("\nConstant parameters:\n{}", columns(&lines, 1))
 }
 
-/// A line a stage: its steps, how splats come and go, what it is judged by, when it may end early.
-fn stages(recipe: &Recipe, moments: &[Moment], pace: f64) -> Vec<Vec<String>> {
+/// A line per stage: its steps, density control, losses, and early end.
+fn stages(recipe: &Recipe, points: &[OutlinePoint], pace: f64) -> Vec<Vec<String>> {
     let heads = ["stage", "steps", "image scale", "losses", "density", "ends early"];
     let mut lines = vec![heads.map(str::to_owned).to_vec()];
     let mut start = 0.0;
     for (i, stage) in recipe.stage.iter().enumerate() {
         let end = start + stage.steps as f64;
-        let within: Vec<&Moment> = moments.iter().filter(|moment| moment.stage == i).collect();
+        let within: Vec<&OutlinePoint> = points.iter().filter(|point| point.stage == i).collect();
         lines.push(vec![
             stage.name.clone(),
             format!("{:.0} - {:.0}", (start / pace).floor() + 1.0, end / pace),
@@ -139,9 +139,9 @@ fn stages(recipe: &Recipe, moments: &[Moment], pace: f64) -> Vec<Vec<String>> {
     lines
 }
 
-/// The value of a knob in a stage, or its first and its last.
-fn course(within: &[&Moment], param: Param) -> String {
-    let value = |moment: Option<&&Moment>| moment.map_or(0.0, |moment| moment.values[param]);
+/// The value of a parameter in a stage, or its first and last.
+fn course(within: &[&OutlinePoint], param: Param) -> String {
+    let value = |point: Option<&&OutlinePoint>| point.map_or(0.0, |point| point.values[param]);
     let (first, last) = (value(within.first()), value(within.last()));
     if first == last {
         figure(first)
@@ -150,11 +150,11 @@ fn course(within: &[&Moment], param: Param) -> String {
     }
 }
 
-fn losses(within: &[&Moment]) -> String {
+fn losses(within: &[&OutlinePoint]) -> String {
     let with_group = |group: Group| Param::ALL.into_iter().filter(move |param| param.row().group == group);
     let mut losses = Vec::new();
     for loss in with_group(Group::Loss) {
-        if within.iter().all(|moment| moment.values[loss] == 0.0) {
+        if within.iter().all(|point| point.values[loss] == 0.0) {
             continue;
         }
         let named = |param: Param| {
@@ -180,11 +180,11 @@ fn density(stage: &Stage) -> String {
     }
     let strategy = stage.density.map(|density| {
         let name = match density {
-            Density::Classic(knobs) if knobs.absolute => "classic, absolute",
-            Density::Classic(_) => "classic",
-            Density::Mcmc(_) => "mcmc",
-            Density::Taming(_) => "taming",
-            Density::Fast(_) => "fast",
+            DensityControl::Classic(knobs) if knobs.absolute => "classic, absolute",
+            DensityControl::Classic(_) => "classic",
+            DensityControl::Mcmc(_) => "mcmc",
+            DensityControl::Taming(_) => "taming",
+            DensityControl::Fast(_) => "fast",
         };
         format!("{name} every {}", density.every())
     });
@@ -196,26 +196,28 @@ fn density(stage: &Stage) -> String {
 fn exit(exit: Exit) -> String {
     match exit {
         Exit::Threshold { tau } => format!("error below {tau}"),
-        Exit::Relative { ratio } => format!("error below {ratio} of its first"),
-        Exit::Plateau { drop, window } => format!("error falls by less than {drop} of itself in {window} recipe steps"),
+        Exit::Relative { ratio } => format!("error below {ratio} of its first value"),
+        Exit::Plateau { drop, window } => {
+            format!("relative decrease of the error below {drop} in {window} recipe steps")
+        }
     }
 }
 
-/// The moments without those at the end of a stage that the next one begins as.
-fn distinct(moments: &[Moment], pace: f64) -> Vec<&Moment> {
-    let step = |moment: &Moment| (moment.time / pace).round();
+/// The points without those at the end of a stage that equal the start of the next one.
+fn distinct(points: &[OutlinePoint], pace: f64) -> Vec<&OutlinePoint> {
+    let step = |point: &OutlinePoint| (point.time / pace).round();
     let equal = |a: f64, b: f64| (a - b).abs() <= 1e-6 * a.abs();
-    let same = |a: &Moment, b: &Moment| {
+    let same = |a: &OutlinePoint, b: &OutlinePoint| {
         step(a) == step(b) && Param::ALL.iter().all(|param| equal(a.values[*param], b.values[*param]))
     };
-    let shown = moments
+    let shown = points
         .iter()
         .enumerate()
-        .filter(|(i, moment)| moments.get(i + 1).is_none_or(|next| !same(moment, next)));
-    shown.map(|(_, moment)| moment).collect()
+        .filter(|(i, point)| points.get(i + 1).is_none_or(|next| !same(point, next)));
+    shown.map(|(_, point)| point).collect()
 }
 
-/// Three digits that count.
+/// Formats with three significant digits.
 fn figure(value: f64) -> String {
     if value == 0.0 {
         return "0".into();

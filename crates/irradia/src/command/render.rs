@@ -12,27 +12,27 @@ use std::path::PathBuf;
 #[derive(clap::Args)]
 #[command(group(clap::ArgGroup::new("cameras").required(true).args(["data", "orbit"])))]
 pub struct Args {
-    /// The scene: RUN, or a file; background and filters are taken from the run it lies in
+    /// The scene: RUN, or a file; background and filters are taken from the run that contains it
     pub scene: PathBuf,
     /// Render the views of this dataset
     #[arg(long)]
     pub data: Option<PathBuf>,
-    /// Which of its views
+    /// Views of the dataset to render
     #[arg(long, value_enum, default_value_t = Split::Test)]
     pub split: Split,
-    /// Render so many frames of a circle around the scene instead
+    /// Render this number of frames on a circle around the scene instead
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=100_000))]
     pub orbit: Option<u32>,
-    /// Size of the orbit's frames; that of the training images, or 1280x720, when absent
+    /// Size of the orbit's frames; when absent that of the training images, or 1280x720
     #[arg(long, value_name = "WxH", value_parser = parse_size, conflicts_with = "data")]
     pub size: Option<(u32, u32)>,
     /// Folder for the frames
     #[arg(long)]
     pub out: PathBuf,
-    /// Write depth too: NAME.depth.png, near is bright, one range for all frames
+    /// Also write depth: NAME.depth.png, near is bright, one range for all frames
     #[arg(long)]
     pub depth: bool,
-    /// Write alpha too: NAME.alpha.png
+    /// Also write alpha: NAME.alpha.png
     #[arg(long)]
     pub alpha: bool,
     /// Threads; all cores when absent
@@ -47,7 +47,7 @@ pub fn parse_size(text: &str) -> Result<(u32, u32), String> {
     text.split_once('x')
         .and_then(|(w, h)| Some((w.parse().ok()?, h.parse().ok()?)))
         .filter(|(w, h)| (1..=16384).contains(w) && (1..=16384).contains(h))
-        .ok_or_else(|| "give a size such as 640x480, each side 1 to 16384".into())
+        .ok_or_else(|| "expected a size such as 640x480, each side 1 to 16384".into())
 }
 
 pub fn run(args: &Args) -> Result<()> {
@@ -68,12 +68,12 @@ pub fn run(args: &Args) -> Result<()> {
             let cameras = scene.orbit(frames, args.size).into_iter().enumerate();
             cameras.map(|(i, camera)| (format!("frame_{i:04}"), camera)).collect()
         }
-        (None, None) => unreachable!("clap asks for one of them"),
+        (None, None) => unreachable!("clap requires one of them"),
     };
     if cameras.is_empty() {
         return Err(Usage("nothing to render: no such views".into()).into());
     }
-    std::fs::create_dir_all(&args.out).with_context(|| format!("cannot make {}", args.out.display()))?;
+    std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
     let mut renderer = Renderer::new();
     let mut depths = Vec::new();
     let write = |name: &str, what: &str, image: &Image| -> Result<()> {
@@ -93,7 +93,7 @@ pub fn run(args: &Args) -> Result<()> {
             write(name, ".alpha", &alpha)?;
         }
     }
-    // One range for all frames, of inverse depth: far things, which are many, then share few steps.
+    // One range for all frames, of inverse depth, which gives distant parts, usually most of the scene, few levels.
     let nearest = depths.iter().flat_map(|d| &d.data).fold(0.0f32, |m, v| m.max(*v));
     for ((name, _), mut image) in cameras.iter().zip(depths) {
         for value in &mut image.data {

@@ -13,7 +13,7 @@ use std::sync::atomic::Ordering;
 
 #[derive(clap::Args)]
 pub struct Args {
-    /// Folder of posed photographs (COLMAP, nerfstudio, Blender, LLFF); with --resume and --replay the run knows it
+    /// Folder of posed photographs (COLMAP, nerfstudio, Blender, LLFF); not needed with --resume and --replay
     #[arg(required_unless_present_any = ["resume", "replay"])]
     pub data: Option<PathBuf>,
     /// Folder for the run
@@ -22,42 +22,42 @@ pub struct Args {
     /// Built-in recipe or a .toml file
     #[arg(long, value_name = "NAME|FILE", default_value = DEFAULT_RECIPE, conflicts_with = "resume")]
     pub recipe: String,
-    /// Change one key of the recipe, such as stage.grow.params.ssim_weight=0.3
+    /// Override one key of the recipe, such as stage.grow.params.ssim_weight=0.3
     #[arg(long, value_name = "KEY=VALUE", conflicts_with = "resume")]
     pub set: Vec<String>,
-    /// Fit the recipe into so many steps
+    /// Fit the recipe into this number of steps
     #[arg(long, value_name = "N", conflicts_with_all = ["resume", "budget"], value_parser = clap::value_parser!(u64).range(1..))]
     pub steps: Option<u64>,
-    /// Never more splats than this
+    /// Maximum number of splats
     #[arg(long, value_name = "N", conflicts_with = "resume", value_parser = RangedU64ValueParser::<usize>::new().range(1..))]
     pub max_splats: Option<usize>,
-    /// Everything random follows from it
+    /// Random seed
     #[arg(long, value_name = "N", default_value_t = 0, conflicts_with = "resume")]
     pub seed: u64,
     /// Threads; all cores when absent. The result does not depend on it
     #[arg(long, value_name = "N", value_parser = thread_count())]
     pub threads: Option<usize>,
-    /// Stop when the held-out views reach this
+    /// Stop at this held-out PSNR
     #[arg(long, value_name = "DB")]
     pub until_psnr: Option<f64>,
-    /// Fit the recipe into a time of training, such as 90s or 5m. How far it comes depends on the clock, and so do the bytes of
-    /// the scene; --replay makes the same ones again
+    /// Fit the recipe into a training time, such as 90s or 5m. The progress depends on the speed of the machine, and so do the
+    /// bytes of the scene; --replay reproduces them
     #[arg(long, value_name = "TIME", value_parser = parse_seconds)]
     pub budget: Option<f64>,
-    /// Go on with an interrupted run, from its newest checkpoint; the result is that of an unbroken run
+    /// Resume an interrupted run from its latest checkpoint; the result is that of an uninterrupted run
     #[arg(long, value_name = "RUN", conflicts_with_all = ["out", "overwrite", "downscale", "max_side", "full_size", "holdout", "format"])]
     pub resume: Option<PathBuf>,
-    /// Train as RUN was, each step at the pace that it had, into --out: the same bytes, also of a run with a --budget
+    /// Repeat RUN into --out, each step at its recorded pace: the same bytes, even for a run with a --budget
     #[arg(long, value_name = "RUN", conflicts_with_all = ["resume", "recipe", "set", "steps", "max_splats", "seed", "until_psnr", "budget", "downscale", "max_side", "full_size", "holdout", "format", "background"])]
     pub replay: Option<PathBuf>,
-    /// Replace the run that --out holds
+    /// Replace an existing run in --out
     #[arg(long)]
     pub overwrite: bool,
     /// LPIPS weights: a file, or a folder of them; see irradia lpips
     #[arg(long, value_name = "PATH")]
     pub lpips: Option<PathBuf>,
-    /// white, black or random (trained over random colours, scored over white): what photographs with alpha are laid over;
-    /// white for Blender scenes and the recipe's own for others when absent
+    /// Background of photographs with alpha: white, black or random (random colours in training, white in evaluation); when
+    /// absent white for Blender scenes and the recipe's own for others
     #[arg(long, value_name = "COLOR", conflicts_with = "resume")]
     pub background: Option<Background>,
     #[command(flatten)]
@@ -74,7 +74,7 @@ pub fn parse_seconds(text: &str) -> Result<f64, String> {
     };
     match number.trim().parse::<f64>() {
         Ok(value) if value > 0.0 && value.is_finite() => Ok(value * unit),
-        _ => Err("give a time such as 90s, 5m or 1h".into()),
+        _ => Err("expected a time such as 90s, 5m or 1h".into()),
     }
 }
 
@@ -87,9 +87,9 @@ pub fn run(args: &Args) -> Result<()> {
     }
 }
 
-/// `run` again.
+/// The input that repeats `run`.
 fn replay(run: &Path, args: &Args) -> Result<TrainInput> {
-    let out = args.out.clone().expect("clap asks for it");
+    let out = args.out.clone().expect("required by clap");
     let mut input = TrainInput::replay_of(run, out)?;
     if let Some(data) = &args.data {
         input.data.clone_from(data);
@@ -99,15 +99,15 @@ fn replay(run: &Path, args: &Args) -> Result<TrainInput> {
     Ok(input)
 }
 
-/// The weights that a run began with, where they still lie: a perceptual loss without them would train another scene.
+/// The weights with which a run began, if they still exist: without them a perceptual loss would be skipped.
 fn lpips_for(kept: Option<PathBuf>, args: &Args) -> Result<Option<PathBuf>> {
     let kept = kept.filter(|path| path.exists());
     lpips_path(args.lpips.as_ref().or(kept.as_ref()))
 }
 
-/// A new run as the command line asks for it.
+/// The input of a new run.
 fn input(args: &Args) -> Result<TrainInput> {
-    let given = |path: &Option<PathBuf>| path.clone().expect("clap asks for it");
+    let given = |path: &Option<PathBuf>| path.clone().expect("required by clap");
     Ok(TrainInput {
         recipe: args.recipe.clone(),
         set: args.set.clone(),
@@ -124,7 +124,7 @@ fn input(args: &Args) -> Result<TrainInput> {
     })
 }
 
-/// Makes a new run, on the threads that there are.
+/// Begins a new run on the current threads, and finishes it.
 pub fn begin(input: TrainInput) -> Result<()> {
     let request = input.check().map_err(by_option)?;
     RunFolder::check_free(&request.input().out, request.input().overwrite)?;
@@ -141,7 +141,7 @@ fn resume(folder: &Path, args: &Args) -> Result<()> {
     if record.complete {
         let report = opened.file("report.html");
         return say(format_args!(
-            "{} is complete: look at {}",
+            "{} is complete: see {}",
             folder.display(),
             report.display()
         ));
@@ -164,7 +164,7 @@ fn resume(folder: &Path, args: &Args) -> Result<()> {
     finish(run)
 }
 
-/// Trains, writes everything, and says how it went.
+/// Trains, writes all results, and prints a summary.
 fn finish(mut run: Run) -> Result<()> {
     let folder = run.folder().path().to_owned();
     if let (Some(lpips), Some(path)) = (&run.trainer().options.lpips, &run.request().input().lpips) {
@@ -172,7 +172,7 @@ fn finish(mut run: Run) -> Result<()> {
     }
     let stop = stop_flag();
     let trained = run.train(&mut [&mut Progress::new(stop.clone())]);
-    // A Ctrl-C that ended the steps is obeyed by then; the evaluation ends by one of its own.
+    // If Ctrl-C ended the steps, a second one ends the evaluation.
     let stopped = stop.load(Ordering::Relaxed);
     let stop = || !stopped && stop.load(Ordering::Relaxed);
     let finished = trained.and_then(|_| run.finish_unless(&stop));
@@ -185,7 +185,7 @@ fn finish(mut run: Run) -> Result<()> {
     }
     let finished = finished.map_err(|error| {
         anyhow!(
-            "{}; when that is put right, go on with: irradia train --resume {}",
+            "{}; once that is fixed, resume with: irradia train --resume {}",
             one_line(&error.into()),
             folder.display()
         )
@@ -196,7 +196,7 @@ fn finish(mut run: Run) -> Result<()> {
 fn tell(finished: &Finished) -> Result<()> {
     let (report, folder) = (&finished.report, &finished.folder);
     let figures = if report.psnr.is_nan() {
-        "nothing was evaluated: no view is held out that could be measured".to_owned()
+        "nothing was evaluated: there is no held-out view with pixels to measure".to_owned()
     } else {
         format!(
             "held-out PSNR {:.2} dB, SSIM {:.4}{}{}",
@@ -204,7 +204,7 @@ fn tell(finished: &Finished) -> Result<()> {
             report.ssim,
             in_words(report.lpips, report.lpips_net.as_deref()),
             report.half_fit_psnr.map_or(String::new(), |psnr| format!(
-                ", {psnr:.2} dB on right halves fitted on left ones"
+                ", {psnr:.2} dB on right halves after a fit on left halves"
             )),
         )
     };
@@ -223,14 +223,14 @@ fn tell(finished: &Finished) -> Result<()> {
     ))?;
     if !finished.complete {
         say(format_args!(
-            "go on with: irradia train --resume {}",
+            "resume with: irradia train --resume {}",
             folder.path().display()
         ))?;
     }
-    say(format_args!("look at {}", folder.file("report.html").display()))
+    say(format_args!("see {}", folder.file("report.html").display()))
 }
 
-/// `, LPIPS (alex) 0.1234`, where it was measured.
+/// `, LPIPS (alex) 0.1234`, if measured.
 fn in_words(lpips: Option<f64>, net: Option<&str>) -> String {
     let pair = lpips.zip(net);
     pair.map_or(String::new(), |(lpips, net)| format!(", LPIPS ({net}) {lpips:.4}"))

@@ -1,25 +1,25 @@
-//! Bad input gets one clear line and the right exit code, and nothing is lost or half written.
+//! Bad input gets one clear line and the right exit code, and no file is lost or partially written.
 
 use crate::process::*;
 use serde_json::{Value, json as value};
 use std::fs;
 use std::path::Path;
 
-/// Changes a JSON file.
+/// Edits a JSON file.
 fn edit(path: &Path, change: impl FnOnce(&mut Value)) {
     let mut content = json(path);
     change(&mut content);
     fs::write(path, content.to_string()).expect("written");
 }
 
-/// Training on `data` is refused with exit code 1 and `words`, and makes no run.
+/// Asserts that training on `data` fails with exit code 1 and `words`, and creates no run.
 fn data_refused(folder: &Path, words: &[&str]) {
     irradia(folder, "train data --out run --steps 5").refused(1, words);
-    assert!(!folder.join("run").exists(), "a refused run leaves no folder");
+    assert!(!folder.join("run").exists(), "a rejected run leaves no folder");
 }
 
 #[test]
-fn mistakes_in_the_command_line_exit_with_2_and_touch_nothing() {
+fn command_line_mistakes_exit_with_2_and_change_nothing() {
     let folder = with_run();
     let cases: [(&str, &[&str]); 23] = [
         ("train", &["<DATA>"]),
@@ -65,7 +65,7 @@ fn mistakes_in_the_command_line_exit_with_2_and_touch_nothing() {
         let ended = irradia(folder.path(), line);
         let error = ended.stderr.clone();
         if line.starts_with("train") && words.len() == 1 || line.starts_with("render run --out") {
-            // What is missing, clap lists under its line.
+            // clap lists missing arguments below its line.
             assert_eq!(ended.code, Some(2), "{line}: {error}");
             assert!(words.iter().all(|word| error.contains(word)), "{line}: {error}");
         } else {
@@ -79,7 +79,7 @@ fn mistakes_in_the_command_line_exit_with_2_and_touch_nothing() {
 }
 
 #[test]
-fn a_recipe_file_with_an_unknown_key_is_refused_by_that_key() {
+fn an_unknown_key_in_a_recipe_file_is_named() {
     let folder = with_run();
     let path = folder.path().join("run/recipe.toml");
     let text = fs::read_to_string(&path).expect("recipe");
@@ -88,16 +88,16 @@ fn a_recipe_file_with_an_unknown_key_is_refused_by_that_key() {
         .refused(2, &["mine.toml", "`eval_evry`", "`eval_every`"]);
     fs::write(folder.path().join("mine.toml"), "name = \"mine\"\nabout = = 3\n").expect("written");
     irradia(folder.path(), "train data --out x --recipe mine.toml").refused(2, &["mine.toml", "line 2"]);
-    // The resolved recipe of a run is itself a recipe.
+    // The resolved recipe of a run is a valid recipe.
     irradia(
         folder.path(),
         "train data --out again --recipe run/recipe.toml --steps 2",
     )
-    .well();
+    .success();
 }
 
 #[test]
-fn a_folder_that_is_no_dataset_is_told_what_was_looked_for() {
+fn a_folder_without_a_dataset_gets_the_list_of_known_layouts() {
     let folder = with_data();
     irradia(folder.path(), "train nowhere --out run").refused(1, &["nowhere"]);
     irradia(folder.path(), "train . --out run").refused(1, &["transforms.json", "sparse/0", "poses_bounds.npy"]);
@@ -108,7 +108,7 @@ fn a_folder_that_is_no_dataset_is_told_what_was_looked_for() {
 }
 
 #[test]
-fn fewer_than_three_views_are_refused_with_their_reasons() {
+fn fewer_than_three_views_are_rejected_with_reasons() {
     let folder = with_data();
     for view in 2..8 {
         fs::remove_file(folder.path().join(format!("data/train/r_{view:03}.png"))).expect("removed");
@@ -118,14 +118,14 @@ fn fewer_than_three_views_are_refused_with_their_reasons() {
 }
 
 #[test]
-fn poses_that_are_none_are_left_out_and_named() {
+fn invalid_poses_are_skipped_and_named() {
     let folder = with_data();
     edit(&folder.path().join("data/transforms_train.json"), |content| {
-        // JSON knows no NaN; writers that have one put null, or a number no f32 holds.
+        // JSON has no NaN; writers that have one write null, or a number beyond f32.
         content["frames"][0]["transform_matrix"][0][0] = Value::Null;
         content["frames"][1]["transform_matrix"][1][3] = value!(1e300);
     });
-    let ended = irradia(folder.path(), "train data --out run --steps 5").well();
+    let ended = irradia(folder.path(), "train data --out run --steps 5").success();
     let warning = ended
         .stderr
         .lines()
@@ -136,17 +136,17 @@ fn poses_that_are_none_are_left_out_and_named() {
         "{warning}"
     );
     let told = json(&folder.path().join("run/report.json"))["warnings"].to_string();
-    assert!(told.contains("r_001"), "the report tells it too: {told}");
+    assert!(told.contains("r_001"), "the report contains it, too: {told}");
     // Python writes NaN as a bare word.
     let path = folder.path().join("data/transforms_train.json");
     let text = fs::read_to_string(&path).expect("file");
     fs::write(&path, text.replace("null", "NaN")).expect("written");
-    let ended = irradia(folder.path(), "train data --out again --steps 5").well();
+    let ended = irradia(folder.path(), "train data --out again --steps 5").success();
     assert!(ended.stderr.contains("r_000"), "{ended:?}");
 }
 
 #[test]
-fn images_that_cannot_be_used_are_left_out_and_named() {
+fn unusable_images_are_skipped_and_named() {
     let folder = with_data();
     let train = folder.path().join("data/train");
     fs::write(train.join("r_001.png"), "").expect("emptied");
@@ -154,7 +154,7 @@ fn images_that_cannot_be_used_are_left_out_and_named() {
     let whole = fs::read(train.join("r_003.png")).expect("a picture");
     fs::write(train.join("r_003.png"), &whole[..whole.len() / 2]).expect("cut");
     fs::remove_file(train.join("r_004.png")).expect("removed");
-    let ended = irradia(folder.path(), "train data --out run --steps 5").well();
+    let ended = irradia(folder.path(), "train data --out run --steps 5").success();
     let warnings: Vec<&str> = ended
         .stderr
         .lines()
@@ -171,7 +171,7 @@ fn images_that_cannot_be_used_are_left_out_and_named() {
 }
 
 #[test]
-fn an_image_damaged_inside_is_named_and_the_run_goes_on_once_it_is_gone() {
+fn an_image_damaged_inside_is_named_and_the_run_resumes_without_it() {
     let folder = with_data();
     let picture = folder.path().join("data/train/r_005.png");
     let mut bytes = fs::read(&picture).expect("a picture");
@@ -181,13 +181,13 @@ fn an_image_damaged_inside_is_named_and_the_run_goes_on_once_it_is_gone() {
     irradia(folder.path(), "train data --out run --steps 5").refused(1, &["r_005.png", "remove", "--resume run"]);
     assert_no_leftovers(&folder.path().join("run"));
     fs::remove_file(&picture).expect("removed");
-    let ended = irradia(folder.path(), "train --resume run").well();
+    let ended = irradia(folder.path(), "train --resume run").success();
     assert!(ended.stderr.contains("r_005"), "{ended:?}");
     assert_eq!(json(&folder.path().join("run/report.json"))["steps"], 5);
 }
 
 #[test]
-fn cameras_without_intrinsics_are_refused() {
+fn cameras_without_intrinsics_are_rejected() {
     let folder = with_data();
     edit(&folder.path().join("data/transforms_train.json"), |content| {
         content.as_object_mut().expect("an object").remove("camera_angle_x");
@@ -199,7 +199,7 @@ fn cameras_without_intrinsics_are_refused() {
 }
 
 #[test]
-fn an_unknown_camera_model_is_refused_by_name() {
+fn an_unknown_camera_model_is_rejected_by_name() {
     let folder = tempfile::tempdir().expect("a folder");
     let model = folder.path().join("data/sparse/0");
     fs::create_dir_all(&model).expect("a folder");
@@ -210,7 +210,7 @@ fn an_unknown_camera_model_is_refused_by_name() {
 }
 
 #[test]
-fn a_ply_that_promises_more_than_it_holds_is_refused() {
+fn a_ply_shorter_than_its_header_promises_is_rejected() {
     let folder = with_run();
     let whole = scene(&folder.path().join("run"));
     fs::write(folder.path().join("cut.ply"), &whole[..whole.len() / 3]).expect("written");
@@ -250,9 +250,9 @@ fn a_damaged_checkpoint_is_named() {
 }
 
 #[test]
-fn a_place_that_cannot_be_written_is_named() {
+fn a_path_that_cannot_be_written_is_named() {
     let folder = with_run();
-    // Below a file no folder can be made, whoever asks.
+    // No user can create a folder below a file.
     irradia(folder.path(), "train data --out run/scene.ply/x --steps 2").refused(1, &["run/scene.ply/x", "--out"]);
     irradia(folder.path(), "convert run/scene.ply nowhere/out.ply").refused(1, &["nowhere/out.ply"]);
     irradia(folder.path(), "render run --orbit 1 --out run/scene.ply").refused(1, &["run/scene.ply"]);
@@ -262,10 +262,10 @@ fn a_place_that_cannot_be_written_is_named() {
     assert!(!folder.path().join("x").exists());
 }
 
-/// A limit on the size of files stands for the full disk: the system refuses to write on, in the midst of a file.
+/// A limit on file sizes stands in for a full disk: writes fail in the middle of a file.
 #[cfg(unix)]
 #[test]
-fn a_disk_that_fills_up_leaves_no_partial_file_and_keeps_what_was_there() {
+fn a_full_disk_leaves_no_partial_file_and_keeps_existing_ones() {
     let folder = with_run();
     let limited = |line: &str| -> Ended {
         let shell = format!(
@@ -293,10 +293,13 @@ fn a_disk_that_fills_up_leaves_no_partial_file_and_keeps_what_was_there() {
     let ended = limited("train data --out full --steps 40 --set checkpoint_every=10");
     let ended = ended.refused(1, &["full/scene.ply", "cannot write", "--resume full"]);
     assert!(ended.stderr.contains("warning: no checkpoint"), "{ended:?}");
-    assert!(ended.stderr.contains("recipe complete"), "training went on: {ended:?}");
+    assert!(
+        ended.stderr.contains("recipe complete"),
+        "training continued: {ended:?}"
+    );
     assert!(!folder.path().join("full/scene.ply").exists());
     assert_no_leftovers(folder.path());
-    // Room was made.
-    irradia(folder.path(), "train --resume full").well();
+    // There is room again.
+    irradia(folder.path(), "train --resume full").success();
     assert_eq!(json(&folder.path().join("full/report.json"))["steps"], 40);
 }

@@ -1,4 +1,4 @@
-//! `irradia compare`: runs side by side, kept and read again.
+//! `irradia compare`: runs under the same conditions, stored and reused.
 
 use crate::process::*;
 use std::fs;
@@ -6,9 +6,9 @@ use std::fs;
 const LINE: &str = "compare data --recipes classic,classic:params.ssim_weight=0.9 --seeds 2 --steps 20 --out both";
 
 #[test]
-fn a_comparison_sums_up_its_runs_and_reads_finished_ones_again() {
+fn a_comparison_summarises_its_runs_and_reuses_finished_ones() {
     let folder = with_data();
-    let first = irradia(folder.path(), LINE).well();
+    let first = irradia(folder.path(), LINE).success();
     assert!(
         first.stdout.contains("classic:params.ssim_weight=0.9") && first.stdout.contains(" ± "),
         "{first:?}"
@@ -46,24 +46,24 @@ fn a_comparison_sums_up_its_runs_and_reads_finished_ones_again() {
                 .is_file()
         );
     }
-    // Pictures are in the page: nothing beside it is needed.
+    // The page is self-contained: pictures are embedded.
     let page = fs::read_to_string(both.join("compare.html")).expect("a page");
     assert!(page.contains("data:image/jpeg;base64,") && !page.contains("https://"));
     let table = fs::read_to_string(both.join("compare.md")).expect("a table");
     assert!(table.contains("| data | classic:params.ssim_weight=0.9 |"), "{table}");
     assert_no_leftovers(&both);
 
-    // Nothing is trained again, but what is missing is.
+    // Only missing runs are trained again.
     fs::remove_dir_all(both.join("data/classic/seed_1")).expect("removed");
     let scene = scene(&both.join("data/classic/seed_0"));
-    let again = irradia(folder.path(), LINE).well();
+    let again = irradia(folder.path(), LINE).success();
     let trained: Vec<&str> = again.stderr.lines().filter(|line| line.ends_with("..")).collect();
     assert_eq!(trained, ["[3/4] data, classic, seed 1 .."], "{again:?}");
     assert!(scene == self::scene(&both.join("data/classic/seed_0")));
     let psnr = |value: &serde_json::Value| value["scenes"][0]["entries"][0]["psnr"]["mean"].as_f64();
     assert_eq!(psnr(&json(&both.join("compare.json"))), psnr(&json_before));
 
-    // Data or a program that changed since are noticed.
+    // Changes of the data or of the program are detected.
     let request = both.join("data/classic/seed_0/request.json");
     let kept = fs::read_to_string(&request).expect("a request");
     let mut changed = json(&request);
@@ -74,22 +74,22 @@ fn a_comparison_sums_up_its_runs_and_reads_finished_ones_again() {
     let picture = folder.path().join("data/train/r_000.png");
     let bytes = fs::read(&picture).expect("a picture");
     fs::copy(folder.path().join("data/train/r_001.png"), &picture).expect("replaced");
-    irradia(folder.path(), LINE).refused(2, &["seed_0", "data that changed since"]);
+    irradia(folder.path(), LINE).refused(2, &["seed_0", "data that has changed since"]);
     fs::write(&picture, bytes).expect("written");
 
-    // Other conditions are another comparison, unless that is what is wanted.
+    // Other conditions make another comparison, except with --overwrite.
     let other = LINE.replace("--steps 20", "--steps 21");
     irradia(folder.path(), &other).refused(2, &["other conditions", "--overwrite"]);
-    irradia(folder.path(), &(other + " --overwrite")).well();
+    irradia(folder.path(), &(other + " --overwrite")).success();
     assert_eq!(json(&both.join("data/classic/seed_0/report.json"))["steps"], 21);
 }
 
 #[test]
-fn a_run_that_fails_is_a_row_and_not_the_end() {
+fn a_failed_run_is_a_row_and_does_not_end_the_comparison() {
     let folder = with_data();
     fs::create_dir(folder.path().join("empty")).expect("a folder");
     let line = "compare empty data --recipes classic --seeds 1 --steps 5 --out both";
-    let ended = irradia(folder.path(), line).well();
+    let ended = irradia(folder.path(), line).success();
     assert!(ended.stdout.contains("failed: empty, classic, seed 0: "), "{ended:?}");
     let figures = json(&folder.path().join("both/compare.json"));
     let run = &figures["scenes"][0]["entries"][0]["runs"][0];
@@ -99,11 +99,11 @@ fn a_run_that_fails_is_a_row_and_not_the_end() {
     );
     assert!(figures["scenes"][1]["entries"][0]["psnr"]["mean"].as_f64().is_some());
     let line = "compare empty --recipes classic --seeds 1 --steps 5 --out none";
-    irradia(folder.path(), line).refused(1, &["no run came to an end"]);
+    irradia(folder.path(), line).refused(1, &["no run was completed"]);
 }
 
 #[test]
-fn mistakes_are_found_before_anything_is_trained() {
+fn mistakes_are_found_before_any_training() {
     let folder = with_data();
     let cases = [
         ("compare data --recipes nonsense --out both", "nonsense"),
@@ -119,13 +119,13 @@ fn mistakes_are_found_before_anything_is_trained() {
 
 #[cfg(unix)]
 #[test]
-fn an_interrupted_comparison_keeps_what_is_finished() {
+fn an_interrupted_comparison_keeps_finished_runs() {
     use std::time::{Duration, Instant};
     let folder = with_data();
     let line = "compare data --recipes classic,classic:max_splats=4000 --seeds 1 --out both --threads 1";
     // The first run is made beforehand; the second would take minutes.
     let short = "compare data --recipes classic:stage.warmup.steps=1 --seeds 1 --steps 5 --out both";
-    irradia(folder.path(), short).well();
+    irradia(folder.path(), short).success();
     let mut command = program(folder.path());
     let child = command.args(line.split_whitespace()).spawn().expect("it starts");
     let events = folder.path().join("both/data/classic/seed_0/events.jsonl");
@@ -139,7 +139,7 @@ fn an_interrupted_comparison_keeps_what_is_finished() {
         .status();
     assert!(interrupt.expect("kill").success());
     let ended: Ended = child.wait_with_output().expect("it ends").into();
-    let ended = ended.well();
+    let ended = ended.success();
     assert!(ended.stdout.contains("stopped"), "{ended:?}");
     assert!(folder.path().join("both/compare.json").is_file());
 }

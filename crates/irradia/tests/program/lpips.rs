@@ -1,4 +1,4 @@
-//! Weights of LPIPS: imported from PyTorch's files, found in their places, and named in what is measured.
+//! LPIPS weights: imported from PyTorch files, found, and named in results.
 
 use crate::process::*;
 use irradia_testkit::{shared, torch};
@@ -6,7 +6,7 @@ use safetensors::SafeTensors;
 use std::fs;
 use std::path::Path;
 
-/// Features and heads of the shared weights, as torchvision and the authors of LPIPS would publish them.
+/// Features and heads of the shared weights, in the form of torchvision's and the LPIPS authors' files.
 fn publish(weights: &Path, folder: &Path) {
     let bytes = fs::read(weights).expect("the weights");
     let file = SafeTensors::deserialize(&bytes).expect("whole");
@@ -43,11 +43,11 @@ fn weights_are_imported_found_and_named() {
     let here = folder.path();
     assert!(
         irradia(here, "lpips")
-            .well()
+            .success()
             .stdout
-            .contains("no weights of LPIPS were found")
+            .contains("no LPIPS weights found")
     );
-    let without = irradia(here, "eval run --data data").well();
+    let without = irradia(here, "eval run --data data").success();
     assert_eq!(
         without.stderr.matches("LPIPS is not measured").count(),
         1,
@@ -57,11 +57,11 @@ fn weights_are_imported_found_and_named() {
 
     for weights in [&squeeze, &alex] {
         publish(weights, here);
-        irradia(here, "lpips --import features.pth heads.pth").well();
+        irradia(here, "lpips --import features.pth heads.pth").success();
     }
-    let listed = irradia(here, "lpips").well().stdout;
+    let listed = irradia(here, "lpips").success().stdout;
     assert!(listed.contains("squeeze") && listed.contains("lpips_alex.safetensors") && !listed.contains("vgg"));
-    // The same tensors as in the file that they were taken from.
+    // The same tensors as in the original file.
     let [got, want] =
         [here.join("share/irradia/lpips_alex.safetensors"), alex.clone()].map(|path| fs::read(path).unwrap());
     let [got, want] = [&got, &want].map(|bytes| SafeTensors::deserialize(bytes).unwrap());
@@ -75,7 +75,7 @@ fn weights_are_imported_found_and_named() {
     }
 
     let measure = |more: &str| {
-        let ended = irradia(here, &format!("eval run --data data --json figures.json {more}")).well();
+        let ended = irradia(here, &format!("eval run --data data --json figures.json {more}")).success();
         assert_eq!(ended.stderr.matches("LPIPS of ").count(), 1, "{ended:?}");
         let figures = json(&here.join("figures.json"));
         let net = figures["lpips_net"].as_str().expect("a network").to_owned();
@@ -86,7 +86,7 @@ fn weights_are_imported_found_and_named() {
     assert_eq!(net, "squeeze");
     let (net, by_alex) = measure("--lpips-net alex");
     assert!(net == "alex" && by_alex != by_squeeze);
-    // A file tells its network by its tensors, a folder holds files by name.
+    // A file's network is recognised by its tensors, files in a folder by name.
     assert_eq!(
         measure(&format!("--lpips {}", alex.display())),
         ("alex".to_owned(), by_alex)
@@ -101,7 +101,7 @@ fn weights_are_imported_found_and_named() {
     irradia_with(here, "eval run --data data --lpips-net squeeze --lpips", &[&name]).refused(2, &["alex", "squeeze"]);
     irradia(here, "eval run --data data --lpips-net vgg --lpips share/irradia").refused(2, &["lpips_vgg.safetensors"]);
     irradia(here, "eval run --data data --lpips-net vgg16").refused(2, &["squeeze, alex or vgg"]);
-    // Features of one network with the heads of another.
+    // Features of one network combined with the heads of another.
     publish(&squeeze, here);
     fs::copy(here.join("heads.pth"), here.join("other.pth")).unwrap();
     publish(&alex, here);

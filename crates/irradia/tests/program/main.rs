@@ -1,4 +1,4 @@
-//! The program `irradia` as its users meet it: a process with arguments, folders, an exit code and two streams.
+//! The program `irradia` as users run it: a process with arguments, folders, an exit code and two streams.
 
 mod bad_input;
 mod compare;

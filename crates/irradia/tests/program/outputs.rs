@@ -1,10 +1,10 @@
-//! What the program writes, and that it is what was asked for.
+//! The outputs of the program.
 
 use crate::process::*;
 use std::fs;
 
 #[test]
-fn a_run_holds_all_that_was_promised() {
+fn a_run_contains_all_outputs() {
     let folder = with_run();
     let run = folder.path().join("run");
     for file in [
@@ -50,7 +50,7 @@ fn a_run_holds_all_that_was_promised() {
 }
 
 #[test]
-fn events_tell_the_run_from_start_to_end() {
+fn events_describe_the_run_from_start_to_end() {
     let folder = with_run();
     let events = events(&folder.path().join("run"));
     let names: Vec<&str> = events.iter().filter_map(|e| e["event"].as_str()).collect();
@@ -69,7 +69,7 @@ fn events_tell_the_run_from_start_to_end() {
 #[test]
 fn the_scene_has_the_inria_layout_and_converts_to_the_same_bytes() {
     let folder = with_run();
-    irradia(folder.path(), "convert run/scene.ply copy.ply").well();
+    irradia(folder.path(), "convert run/scene.ply copy.ply").success();
     let (first, second) = (
         scene(&folder.path().join("run")),
         fs::read(folder.path().join("copy.ply")).expect("copy"),
@@ -83,7 +83,7 @@ fn the_scene_has_the_inria_layout_and_converts_to_the_same_bytes() {
 }
 
 #[test]
-fn info_knows_every_kind() {
+fn info_describes_every_kind() {
     let folder = with_run();
     let cases = [
         ("run/scene.ply", "Gaussians"),
@@ -92,16 +92,16 @@ fn info_knows_every_kind() {
         ("data/points.ply", "point cloud with 6000 points"),
     ];
     for (path, says) in cases {
-        let ended = irradia(folder.path(), &format!("info {path}")).well();
+        let ended = irradia(folder.path(), &format!("info {path}")).success();
         assert!(ended.stdout.contains(says), "{path}: {}", ended.stdout);
     }
 }
 
 #[test]
-fn eval_measures_what_the_run_reported() {
+fn eval_reproduces_the_figures_of_the_run() {
     let folder = with_run();
     let line = "eval run --data data --json figures.json --save-images seen";
-    let ended = irradia(folder.path(), line).well();
+    let ended = irradia(folder.path(), line).success();
     assert!(ended.stdout.contains("mean of 2"), "{}", ended.stdout);
     let (figures, report) = (
         json(&folder.path().join("figures.json")),
@@ -109,26 +109,26 @@ fn eval_measures_what_the_run_reported() {
     );
     for key in ["psnr", "ssim"] {
         let both = [&figures, &report].map(|v| v[key].as_f64().expect("a number"));
-        // A scene survives its file to the bit, and so do the figures.
+        // A scene round-trips bit for bit, and so do the figures.
         assert_eq!(both[0], both[1], "{key}");
     }
     assert_eq!(figures["views"].as_array().map(Vec::len), Some(2));
     assert_eq!(files_under(&folder.path().join("seen")).len(), 2);
     for (split, views) in [("train", 8), ("all", 10)] {
         let line = format!("eval run/scene.ply --data data --split {split}");
-        let ended = irradia(folder.path(), &line).well();
+        let ended = irradia(folder.path(), &line).success();
         assert!(ended.stdout.contains(&format!("mean of {views}")), "{}", ended.stdout);
     }
 }
 
 #[test]
-fn render_goes_round_the_scene_with_depth_and_alpha() {
+fn render_orbits_the_scene_with_depth_and_alpha() {
     let folder = with_run();
     irradia(
         folder.path(),
         "render run --orbit 4 --size 40x30 --out round --depth --alpha",
     )
-    .well();
+    .success();
     let files = files_under(&folder.path().join("round"));
     assert_eq!(files.len(), 12, "{files:?}");
     for file in &files {
@@ -139,30 +139,30 @@ fn render_goes_round_the_scene_with_depth_and_alpha() {
             .pixels()
             .fold((255, 0), |(l, h), p| (l.min(p.0[0]), h.max(p.0[0])));
         let is_alpha = file.to_string_lossy().contains(".alpha.");
-        // The table fills the frame: alpha is even, and everything else has something in it.
+        // The table fills the frame: alpha is uniform, and everything else has contrast.
         assert!(
             if is_alpha { high > 200 } else { high > low + 20 },
             "{}: {low} to {high}",
             file.display()
         );
     }
-    irradia(folder.path(), "render run/scene.ply --data data --out views").well();
+    irradia(folder.path(), "render run/scene.ply --data data --out views").success();
     assert_eq!(files_under(&folder.path().join("views")).len(), 2);
 }
 
 #[test]
-fn a_run_stops_at_the_psnr_it_was_asked_for() {
+fn a_run_stops_at_the_requested_psnr() {
     let folder = with_data();
-    let ended = irradia(folder.path(), "train data --out run --steps 2000 --until-psnr 12").well();
+    let ended = irradia(folder.path(), "train data --out run --steps 2000 --until-psnr 12").success();
     assert!(ended.stderr.contains("held-out PSNR reached"), "{ended:?}");
     let report = json(&folder.path().join("run/report.json"));
     assert!(report["steps"].as_u64() < Some(200) && report["psnr"].as_f64() >= Some(11.9));
 }
 
 #[test]
-fn a_limit_on_splats_holds_from_the_start() {
+fn a_limit_on_splats_applies_from_the_start() {
     let folder = with_data();
-    irradia(folder.path(), "train data --out run --steps 20 --max-splats 500").well();
+    irradia(folder.path(), "train data --out run --steps 20 --max-splats 500").success();
     let most = events(&folder.path().join("run"))
         .iter()
         .filter_map(|event| event["splats"].as_u64())
@@ -171,33 +171,33 @@ fn a_limit_on_splats_holds_from_the_start() {
 }
 
 #[test]
-fn a_budget_holds_the_whole_recipe() {
+fn a_budget_covers_the_whole_recipe() {
     let folder = with_data();
-    let ended = irradia(folder.path(), "train data --out run --budget 2s --max-splats 8000").well();
+    let ended = irradia(folder.path(), "train data --out run --budget 2s --max-splats 8000").success();
     assert!(ended.stderr.contains("recipe complete"), "{ended:?}");
     let run = folder.path().join("run");
     let seconds = json(&run.join("report.json"))["seconds"].as_f64().expect("a number");
-    // Other tests take the same cores now and then, which only a step that was measured can tell.
+    // Other tests use the same cores at times, which is noticed only when a step is measured.
     assert!((1.0..4.0).contains(&seconds), "{seconds}");
     assert_eq!(events(&run).iter().filter(|e| e["event"] == "stage_entered").count(), 2);
 }
 
 #[test]
-fn overwriting_leaves_nothing_of_the_earlier_run() {
+fn overwriting_removes_the_earlier_run() {
     let folder = with_run();
     let run = folder.path().join("run");
     fs::write(run.join("eval/stale.png"), "x").expect("written");
     fs::write(run.join("mine.txt"), "x").expect("written");
-    irradia(folder.path(), "train data --out run --steps 5 --overwrite").well();
+    irradia(folder.path(), "train data --out run --steps 5 --overwrite").success();
     assert!(!run.join("eval/stale.png").exists() && run.join("mine.txt").exists());
     assert_eq!(json(&run.join("report.json"))["steps"], 5);
     assert_eq!(events(&run).iter().filter(|e| e["event"] == "started").count(), 1);
 }
 
 #[test]
-fn the_demo_leaves_data_and_a_run() {
+fn the_demo_writes_data_and_a_run() {
     let folder = tempfile::tempdir_in(env!("CARGO_TARGET_TMPDIR")).expect("a folder");
-    let ended = irradia(folder.path(), "demo --steps 10 --views 4 --size 32x32 --threads 1").well();
+    let ended = irradia(folder.path(), "demo --steps 10 --views 4 --size 32x32 --threads 1").success();
     assert!(ended.stdout.contains("demo/run/report.html") && ended.stdout.contains("irradia render demo/run"));
     for file in [
         "data/transforms_train.json",
@@ -211,9 +211,9 @@ fn the_demo_leaves_data_and_a_run() {
 
 #[cfg(unix)]
 #[test]
-fn a_reader_that_goes_away_ends_nothing() {
+fn a_closed_pipe_does_not_end_a_run() {
     let folder = with_data();
-    // Both streams end in a pipe that is closed at once.
+    // Both streams go to a pipe that is closed at once.
     let line = format!(
         "'{}' train data --out run --steps 30 2>&1 | true",
         env!("CARGO_BIN_EXE_irradia")

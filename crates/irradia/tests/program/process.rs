@@ -1,4 +1,4 @@
-//! Runs the program, and makes what most tests start from once: a small dataset and a short run on it.
+//! Runs the program, and creates the common inputs of most tests once: a small dataset and a short run on it.
 
 use serde_json::Value;
 use std::fs;
@@ -7,7 +7,7 @@ use std::process::{Command, Output, Stdio};
 use std::sync::OnceLock;
 use tempfile::TempDir;
 
-/// Density control within the few steps that a test can wait for.
+/// Density control within the few steps of a test.
 pub const LIVELY: [&str; 6] = [
     "--recipe",
     "classic",
@@ -17,7 +17,7 @@ pub const LIVELY: [&str; 6] = [
     "stage.grow.density.reset_every=40",
 ];
 
-/// How the program ended and what it said.
+/// Exit status and output of the program.
 #[derive(Debug)]
 pub struct Ended {
     pub code: Option<i32>,
@@ -36,13 +36,13 @@ impl From<Output> for Ended {
 }
 
 impl Ended {
-    /// It did what was asked.
-    pub fn well(self) -> Self {
+    /// Asserts success.
+    pub fn success(self) -> Self {
         assert_eq!(self.code, Some(0), "{self:#?}");
         self
     }
 
-    /// It refused with `code` and exactly one line of error that has all of `words`.
+    /// Asserts failure with `code` and exactly one line of error that contains all of `words`.
     pub fn refused(self, code: i32, words: &[&str]) -> Self {
         assert_eq!(self.code, Some(code), "{self:#?}");
         assert!(!self.stderr.contains("panicked"), "{self:#?}");
@@ -50,13 +50,13 @@ impl Ended {
         assert_eq!(errors.len(), 1, "{self:#?}");
         for word in words {
             let times = errors[0].matches(word).count();
-            assert!(times > 0, "the error does not say {word:?}: {}", errors[0]);
+            assert!(times > 0, "the error does not contain {word:?}: {}", errors[0]);
         }
         self
     }
 }
 
-/// The program, to be run in `folder`, where no weights of LPIPS are found but in `share/irradia`.
+/// The program, to be run in `folder`, where LPIPS weights are found only in `share/irradia`.
 pub fn program(folder: &Path) -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_irradia"));
     command.current_dir(folder).env_remove("IRRADIA_LPIPS");
@@ -68,40 +68,40 @@ pub fn program(folder: &Path) -> Command {
     command
 }
 
-/// Runs the program in `folder`; words of `line` are its arguments.
+/// Runs the program in `folder`; the words of `line` are its arguments.
 pub fn irradia(folder: &Path, line: &str) -> Ended {
     irradia_with(folder, line, &[])
 }
 
-/// Likewise with `more` arguments, which may hold spaces.
+/// Likewise with `more` arguments, which may contain spaces.
 pub fn irradia_with(folder: &Path, line: &str, more: &[&str]) -> Ended {
     let mut command = program(folder);
     command.args(line.split_whitespace()).args(more);
     command.output().expect("the program starts").into()
 }
 
-/// A fresh folder in which `data` is a copy of the small dataset: 8 views to train on, 2 held out, 48 x 48.
+/// A fresh folder with a copy of the small dataset in `data`: 8 training views, 2 held out, 48 x 48.
 pub fn with_data() -> TempDir {
     static MADE: OnceLock<PathBuf> = OnceLock::new();
     copied(MADE.get_or_init(|| {
         let folder = emptied("with_data");
-        irradia(&folder, "synth data --views 8 --size 48x48").well();
+        irradia(&folder, "synth data --views 8 --size 48x48").success();
         folder
     }))
 }
 
-/// A fresh folder with the small dataset and, in `run`, 60 steps on it.
+/// A fresh folder with the small dataset and, in `run`, a run of 60 steps on it.
 pub fn with_run() -> TempDir {
     static MADE: OnceLock<PathBuf> = OnceLock::new();
     copied(MADE.get_or_init(|| {
         let folder = emptied("with_run");
         copy(with_data().path(), &folder);
-        irradia_with(&folder, "train data --out run --steps 60 --seed 7", &LIVELY).well();
+        irradia_with(&folder, "train data --out run --steps 60 --seed 7", &LIVELY).success();
         folder
     }))
 }
 
-/// Takes from a finished run what its end wrote, as if it had been killed after its last checkpoint.
+/// Removes from a finished run what its end wrote, as if it had been killed after its last checkpoint.
 pub fn unfinish(run: &Path, scene: &str) {
     for file in [scene, "report.json", "report.html"] {
         fs::remove_file(run.join(file)).expect("removed");
@@ -111,7 +111,7 @@ pub fn unfinish(run: &Path, scene: &str) {
     fs::write(run.join("run.json"), config.to_string()).expect("written");
 }
 
-/// A folder that outlives the tests (nothing drops what is static) and that the next ones make anew.
+/// A folder that outlives the tests (statics are never dropped), emptied by the next test run.
 fn emptied(name: &str) -> PathBuf {
     let folder = Path::new(env!("CARGO_TARGET_TMPDIR")).join(name);
     let _ = fs::remove_dir_all(&folder);
@@ -153,7 +153,7 @@ pub fn files_under(folder: &Path) -> Vec<PathBuf> {
     files
 }
 
-/// Nothing that was being written when something went wrong stayed under `folder`.
+/// Asserts that no temporary file is left under `folder`.
 pub fn assert_no_leftovers(folder: &Path) {
     for file in files_under(folder) {
         assert!(!file.to_string_lossy().ends_with(".tmp"), "{}", file.display());

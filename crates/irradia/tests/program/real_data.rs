@@ -1,17 +1,17 @@
-//! The real scenes of `../shared/data`: each trains with no flags but those that make it small, and stays small itself.
+//! The real scenes of `../shared/data`: each trains without flags except those that reduce it, within bounded memory.
 
 use crate::process::*;
 use std::path::PathBuf;
 
 /// The shared data, absolute.
 fn shared() -> Option<PathBuf> {
-    Some(irradia_testkit::shared("data")?.canonicalize().expect("it is there"))
+    Some(irradia_testkit::shared("data")?.canonicalize().expect("it exists"))
 }
 
 #[test]
 fn every_scene_trains() {
     let Some(shared) = shared() else { return };
-    // Scene, warnings, and the held-out PSNR that 150 steps on small pictures must reach, about 1.5 dB below what they do.
+    // Scene, warnings, and the held-out PSNR that 150 steps on small images must reach, about 1.5 dB below the usual result.
     let cases = [
         ("fox", 1, 18.4),
         ("fox_colmap", 0, 18.5),
@@ -24,7 +24,7 @@ fn every_scene_trains() {
     for (scene, warnings, at_least) in cases {
         let data = shared.join(scene).display().to_string();
         let line = format!("--out {scene} --steps 150 --max-side 120");
-        let ended = irradia_with(folder.path(), &format!("train {line}"), &[&data]).well();
+        let ended = irradia_with(folder.path(), &format!("train {line}"), &[&data]).success();
         let told = ended.stderr.lines().filter(|line| line.starts_with("warning:")).count();
         assert_eq!(told, warnings, "{scene}: {}", ended.stderr);
         let psnr = json(&folder.path().join(scene).join("report.json"))["psnr"]
@@ -49,7 +49,7 @@ fn fox_takes_less_than_400_megabytes_and_lpips_finds_its_weights() {
         "train --out run --steps 60 --lpips",
         &[&more[1], &more[0]],
     )
-    .well();
+    .success();
     let report = json(&folder.path().join("run/report.json"));
     assert!(
         report["peak_rss_bytes"].as_u64() < Some(400_000_000),
@@ -70,8 +70,8 @@ fn a_perceptual_loss_finds_the_weights_of_the_evaluation() {
     let data = shared.join("chair").display().to_string();
     let weights = shared.join("lpips/lpips_squeeze.safetensors").display().to_string();
     let line = "train --steps 20 --max-side 100 --set params.perceptual_weight=0.1 --out";
-    irradia_with(folder.path(), &format!("{line} without"), &[&data]).well();
-    let with = irradia_with(folder.path(), &format!("{line} with"), &[&data, "--lpips", &weights]).well();
+    irradia_with(folder.path(), &format!("{line} without"), &[&data]).success();
+    let with = irradia_with(folder.path(), &format!("{line} with"), &[&data, "--lpips", &weights]).success();
     assert!(!with.stderr.contains("warning:"), "{with:?}");
     assert!(scene(&folder.path().join("with")) != scene(&folder.path().join("without")));
 }

@@ -1,15 +1,15 @@
-//! The same seed writes the same bytes: with any number of threads, and over every kind of interruption.
+//! The same seed writes the same bytes: with any number of threads, and across every kind of interruption.
 
 use crate::process::*;
 use std::path::Path;
 use std::process::{Child, Command};
 use std::time::{Duration, Instant};
 
-/// Long enough to be caught in its midst, and with all that could differ: density control, resets, a new view order.
+/// Long enough to be interrupted midway, and with everything that could differ: density control, resets, a new view order.
 const LONG: &str = "train data --steps 500 --seed 3 --set checkpoint_every=20";
 
 fn unbroken(folder: &Path) -> Vec<u8> {
-    irradia_with(folder, &format!("{LONG} --out unbroken"), &LIVELY).well();
+    irradia_with(folder, &format!("{LONG} --out unbroken"), &LIVELY).success();
     scene(&folder.join("unbroken"))
 }
 
@@ -39,7 +39,7 @@ fn one_thread_and_two_write_the_same_scene() {
     let folder = with_data();
     for threads in [1, 2, 3] {
         let line = format!("train data --out run{threads} --steps 80 --threads {threads}");
-        irradia_with(folder.path(), &line, &LIVELY).well();
+        irradia_with(folder.path(), &line, &LIVELY).success();
     }
     let one = scene(&folder.path().join("run1"));
     assert!(one == scene(&folder.path().join("run2")) && one == scene(&folder.path().join("run3")));
@@ -47,28 +47,28 @@ fn one_thread_and_two_write_the_same_scene() {
         events(&folder.path().join("run1"))
             .iter()
             .any(|e| e["event"] == "densified"),
-        "density control took part"
+        "density control was active"
     );
 }
 
 #[test]
-fn the_default_recipe_writes_the_same_scene_with_any_threads_and_over_a_break() {
+fn the_default_recipe_writes_the_same_scene_with_any_threads_and_across_a_resume() {
     let folder = with_data();
     let line = "train data --steps 90 --set checkpoint_every=40 --set stage.grow.density.every=10";
     for threads in [1, 3] {
-        irradia(folder.path(), &format!("{line} --threads {threads} --out run{threads}")).well();
+        irradia(folder.path(), &format!("{line} --threads {threads} --out run{threads}")).success();
     }
     let one = scene(&folder.path().join("run1"));
     assert!(one == scene(&folder.path().join("run3")));
-    // As a kill after step 80 would have left it.
+    // As after a kill following step 80.
     let run = folder.path().join("run3");
     unfinish(&run, "scene.ply");
-    irradia(folder.path(), "train --resume run3").well();
+    irradia(folder.path(), "train --resume run3").success();
     assert!(one == scene(&run));
 }
 
 #[test]
-fn a_killed_run_resumes_to_the_bytes_of_an_unbroken_one() {
+fn a_killed_run_resumes_to_the_bytes_of_an_uninterrupted_one() {
     let folder = with_data();
     let mut child = caught_in_its_midst(folder.path());
     child.kill().expect("killed");
@@ -76,10 +76,10 @@ fn a_killed_run_resumes_to_the_bytes_of_an_unbroken_one() {
     let run = folder.path().join("run");
     assert!(!run.join("report.json").exists(), "killed too late to prove anything");
     assert!(!run.join("scene.ply").exists());
-    irradia(folder.path(), "train --resume run").well();
+    irradia(folder.path(), "train --resume run").success();
     assert!(scene(&run) == unbroken(folder.path()));
     assert_no_leftovers(&run);
-    // The journal too is that of one run.
+    // The journal, too, is that of one run.
     let steps: Vec<u64> = events(&run)
         .iter()
         .filter(|e| e["event"] == "step")
@@ -93,9 +93,9 @@ fn a_run_killed_before_its_first_checkpoint_resumes_from_its_start() {
     let folder = with_run();
     let run = folder.path().join("run");
     let finished = scene(&run);
-    // As a kill at step 30 would have left it.
+    // As after a kill at step 30.
     unfinish(&run, "scene.ply");
-    irradia(folder.path(), "train --resume run").well();
+    irradia(folder.path(), "train --resume run").success();
     assert!(scene(&run) == finished);
 }
 
@@ -107,7 +107,7 @@ fn ctrl_c_saves_everything_and_the_run_resumes_to_the_same_bytes() {
     let sent = Command::new("kill").args(["-INT", &child.id().to_string()]).status();
     assert!(sent.expect("kill").success());
     let ended: Ended = child.wait_with_output().expect("ends").into();
-    let ended = ended.well();
+    let ended = ended.success();
     assert!(ended.stdout.contains("irradia train --resume run"), "{ended:?}");
     let run = folder.path().join("run");
     let (stopped_at, partial) = (json(&run.join("report.json"))["steps"].as_u64(), scene(&run));
@@ -120,11 +120,11 @@ fn ctrl_c_saves_everything_and_the_run_resumes_to_the_same_bytes() {
             .exists()
     );
 
-    irradia(folder.path(), "train --resume run --threads 1").well();
+    irradia(folder.path(), "train --resume run --threads 1").success();
     assert_eq!(json(&run.join("report.json"))["steps"], 500);
     assert!(scene(&run) == unbroken(folder.path()) && scene(&run) != partial);
-    // What is complete stays as it is.
-    let again = irradia(folder.path(), "train --resume run").well();
+    // A complete run stays unchanged.
+    let again = irradia(folder.path(), "train --resume run").success();
     assert!(again.stdout.contains("complete"), "{again:?}");
 }
 
@@ -138,21 +138,21 @@ fn two_processes_do_not_train_into_one_folder() {
     }
     child.kill().expect("killed");
     child.wait().expect("gone");
-    // The lock went with its process; what it was writing goes now.
+    // The lock was released with its process; partial files are removed now.
     let half = folder.path().join("run/checkpoints/.step_20.safetensors.1.0.tmp");
     std::fs::write(&half, "half a checkpoint").expect("written");
-    irradia(folder.path(), "train data --out run --overwrite --steps 5").well();
+    irradia(folder.path(), "train data --out run --overwrite --steps 5").success();
     assert_no_leftovers(&folder.path().join("run"));
 }
 
 #[test]
-fn a_run_does_not_go_on_with_other_data() {
+fn a_run_does_not_resume_on_other_data() {
     let folder = with_data();
     irradia(
         folder.path(),
         "train data --out run --steps 40 --set checkpoint_every=20",
     )
-    .well();
+    .success();
     let run = folder.path().join("run");
     let before = scene(&run);
     unfinish(&run, "scene.ply");
@@ -160,15 +160,15 @@ fn a_run_does_not_go_on_with_other_data() {
     std::fs::rename(&picture, folder.path().join("kept.png")).expect("moved");
     irradia(folder.path(), "train --resume run").refused(1, &["run", "data", "1 views are gone", "r_002"]);
     std::fs::rename(folder.path().join("kept.png"), &picture).expect("back");
-    irradia(folder.path(), "train --resume run").well();
+    irradia(folder.path(), "train --resume run").success();
     assert!(scene(&run) == before);
 }
 
 #[test]
-fn a_run_within_a_time_is_repeated_to_the_byte() {
+fn a_run_with_a_budget_is_repeated_bit_for_bit() {
     let folder = with_data();
-    irradia_with(folder.path(), "train data --out run --budget 2s --seed 5", &LIVELY).well();
-    irradia(folder.path(), "train --replay run --out again").well();
+    irradia_with(folder.path(), "train data --out run --budget 2s --seed 5", &LIVELY).success();
+    irradia(folder.path(), "train --replay run --out again").success();
     let [run, again] = ["run", "again"].map(|name| folder.path().join(name));
     assert!(scene(&run) == scene(&again));
     let steps = |run: &Path| json(&run.join("report.json"))["steps"].as_u64();
@@ -176,9 +176,9 @@ fn a_run_within_a_time_is_repeated_to_the_byte() {
     let paces = |run: &Path| std::fs::read_to_string(run.join("pace.txt")).expect("paces");
     assert_eq!(paces(&run), paces(&again), "a repeated run can be repeated");
     assert!(paces(&run).lines().count() > 10);
-    // A repetition that was interrupted goes on as one.
+    // An interrupted repetition resumes as one.
     unfinish(&again, "scene.ply");
-    irradia(folder.path(), "train --resume again").well();
+    irradia(folder.path(), "train --resume again").success();
     assert!(scene(&run) == scene(&again));
     std::fs::remove_file(run.join("pace.txt")).expect("removed");
     irradia(folder.path(), "train --replay run --out x").refused(1, &["run/pace.txt"]);
@@ -186,11 +186,11 @@ fn a_run_within_a_time_is_repeated_to_the_byte() {
 }
 
 #[test]
-fn killed_again_and_again_it_ends_with_the_same_bytes() {
+fn after_repeated_kills_it_ends_with_the_same_bytes() {
     let folder = with_data();
     let line = "train data --steps 150 --seed 3 --set checkpoint_every=5";
     let started = Instant::now();
-    irradia_with(folder.path(), &format!("{line} --out unbroken"), &LIVELY).well();
+    irradia_with(folder.path(), &format!("{line} --out unbroken"), &LIVELY).success();
     let whole = started.elapsed();
     let mut rng = irradia_runs::scene::Rng::new(11, 0);
     let (mut kills, mut tries) = (0, 0);
@@ -216,15 +216,15 @@ fn killed_again_and_again_it_ends_with_the_same_bytes() {
         }
         child.wait().expect("gone");
         if folder.path().join("run/report.json").exists() {
-            // Over before it was killed often enough: from the start again.
+            // Finished before it was killed often enough: start again.
             std::fs::remove_dir_all(folder.path().join("run")).expect("removed");
             arguments = format!("{line} --out run");
         }
     }
     if folder.path().join("run/run.json").exists() {
-        irradia(folder.path(), "train --resume run").well();
+        irradia(folder.path(), "train --resume run").success();
     } else {
-        irradia_with(folder.path(), &format!("{line} --out run"), &LIVELY).well();
+        irradia_with(folder.path(), &format!("{line} --out run"), &LIVELY).success();
     }
     assert!(scene(&folder.path().join("run")) == scene(&folder.path().join("unbroken")));
     assert_no_leftovers(&folder.path().join("run"));

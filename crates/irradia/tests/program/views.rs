@@ -1,4 +1,4 @@
-//! Which photographs a run is trained on and scored by, at which size and over which background.
+//! Training and held-out views, their size and their background.
 
 use crate::process::*;
 use image::{Rgba, RgbaImage};
@@ -16,9 +16,9 @@ fn held_out(run: &Path) -> Vec<String> {
 }
 
 #[test]
-fn all_views_are_trained_on_when_none_is_held_out_and_nothing_is_made_up() {
+fn without_held_out_views_all_are_trained_on_and_no_metric_is_reported() {
     let folder = with_data();
-    let ended = irradia(folder.path(), "train data --out run --steps 5 --holdout 0").well();
+    let ended = irradia(folder.path(), "train data --out run --steps 5 --holdout 0").success();
     assert!(!ended.stdout.contains("PSNR") && ended.stdout.contains("nothing was evaluated"));
     let text = fs::read_to_string(folder.path().join("run/report.json")).expect("a report");
     assert!(
@@ -27,26 +27,26 @@ fn all_views_are_trained_on_when_none_is_held_out_and_nothing_is_made_up() {
     );
     assert!(text.contains("no view is held out"));
     assert_eq!(events(&folder.path().join("run"))[0]["views"], 10);
-    // What a run was trained on does not score it later.
+    // Training views are not evaluated later by default.
     irradia(folder.path(), "eval run --data data").refused(2, &["no such views"]);
     irradia(folder.path(), "train data --out x --steps 5 --holdout 0 --until-psnr 9").refused(2, &["--until-psnr"]);
 }
 
 #[test]
-fn a_number_or_a_list_chooses_the_views_that_are_held_out() {
+fn a_number_or_a_list_selects_the_held_out_views() {
     let folder = with_data();
-    irradia(folder.path(), "train data --out run --steps 5 --holdout 5").well();
+    irradia(folder.path(), "train data --out run --steps 5 --holdout 5").success();
     assert_eq!(
         held_out(&folder.path().join("run")),
         ["test/r_000.png", "train/r_003.png"]
     );
-    let ended = irradia(folder.path(), "eval run --data data").well();
+    let ended = irradia(folder.path(), "eval run --data data").success();
     assert!(
         ended.stdout.contains("train/r_003.png") && ended.stdout.contains("mean of 2"),
         "{ended:?}"
     );
     fs::write(folder.path().join("list.txt"), "train/r_001\n").expect("written");
-    irradia(folder.path(), "train data --out listed --steps 5 --holdout list.txt").well();
+    irradia(folder.path(), "train data --out listed --steps 5 --holdout list.txt").success();
     assert_eq!(held_out(&folder.path().join("listed")), ["train/r_001.png"]);
     for wrong in ["1", "none.txt"] {
         irradia(folder.path(), &format!("train data --out x --holdout {wrong}")).refused(2, &["--holdout", wrong]);
@@ -56,9 +56,9 @@ fn a_number_or_a_list_chooses_the_views_that_are_held_out() {
 }
 
 #[test]
-fn a_dataset_without_its_training_images_is_refused() {
+fn a_dataset_without_its_training_images_is_rejected() {
     let folder = with_data();
-    // Enough held-out views to train on, were that allowed.
+    // There are enough held-out views to train on, if that were allowed.
     let path = folder.path().join("data/transforms_test.json");
     let mut test = json(&path);
     let frame = test["frames"][0].clone();
@@ -73,9 +73,9 @@ fn a_dataset_without_its_training_images_is_refused() {
 }
 
 #[test]
-fn large_photographs_are_scaled_unless_another_size_is_asked_for() {
+fn large_photographs_are_downscaled_unless_another_size_is_requested() {
     let folder = with_data();
-    irradia(folder.path(), "synth wide --views 3 --size 1700x8").well();
+    irradia(folder.path(), "synth wide --views 3 --size 1700x8").success();
     for (option, width) in [
         ("", 1600),
         ("--full-size", 1700),
@@ -86,7 +86,7 @@ fn large_photographs_are_scaled_unless_another_size_is_asked_for() {
             folder.path(),
             &format!("train wide --out run --overwrite --steps 1 {option}"),
         )
-        .well();
+        .success();
         assert_eq!(
             json(&folder.path().join("run/cameras.json"))[0]["width"],
             width,
@@ -104,7 +104,7 @@ fn large_photographs_are_scaled_unless_another_size_is_asked_for() {
 }
 
 #[test]
-fn blender_scenes_are_trained_and_scored_over_white_unless_told_otherwise() {
+fn blender_scenes_have_a_white_background_by_default() {
     let folder = with_data();
     for picture in files_under(&folder.path().join("data")) {
         if picture.extension().is_some_and(|e| e == "png") && !picture.to_string_lossy().contains("depth") {
@@ -133,7 +133,7 @@ fn blender_scenes_are_trained_and_scored_over_white_unless_told_otherwise() {
         ),
         ("set", "--set render.background=[0.0,0.0,1.0]", "sRGB 0, 0, 1", 0),
     ] {
-        let ended = irradia(folder.path(), &format!("train data --out {run} --steps 5 {option}")).well();
+        let ended = irradia(folder.path(), &format!("train data --out {run} --steps 5 {option}")).success();
         assert!(ended.stderr.contains(&format!("background: {said}")), "{ended:?}");
         let report = json(&folder.path().join(run).join("report.json"));
         assert!(
@@ -141,7 +141,7 @@ fn blender_scenes_are_trained_and_scored_over_white_unless_told_otherwise() {
             "{report}"
         );
         assert_eq!(corner(run), level, "{run}");
-        irradia(folder.path(), &format!("eval {run} --data data --json {run}.json")).well();
+        irradia(folder.path(), &format!("eval {run} --data data --json {run}.json")).success();
         let again = json(&folder.path().join(format!("{run}.json")));
         assert!(
             (again["psnr"].as_f64().unwrap() - report["psnr"].as_f64().unwrap()).abs() < 1e-9,
@@ -152,14 +152,14 @@ fn blender_scenes_are_trained_and_scored_over_white_unless_told_otherwise() {
         folder.path(),
         "eval black --data data --background white --json white.json",
     )
-    .well();
+    .success();
     let psnr = |file: &str| json(&folder.path().join(file))["psnr"].as_f64();
     assert!(psnr("white.json") < psnr("black.json"));
     irradia(folder.path(), "train data --out x --background grey").refused(2, &["--background", "grey"]);
 }
 
 #[test]
-fn views_whose_names_collide_get_files_of_their_own() {
+fn views_with_colliding_names_get_separate_files() {
     let folder = with_data();
     let test = folder.path().join("data/test");
     let image = image::open(test.join("r_001.png")).expect("a picture").to_rgb8();
@@ -169,7 +169,7 @@ fn views_whose_names_collide_get_files_of_their_own() {
     content["frames"][1]["file_path"] = value!("./test/r_000.jpg");
     content["frames"][0]["file_path"] = value!("./test/r_000.png");
     fs::write(&path, content.to_string()).expect("written");
-    irradia(folder.path(), "train data --out run --steps 5").well();
+    irradia(folder.path(), "train data --out run --steps 5").success();
     let report = json(&folder.path().join("run/report.json"));
     let render = |i: usize| {
         folder
@@ -181,8 +181,8 @@ fn views_whose_names_collide_get_files_of_their_own() {
         fs::read(render(0)).expect("a file"),
         fs::read(render(1)).expect("another")
     );
-    irradia(folder.path(), "eval run --data data --save-images seen").well();
-    irradia(folder.path(), "render run --data data --out frames").well();
+    irradia(folder.path(), "eval run --data data --save-images seen").success();
+    irradia(folder.path(), "render run --data data --out frames").success();
     for name in ["seen", "frames"] {
         assert_eq!(files_under(&folder.path().join(name)).len(), 2, "{name}");
     }

@@ -1,4 +1,4 @@
-//! The library as a program uses it: requests, runs, those who watch them, and scenes.
+//! The library as a program uses it: requests, runs, observers, and scenes.
 
 mod requests;
 mod scenes;
@@ -9,7 +9,7 @@ use irradia_runs::prelude::*;
 use std::path::Path;
 use tempfile::TempDir;
 
-/// A dataset that trains in a blink.
+/// A dataset that trains in moments.
 const SMALL: SynthOptions = SynthOptions {
     views: 4,
     width: 24,
@@ -39,7 +39,7 @@ fn begin(folder: &Path, name: &str, steps: u64) -> Run {
     Run::begin_on(request, dataset()).expect("a run")
 }
 
-/// The bytes of the scene of a run of `steps` steps that nobody watches.
+/// The bytes of the scene of a run of `steps` steps without observers.
 fn unwatched(folder: &Path, steps: u64) -> Vec<u8> {
     let mut run = begin(folder, "unwatched", steps);
     run.train(&mut []).expect("trains");

@@ -1,4 +1,4 @@
-//! Requests: what is refused, and what a run's folder keeps of them.
+//! Requests: validation, and their storage in a run's folder.
 
 use crate::{begin, dataset, folder, input, scene};
 use irradia_runs::prelude::*;
@@ -7,7 +7,7 @@ use std::fs;
 use std::path::Path;
 
 #[test]
-fn each_setting_out_of_range_is_refused_by_its_line() {
+fn each_setting_out_of_range_is_rejected_by_name() {
     let good = || TrainInput::new("photos", "run");
     let reading = |reading: Reading| TrainInput { reading, ..good() };
     let cases = [
@@ -16,28 +16,28 @@ fn each_setting_out_of_range_is_refused_by_its_line() {
                 steps: Some(0),
                 ..good()
             },
-            "steps 0: give 1 or more",
+            "steps 0: must be 1 or more",
         ),
         (
             TrainInput {
                 max_splats: Some(0),
                 ..good()
             },
-            "max_splats 0: give 1 or more",
+            "max_splats 0: must be 1 or more",
         ),
         (
             TrainInput {
                 budget: Some(0.0),
                 ..good()
             },
-            "budget 0: give seconds, more than 0",
+            "budget 0: must be more than 0 seconds",
         ),
         (
             TrainInput {
                 budget: Some(f64::NAN),
                 ..good()
             },
-            "budget NaN: give seconds, more than 0",
+            "budget NaN: must be more than 0 seconds",
         ),
         (
             TrainInput {
@@ -45,35 +45,35 @@ fn each_setting_out_of_range_is_refused_by_its_line() {
                 budget: Some(9.0),
                 ..good()
             },
-            "steps 9: give steps or a budget, not both",
+            "steps 9: cannot be combined with a budget",
         ),
         (
             TrainInput {
                 until_psnr: Some(f64::INFINITY),
                 ..good()
             },
-            "until_psnr inf: give a number of dB",
+            "until_psnr inf: must be a number of dB",
         ),
         (
             reading(Reading {
                 downscale: 0.5,
                 ..Reading::default()
             }),
-            "downscale 0.5: give 1 or more",
+            "downscale 0.5: must be 1 or more",
         ),
         (
             reading(Reading {
                 downscale: f32::NAN,
                 ..Reading::default()
             }),
-            "downscale NaN: give 1 or more",
+            "downscale NaN: must be 1 or more",
         ),
         (
             reading(Reading {
                 max_side: Some(0),
                 ..Reading::default()
             }),
-            "max_side 0: give 1 or more",
+            "max_side 0: must be 1 or more",
         ),
         (
             reading(Reading {
@@ -81,7 +81,7 @@ fn each_setting_out_of_range_is_refused_by_its_line() {
                 downscale: 2.0,
                 ..Reading::default()
             }),
-            "max_side 64: give it or downscale, not both",
+            "max_side 64: cannot be combined with downscale",
         ),
     ];
     for (input, line) in cases {
@@ -128,7 +128,7 @@ fn overrides_and_the_cap_change_the_recipe() {
 }
 
 #[test]
-fn a_folder_that_holds_a_run_is_not_replaced_unless_asked() {
+fn an_existing_run_is_replaced_only_on_request() {
     let folder = folder();
     begin(folder.path(), "run", 2);
     let again = || input(folder.path(), "run", 3);
@@ -149,7 +149,7 @@ fn a_folder_that_holds_a_run_is_not_replaced_unless_asked() {
 }
 
 #[test]
-fn what_was_asked_for_is_read_back() {
+fn a_request_round_trips() {
     let folder = folder();
     let asked = TrainInput {
         recipe: "classic".into(),
@@ -173,7 +173,7 @@ fn what_was_asked_for_is_read_back() {
         ..asked.clone()
     };
     assert_eq!(record.input, kept);
-    // To resume, the recipe is the one that the folder holds.
+    // A resumed run uses the resolved recipe in its folder.
     let resumed = TrainInput::of_run(&run).expect("a run");
     assert_eq!(
         (resumed.seed, resumed.until_psnr, resumed.set.len()),
@@ -185,7 +185,7 @@ fn what_was_asked_for_is_read_back() {
 }
 
 #[test]
-fn what_died_before_its_run_had_begun_is_no_run() {
+fn a_process_that_died_before_its_run_began_leaves_no_run() {
     let folder = folder();
     let run = folder.path().join("run");
     fs::create_dir(&run).expect("a folder");
@@ -202,7 +202,7 @@ fn what_died_before_its_run_had_begun_is_no_run() {
     again().expect("a run");
 }
 
-/// As 0.1.0's first builds wrote it: no recipe, and `lpips` in later ones only.
+/// As written by the first builds of 0.1.0: no recipe, and `lpips` in later ones only.
 #[test]
 fn an_old_run_json_is_read() {
     let text = r#"{
@@ -212,7 +212,7 @@ fn an_old_run_json_is_read() {
     let record: RunRecord = serde_json::from_str(text).expect("an old record");
     assert_eq!(record.input.data, Path::new("/photos"));
     assert_eq!((record.input.seed, record.input.reading.downscale), (3, 2.0));
-    // It had no usual size.
+    // It had no default size limit.
     assert_eq!(record.input.reading.max_side, None);
     assert_eq!((record.input.lpips, record.complete), (None, false));
 
@@ -221,13 +221,13 @@ fn an_old_run_json_is_read() {
     begin(folder.path(), "run", 3);
     fs::write(run.join("run.json"), text).expect("written");
     let input = TrainInput::of_run(&run).expect("an old run");
-    // A budget that was given when the run was resumed replaces its steps.
+    // A budget given when the run was resumed replaces its steps.
     assert_eq!((input.budget, input.steps), (Some(90.0), None));
     input.check().expect("a request");
 }
 
 #[test]
-fn folders_that_hold_no_run_are_told_by_one_line() {
+fn folders_without_a_run_get_one_line_of_error() {
     let folder = folder();
     let error = TrainInput::of_run(folder.path()).expect_err("no run");
     let line = error.to_string();
@@ -239,7 +239,7 @@ fn folders_that_hold_no_run_are_told_by_one_line() {
 }
 
 #[test]
-fn weights_that_cannot_be_read_leave_no_run() {
+fn unreadable_weights_leave_no_run() {
     let folder = folder();
     let input = TrainInput {
         lpips: Some("nowhere.safetensors".into()),
@@ -252,7 +252,7 @@ fn weights_that_cannot_be_read_leave_no_run() {
 }
 
 #[test]
-fn a_recipe_that_misses_its_weights_is_a_warning() {
+fn missing_lpips_weights_are_a_warning() {
     let named = |recipe: &str| {
         let input = TrainInput {
             recipe: recipe.into(),
@@ -265,7 +265,7 @@ fn a_recipe_that_misses_its_weights_is_a_warning() {
 }
 
 #[test]
-fn a_run_is_made_on_files_and_on_a_dataset_in_memory() {
+fn a_run_trains_on_files_and_on_a_dataset_in_memory() {
     let folder = folder();
     let data = folder.path().join("data");
     write_synth_dataset(&data, &crate::SMALL).expect("written");
@@ -283,6 +283,6 @@ fn a_run_is_made_on_files_and_on_a_dataset_in_memory() {
         "files" => make(name, &Run::begin),
         _ => make(name, &|request| Run::begin_on(request, dataset())),
     });
-    // Poses go through a file's matrices and back: near to each other, not the same bits.
+    // Poses pass through a file's matrices: approximately equal, not bit for bit.
     assert_eq!(sizes[0], sizes[1]);
 }

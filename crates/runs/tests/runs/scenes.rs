@@ -7,7 +7,7 @@ use irradia_runs::train::half_fit::HalfFit;
 use std::fs;
 
 #[test]
-fn a_scene_takes_background_and_cameras_from_its_run_and_does_without() {
+fn a_scene_takes_background_and_cameras_from_its_run_if_it_has_one() {
     let folder = folder();
     let mut run = begin(folder.path(), "run", 3);
     run.train(&mut []).expect("trains");

@@ -1,4 +1,4 @@
-//! The newest state, seen from another thread.
+//! The latest state, requested from another thread.
 
 use crate::{begin, folder, scene, unwatched};
 use irradia_runs::prelude::*;
@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::sync::mpsc::{Receiver, channel};
 use std::time::Duration;
 
-/// Tells another thread about each step, and pauses after one step until it hears back.
+/// Notifies another thread of each step, and pauses after one step until it answers.
 struct HandsOver {
     pause_after: u64,
     go_on: Receiver<()>,
@@ -39,13 +39,13 @@ fn first(snapshots: &Snapshots) -> Arc<Snapshot> {
 }
 
 #[test]
-fn a_watched_run_gives_the_same_snapshot_until_a_step_is_made_and_the_same_bytes() {
+fn a_snapshot_is_reused_until_a_step_is_made_and_does_not_change_the_run() {
     let folder = folder();
     let mut run = begin(folder.path(), "run", 30);
     let snapshots = run.snapshots();
     assert!(
         snapshots.newest().is_none() && snapshots.last().is_none(),
-        "not before it runs"
+        "none before it runs"
     );
     let (go_on, told) = channel();
     let viewer = std::thread::spawn(move || {
@@ -53,7 +53,7 @@ fn a_watched_run_gives_the_same_snapshot_until_a_step_is_made_and_the_same_bytes
         while seen.last().is_some_and(|snapshot| snapshot.step < 10) {
             seen.push(snapshots.newest().expect("running"));
         }
-        // Paused now: nothing changes, and requests are answered all the same.
+        // Paused now: nothing changes, and requests are still answered.
         let paused = [snapshots.newest(), snapshots.newest()].map(|s| s.expect("running"));
         assert!(paused[0].step == 10 && Arc::ptr_eq(&paused[0], &paused[1]));
         assert!(Arc::ptr_eq(&paused[0], seen.last().expect("some")));
@@ -78,12 +78,12 @@ fn a_watched_run_gives_the_same_snapshot_until_a_step_is_made_and_the_same_bytes
         let cameras = [&pair[0], &pair[1]].map(|s| s.scene.cameras.clone().expect("of a training"));
         assert!(Arc::ptr_eq(&cameras[0], &cameras[1]) && cameras[0].len() == 4);
     }
-    // It renders what it was, whatever the training did since.
+    // It renders its own state, independent of later training.
     let early = &seen[0];
     let camera = early.scene.cameras.as_ref().expect("of a training")[0];
     assert!(early.scene.render(&camera).color != seen[seen.len() - 1].scene.render(&camera).color);
 
-    // What was asked for last stays when the run is gone, and is what the run wrote.
+    // The last snapshot outlives the run, and equals the scene that the run wrote.
     run.finish().expect("finishes");
     let last = snapshots.newest().expect("the last");
     assert_eq!((last.step, last.total_steps), (30, 30));
@@ -99,7 +99,7 @@ fn without_requests_the_last_state_is_kept_for_a_handle_only() {
     drop(run.snapshots());
     run.train(&mut []).expect("trains");
     let late = run.snapshots();
-    assert!(late.last().is_none(), "nobody asked, nothing was copied");
+    assert!(late.last().is_none(), "no request, no copy");
     let mut run = begin(folder.path(), "other", 2);
     let handle = run.snapshots();
     handle.request();
@@ -109,7 +109,7 @@ fn without_requests_the_last_state_is_kept_for_a_handle_only() {
 }
 
 #[test]
-fn nobody_waits_for_a_run_that_is_gone() {
+fn requests_do_not_wait_for_a_run_that_has_ended() {
     let folder = folder();
     let run = begin(folder.path(), "run", 2);
     let handle = run.snapshots();

@@ -5,7 +5,7 @@ use irradia_runs::prelude::*;
 use std::fs;
 use std::time::{Duration, Instant};
 
-/// Answers `answer` after step `at`, and keeps what it was told.
+/// Answers `answer` after step `at`, and keeps all events.
 struct At {
     step: u64,
     answer: Signal,
@@ -32,7 +32,7 @@ impl Observer for At {
     }
 }
 
-/// Pauses after a step for a while, saving meanwhile, and then goes on or stops.
+/// Pauses after a step for a while, saving meanwhile, and then continues or stops.
 struct Pauses {
     after: u64,
     questions: u32,
@@ -63,7 +63,7 @@ impl Observer for Pauses {
 }
 
 #[test]
-fn a_stopped_run_is_saved_and_resumes_to_the_bytes_of_an_unbroken_one() {
+fn a_stopped_run_is_saved_and_resumes_to_the_bytes_of_an_uninterrupted_one() {
     let folder = folder();
     let mut run = begin(folder.path(), "run", 12);
     let reason = run.train(&mut [&mut At::new(5, Signal::Stop)]).expect("trains");
@@ -83,7 +83,7 @@ fn a_stopped_run_is_saved_and_resumes_to_the_bytes_of_an_unbroken_one() {
 }
 
 #[test]
-fn a_stopped_run_may_be_trained_on_at_once() {
+fn a_stopped_run_may_be_trained_further_at_once() {
     let folder = folder();
     let mut run = begin(folder.path(), "run", 12);
     run.train(&mut [&mut At::new(5, Signal::Stop)]).expect("trains");
@@ -111,7 +111,7 @@ fn a_stopped_run_may_be_trained_on_at_once() {
 }
 
 #[test]
-fn save_writes_a_checkpoint_and_says_so() {
+fn save_writes_a_checkpoint_and_reports_it() {
     let folder = folder();
     let mut run = begin(folder.path(), "run", 6);
     let mut asks = At::new(3, Signal::Save);
@@ -122,7 +122,7 @@ fn save_writes_a_checkpoint_and_says_so() {
 }
 
 #[test]
-fn a_paused_run_waits_and_goes_on_to_the_same_bytes() {
+fn a_paused_run_waits_and_resumes_to_the_same_bytes() {
     let folder = folder();
     let mut run = begin(folder.path(), "run", 8);
     let mut pauses = Pauses {
@@ -132,13 +132,10 @@ fn a_paused_run_waits_and_goes_on_to_the_same_bytes() {
         steps: Vec::new(),
     };
     let started = Instant::now();
-    // One that saves in the same step is heard too.
+    // A save request in the same step is also followed.
     run.train(&mut [&mut At::new(3, Signal::Save), &mut pauses])
         .expect("trains");
-    assert!(
-        started.elapsed() > Duration::from_millis(40),
-        "it waits between questions"
-    );
+    assert!(started.elapsed() > Duration::from_millis(40), "it waits between polls");
     assert_eq!((pauses.questions, pauses.steps.len()), (4, 8));
     assert!(run.folder().file("checkpoints/step_3.safetensors").is_file());
     let log = fs::read_to_string(run.folder().file("events.jsonl")).expect("events");
@@ -164,7 +161,7 @@ fn a_paused_run_can_be_stopped() {
     assert!(run.folder().file("checkpoints/step_3.safetensors").is_file());
 }
 
-/// Cannot do its work, and says so once.
+/// Reports a warning once.
 struct Warns(Option<String>);
 
 impl Observer for Warns {
@@ -189,7 +186,7 @@ fn an_observers_warning_reaches_the_others_and_the_report_once() {
 }
 
 #[test]
-fn an_evaluation_that_was_stopped_is_made_when_the_run_is_resumed() {
+fn a_stopped_evaluation_is_repeated_when_the_run_is_resumed() {
     let folder = folder();
     let mut run = begin(folder.path(), "run", 12);
     run.train(&mut []).expect("trains");
@@ -207,7 +204,7 @@ fn an_evaluation_that_was_stopped_is_made_when_the_run_is_resumed() {
     assert!(scene(folder.path(), "run") == unwatched(folder.path(), 12));
 }
 
-/// Wants to stop as soon as held-out views are evaluated.
+/// Requests a stop as soon as held-out views are evaluated.
 struct Impatient(Vec<Event>);
 
 impl Observer for Impatient {
@@ -222,7 +219,7 @@ impl Observer for Impatient {
 }
 
 #[test]
-fn half_an_evaluation_is_not_told() {
+fn a_partial_evaluation_is_not_reported() {
     let folder = folder();
     let asked = TrainInput {
         set: vec!["eval_every=2".into()],

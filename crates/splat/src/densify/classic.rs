@@ -1,27 +1,27 @@
-//! The adaptive density control of 3DGS (Kerbl et al. 2023, section 5): where the image pulls hard on a splat's centre the
-//! scene is not covered well; small splats there are cloned, large ones split; faint and oversized ones go.
+//! The adaptive density control of 3DGS (Kerbl et al. 2023, section 5). A large screen gradient of a splat's centre indicates
+//! an insufficiently covered region: small splats are cloned there, large ones split; faint and oversized ones are removed.
 
 use super::DensityChange;
 use super::split::{is_finite, largest_scale, random_halves, rebuild, without};
 use crate::{SplatState, logit};
 use irradia_scene::Rng;
 
-/// Knobs, with the Inria code's names and defaults in the docs.
+/// Options; docs give the Inria code's names and defaults.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ClassicOptions {
     /// Mean screen gradient (normalised device coordinates) from which a splat is densified; `densify_grad_threshold` 0.0002.
     pub gradient_threshold: f32,
-    /// World size that divides small from large; `percent_dense` 0.01 times the scene's extent.
+    /// World size that separates small splats from large ones; `percent_dense` 0.01 times the scene's extent.
     pub small: f32,
     /// Opacity below which a splat is removed; 0.005.
     pub min_opacity: f32,
-    /// World size above which a splat is removed; `None` until opacities were reset once; 0.1 times the scene's extent. The Inria
-    /// code means to prune by size on screen too, but zeroes those sizes before it compares them.
+    /// World size above which a splat is removed; `None` until opacities have been reset once; 0.1 times the scene's extent. The
+    /// Inria code also intends to prune by size on screen, but zeroes those sizes before it compares them.
     pub max_scale: Option<f32>,
-    /// Never more splats than this; the strongest gradients are served first.
+    /// Maximum number of splats; the largest gradients come first.
     pub max_splats: usize,
-    /// Give the copies of a clone the opacity 1 - sqrt(1 - o), so that the two together are as opaque as the one was
-    /// (Rota Bulo et al. 2024, eq. 9); 3DGS leaves it, which makes clones darker than what they copy.
+    /// Give both splats of a clone the opacity 1 - sqrt(1 - o), so that together they are as opaque as the original (Rota Bulo et
+    /// al. 2024, eq. 9); 3DGS keeps o, which makes clones more opaque than the original.
     pub revised_opacity: bool,
 }
 
@@ -68,7 +68,7 @@ pub fn densify(state: &mut SplatState, options: &ClassicOptions, rng: &mut Rng) 
     }
 }
 
-/// Removes what is faint or oversized, new splats too; returns how many.
+/// Removes faint or oversized splats, including new ones; returns their number.
 fn prune(state: &mut SplatState, options: &ClassicOptions) -> usize {
     let (n, splats) = (state.len(), &state.splats);
     let stays = |i: usize| {
@@ -82,8 +82,8 @@ fn prune(state: &mut SplatState, options: &ClassicOptions) -> usize {
     n - kept.len()
 }
 
-/// Lowers every opacity to at most `ceiling` (0.01 in the Inria code) and forgets its moments: what the images need comes
-/// back within a few hundred steps, what floats before the cameras does not.
+/// Lowers every opacity to at most `ceiling` (0.01 in the Inria code) and resets its moments: opacities that the images need
+/// recover within a few hundred steps, those of floaters in front of the cameras do not.
 pub fn reset_opacity(state: &mut SplatState, ceiling: f32) {
     let ceiling = logit(ceiling);
     for value in state.splats.opacity_logits.as_mut_slice() {
@@ -130,7 +130,7 @@ mod tests {
     }
 
     #[test]
-    fn small_ones_are_cloned_large_ones_split_faint_ones_go() {
+    fn small_splats_are_cloned_large_ones_split_and_faint_ones_removed() {
         let mut s = state(&[(-5.0, 2.0, 0.0), (0.0, 2.0, 0.0), (0.0, 0.5, 0.0), (0.0, 0.5, -9.0)]);
         let change = densify(&mut s, &options(), &mut Rng::new(1, 1));
         assert_eq!(
@@ -149,7 +149,7 @@ mod tests {
     }
 
     #[test]
-    fn the_oversized_go_new_ones_too_and_what_lies_large_on_the_screen_stays() {
+    fn oversized_splats_are_removed_including_new_ones_whatever_their_size_on_screen() {
         let items = [(0.0, 0.5, 0.0), (2.0, 0.5, 0.0), (1.0, 2.0, 0.0), (0.6, 2.0, 0.0)];
         let limit = Some(1.2);
         for (max_scale, pruned, left) in [(None, 0, 6), (limit, 1 + 2, 3)] {
@@ -157,13 +157,13 @@ mod tests {
             (0..4).for_each(|i| s.statistics.set(SplatState::EXTENT, i, 1e4));
             let options = ClassicOptions { max_scale, ..options() };
             let change = densify(&mut s, &options, &mut Rng::new(1, 1));
-            // Halves are smaller by 1.6: of e 1.70, of e^0.6 1.14.
+            // Halves are smaller by a factor of 1.6: e becomes 1.70, e^0.6 becomes 1.14.
             assert_eq!((change.split, change.pruned, s.len()), (2, pruned, left));
         }
     }
 
     #[test]
-    fn revised_clones_are_as_opaque_together_as_the_one_was() {
+    fn revised_clones_are_together_as_opaque_as_the_original() {
         let mut s = state(&[(-5.0, 2.0, logit(0.75))]);
         let options = ClassicOptions {
             revised_opacity: true,
@@ -176,7 +176,7 @@ mod tests {
     }
 
     #[test]
-    fn the_cap_holds_and_the_strongest_gradient_wins() {
+    fn the_cap_is_respected_and_the_largest_gradient_comes_first() {
         let mut s = state(&[(-5.0, 2.0, 0.0), (-5.0, 3.0, 0.0), (-5.0, 4.0, 0.0)]);
         let change = densify(
             &mut s,
@@ -192,7 +192,7 @@ mod tests {
     }
 
     #[test]
-    fn a_reset_lowers_only_what_is_higher() {
+    fn a_reset_lowers_only_opacities_above_the_ceiling() {
         let mut s = state(&[(0.0, 0.0, 3.0), (0.0, 0.0, -7.0)]);
         s.moments[0].opacity_logits.set(0, 0, 5.0);
         reset_opacity(&mut s, 0.01);

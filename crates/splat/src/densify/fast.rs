@@ -1,31 +1,31 @@
-//! Densification where the pictures are wrong, to a planned number: what several views show badly is cut in two across its
-//! longest axis, what hardly shows anywhere goes.
+//! Densification by image error, to a planned number: splats that show errors in several views are split in two across their
+//! longest axis, splats that contribute hardly anywhere are removed.
 //!
-//! It joins what made the fastest trainers fast. Error decides, not the gradient alone, and it is collected over all
-//! views since the last round (FastGS, Ren et al. 2025; Rota Bulo et al. 2024); here it costs nothing, for backward sums it
-//! up beside the gradients. The number of splats follows a plan, few while images are small (DashGaussian, Chen et al.
-//! 2025). Halves keep the image as it is, so that no step is lost to recovery, and opacities are never reset.
+//! It combines what made the fastest trainers fast. Error decides, not the gradient alone, and it is accumulated over all
+//! views since the last round (FastGS, Ren et al. 2025; Rota Bulo et al. 2024); this is free here, since the backward pass
+//! accumulates it beside the gradients. The number of splats follows a plan, with few splats while images are small
+//! (DashGaussian, Chen et al. 2025). Halves preserve the image, so that no step is spent on recovery, and opacities are never reset.
 
 use super::DensityChange;
 use super::split::{is_finite, long_axis_halves, rebuild, without};
 use crate::SplatState;
 
-/// Knobs.
+/// Options.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct FastOptions {
-    /// Never more splats than this after the round.
+    /// Maximum number of splats after the round.
     pub target: usize,
     /// Opacity below which a splat is removed.
     pub min_opacity: f32,
-    /// Mean weight a frame, in pixels, below which a splat is removed.
+    /// Mean weight per frame, in pixels, below which a splat is removed.
     pub min_weight: f32,
-    /// Mean error a frame, mean absolute colour difference times pixels, from which a splat is cut in two.
+    /// Mean error per frame, mean absolute colour difference times pixels, from which a splat is split.
     pub error_threshold: f32,
-    /// Half size on screen in pixels from which a splat is worth cutting.
+    /// Half size on screen, pixels, from which a splat is worth splitting.
     pub min_extent: f32,
 }
 
-/// Frames that must have seen a splat before its statistics decide anything.
+/// Frames in which a splat must have been visible before its statistics are used.
 const FRAMES: f32 = 2.0;
 
 /// Prunes and splits; clears the statistics and restores Morton order.
@@ -70,7 +70,7 @@ mod tests {
     use crate::{Splats, logit};
 
     #[test]
-    fn what_shows_errors_is_split_and_what_shows_nothing_goes() {
+    fn splats_with_errors_are_split_and_invisible_ones_removed() {
         let mut splats = Splats::zeros(4, 0);
         for i in 0..4 {
             splats.means.set(0, i, 10.0 * i as f32);
@@ -105,7 +105,7 @@ mod tests {
         assert_eq!(
             (change.split, change.pruned, state.len()),
             (1, 1, 4),
-            "the target leaves room for the worst one"
+            "the target leaves room for the splat of the largest error"
         );
         let near_zero = (0..4).filter(|i| state.splats.means.get(0, *i).abs() < 5.0).count();
         assert_eq!(near_zero, 2);

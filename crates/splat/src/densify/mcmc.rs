@@ -1,5 +1,5 @@
 //! Splats as samples of a distribution: "3D Gaussian Splatting as Markov Chain Monte Carlo" (Kheradmand et al. 2024). Dead
-//! splats move to where live ones are, the number grows to a fixed budget, and noise explores.
+//! splats are relocated to live ones, the number grows to a fixed budget, and noise explores.
 
 use super::DensityChange;
 use super::split::{draw, is_finite, rebuild};
@@ -8,18 +8,18 @@ use irradia_compute::Planes;
 use irradia_scene::Rng;
 use rayon::prelude::*;
 
-/// Knobs, with the authors' names and defaults.
+/// Options, with the authors' names and defaults.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct McmcOptions {
-    /// Opacity from which down a splat is dead; 0.005.
+    /// Opacity up to which a splat is dead; 0.005.
     pub min_opacity: f32,
-    /// Factor on the number in each round; 1.05.
+    /// Growth factor of the number of splats per round; 1.05.
     pub growth: f32,
-    /// The number that it grows to; `cap_max`.
+    /// Maximum number of splats; `cap_max`.
     pub max_splats: usize,
 }
 
-/// Relocates the dead and grows; restores Morton order and clears the statistics.
+/// Relocates dead splats and adds new ones; restores Morton order and clears the statistics.
 pub fn densify(state: &mut SplatState, options: &McmcOptions, rng: &mut Rng) -> DensityChange {
     let n = state.len();
     let opacities: Vec<f32> = (0..n)
@@ -31,12 +31,12 @@ pub fn densify(state: &mut SplatState, options: &McmcOptions, rng: &mut Rng) -> 
         .collect();
     let alive: Vec<u32> = (0..n as u32).filter(|i| opacities[*i as usize] > 0.0).collect();
     if alive.is_empty() {
-        return DensityChange::default(); // There is nowhere to move to.
+        return DensityChange::default(); // No live splat to relocate to.
     }
     let dead = n - alive.len();
     let target = ((n as f32 * options.growth) as usize).clamp(n, options.max_splats.max(n));
     let sources = draw(&opacities, target - alive.len(), rng);
-    share_out(state, &sources);
+    replicate(state, &sources);
     let copies = state.splats.gather(&sources);
     rebuild(state, &alive, &[&copies]);
     DensityChange {
@@ -46,27 +46,27 @@ pub fn densify(state: &mut SplatState, options: &McmcOptions, rng: &mut Rng) -> 
     }
 }
 
-/// Makes each splat named k times in `sources` (ascending) so faint and small that it and k copies of it together render
-/// as the one did (eq. 9), and forgets its moments.
-fn share_out(state: &mut SplatState, sources: &[u32]) {
+/// Reduces opacity and size of each splat that occurs k times in `sources` (ascending) so that it and k copies of it together
+/// render like the original (eq. 9), and resets its moments.
+fn replicate(state: &mut SplatState, sources: &[u32]) {
     for group in sources.chunk_by(|a, b| a == b) {
         let i = group[0] as usize;
-        let (opacity, factor) = shared(state.splats.opacity(i), group.len() + 1);
+        let (opacity, factor) = replica(state.splats.opacity(i), group.len() + 1);
         state.splats.opacity_logits.set(0, i, logit(opacity));
         for c in 0..3 {
             let log_scale = state.splats.log_scales.get(c, i);
             state.splats.log_scales.set(c, i, log_scale + factor.ln());
         }
-        state.forget_moments(i);
+        state.reset_moments(i);
     }
 }
 
-/// Most copies that eq. 9 is evaluated for: its alternating sum loses precision beyond.
-const MOST_COPIES: usize = 51;
+/// Maximum number of copies for which eq. 9 is evaluated: its alternating sum loses precision beyond.
+const MAX_COPIES: usize = 51;
 
-/// Opacity of each of `n` splats that share the place of one, and the factor on their size (eq. 9).
-fn shared(opacity: f32, n: usize) -> (f32, f32) {
-    let n = n.min(MOST_COPIES);
+/// Opacity of each of the `n` splats that replace one splat, and the factor on their size (eq. 9).
+fn replica(opacity: f32, n: usize) -> (f32, f32) {
+    let n = n.min(MAX_COPIES);
     let before = f64::from(opacity);
     let after = 1.0 - (1.0 - before).powf(1.0 / n as f64);
     let mut sum = 0.0;
@@ -78,20 +78,20 @@ fn shared(opacity: f32, n: usize) -> (f32, f32) {
             binomial *= (i - 1 - k) as f64 / (k + 1) as f64;
         }
     }
-    // The authors' clamp: as faint as the dead, never quite opaque.
+    // The authors' clamp: at least the opacity of a dead splat, never fully opaque.
     (
         after.clamp(0.005, 1.0 - f64::from(f32::EPSILON)) as f32,
         (before / sum) as f32,
     )
 }
 
-/// Splats of a chunk share a stream of chance: the number of threads changes nothing.
+/// Splats per random stream: one stream per chunk, so that results do not depend on the number of threads.
 const CHUNK: usize = 4096;
 /// Opacity at which the noise has fallen to half, and how steeply it falls (section 3.3).
-const QUIET_OPACITY: f32 = 0.005;
-const QUIET_STEEPNESS: f32 = 100.0;
+const NOISE_OPACITY: f32 = 0.005;
+const NOISE_STEEPNESS: f32 = 100.0;
 
-/// Moves the means by noise in the shape of each splat: `rate` covariance normal(), faded out for what is opaque (eq. 8).
+/// Moves the means by noise shaped by each splat's covariance: `rate` covariance normal(), faded out for opaque splats (eq. 8).
 /// `rate` is the means' learning rate times the authors' 5e5, world units.
 pub fn add_noise(state: &mut SplatState, rate: f32, seed: u64, step: u64) {
     let n = state.len();
@@ -103,9 +103,9 @@ pub fn add_noise(state: &mut SplatState, rate: f32, seed: u64, step: u64) {
             (chunk * CHUNK..n.min((chunk + 1) * CHUNK))
                 .filter_map(|i| {
                     let opacity = splats.opacity(i);
-                    let loud = sigmoid(-QUIET_STEEPNESS * (opacity - QUIET_OPACITY));
-                    // Below this the offset is lost in rounding; most splats of a scene are.
-                    (loud > 1e-6).then(|| {
+                    let strength = sigmoid(-NOISE_STEEPNESS * (opacity - NOISE_OPACITY));
+                    // Below this the offset is lost in rounding, as for most splats of a scene.
+                    (strength > 1e-6).then(|| {
                         let normal = glam::Vec3::new(rng.normal(), rng.normal(), rng.normal());
                         let q = |c: usize| splats.quats.get(c, i);
                         let rotation = glam::Quat::from_xyzw(q(1), q(2), q(3), q(0)).normalize();
@@ -113,7 +113,7 @@ pub fn add_noise(state: &mut SplatState, rate: f32, seed: u64, step: u64) {
                         for c in 0..3 {
                             local[c] *= (2.0 * splats.log_scales.get(c, i)).exp();
                         }
-                        (i as u32, (rotation * local * (loud * rate)).to_array())
+                        (i as u32, (rotation * local * (strength * rate)).to_array())
                     })
                 })
                 .collect()
@@ -130,7 +130,7 @@ pub fn add_noise(state: &mut SplatState, rate: f32, seed: u64, step: u64) {
     }
 }
 
-/// The stream of the run's seed that noise is drawn from.
+/// Random stream of the noise, derived from the run's seed.
 const STREAM_NOISE: u64 = 4;
 
 #[cfg(test)]
@@ -149,11 +149,11 @@ mod tests {
     }
 
     #[test]
-    fn copies_together_are_as_opaque_as_the_one_was() {
+    fn copies_are_together_as_opaque_as_the_original() {
         for (opacity, n) in [(0.5f32, 2usize), (0.9, 5), (0.3, 12), (0.99, 30)] {
-            let (after, factor) = shared(opacity, n);
+            let (after, factor) = replica(opacity, n);
             assert!((1.0 - (1.0 - after).powi(n as i32) - opacity).abs() < 1e-4);
-            // The integral of n blended copies over their plane is that of the one (what eq. 9 is made for).
+            // The integral of n blended copies over their plane equals that of the original (the derivation of eq. 9).
             let integral = |opacity: f64, n: i32, sigma: f64| {
                 (-4000..4000)
                     .map(|i| {
@@ -169,7 +169,7 @@ mod tests {
     }
 
     #[test]
-    fn the_dead_move_and_the_number_grows_to_the_cap() {
+    fn dead_splats_are_relocated_and_the_number_grows_to_the_cap() {
         let mut s = state(&[0.9, 0.001, 0.5, 0.002]);
         let options = McmcOptions {
             min_opacity: 0.005,
@@ -183,7 +183,7 @@ mod tests {
     }
 
     #[test]
-    fn noise_moves_the_faint_and_leaves_the_opaque() {
+    fn noise_moves_faint_splats_and_keeps_opaque_ones() {
         let mut s = state(&[0.9, 0.003]);
         let before = s.splats.clone();
         add_noise(&mut s, 0.1, 7, 1);

@@ -1,5 +1,5 @@
-//! Merging of adjacent splats of like position and colour into one of the same mass, mean and covariance: the CurriculumGS
-//! regulariser that undoes what densification overdid.
+//! Merging of adjacent splats of similar position and colour into one of the same mass, mean and covariance: the CurriculumGS
+//! regulariser that reverses excessive densification.
 
 use super::DensityChange;
 use super::split::is_finite;
@@ -8,16 +8,16 @@ use crate::{SplatState, logit};
 use glam::{Mat3, Quat, Vec3};
 use rayon::prelude::*;
 
-/// Knobs.
+/// Options.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct MergeOptions {
     /// Two splats are adjacent when their centres are closer than this many times the smaller one's median axis.
     pub distance: f32,
-    /// And alike when no channel of their base colours differs by more than this.
+    /// Two splats are similar when no channel of their base colours differs by more than this.
     pub color: f32,
 }
 
-/// Merges pairs that are each other's nearest neighbour, adjacent and alike; clears the statistics.
+/// Merges pairs that are mutual nearest neighbours, adjacent and similar; clears the statistics.
 pub fn merge(state: &mut SplatState, options: &MergeOptions) -> DensityChange {
     let pairs = pairs(state, options);
     let mut gone = vec![false; state.len()];
@@ -53,7 +53,7 @@ fn pairs(state: &SplatState, options: &MergeOptions) -> Vec<(u32, u32)> {
         .enumerate()
         .map(|(i, p)| {
             let found: [_; 2] = tree.of(*p);
-            // The splat itself is among them unless two others lie at the same place.
+            // The splat itself is included unless two others have the same position.
             let own = usize::from(found[0].1 == i as u32);
             found[own].1
         })
@@ -64,11 +64,11 @@ fn pairs(state: &SplatState, options: &MergeOptions) -> Vec<(u32, u32)> {
             *i < other && nearest[other as usize] == *i
         })
         .map(|i| (whole[i as usize], whole[nearest[i as usize] as usize]))
-        .filter(|(a, b)| alike(state, *a as usize, *b as usize, options))
+        .filter(|(a, b)| similar(state, *a as usize, *b as usize, options))
         .collect()
 }
 
-fn alike(state: &SplatState, a: usize, b: usize, options: &MergeOptions) -> bool {
+fn similar(state: &SplatState, a: usize, b: usize, options: &MergeOptions) -> bool {
     let splats = &state.splats;
     let median = |i: usize| {
         let mut s: [f32; 3] = std::array::from_fn(|c| splats.log_scales.get(c, i));
@@ -88,17 +88,17 @@ fn covariance(state: &SplatState, i: usize) -> Mat3 {
     rotation * Mat3::from_diagonal(variance) * rotation.transpose()
 }
 
-/// Puts the union of a and b in a's place.
+/// Replaces a by the union of a and b.
 fn unite(state: &mut SplatState, a: usize, b: usize) {
     let volume = |s: &SplatState, i: usize| (0..3).map(|c| s.splats.log_scales.get(c, i)).sum::<f32>().exp();
     let masses = [a, b].map(|i| state.splats.opacity(i) * volume(state, i));
     let total = (masses[0] + masses[1]).max(f32::MIN_POSITIVE);
-    let shares = masses.map(|m| m / total);
+    let fractions = masses.map(|m| m / total);
     let (ma, mb) = (mean(state, a), mean(state, b));
-    let center = shares[0] * ma + shares[1] * mb;
+    let center = fractions[0] * ma + fractions[1] * mb;
     let outer = |d: Vec3| Mat3::from_cols(d * d.x, d * d.y, d * d.z);
-    let cov = (covariance(state, a) + outer(ma - center)) * shares[0]
-        + (covariance(state, b) + outer(mb - center)) * shares[1];
+    let cov = (covariance(state, a) + outer(ma - center)) * fractions[0]
+        + (covariance(state, b) + outer(mb - center)) * fractions[1];
     let (rotation, variances) = eigen(cov);
     let splats = &mut state.splats;
     for c in 0..3 {
@@ -109,12 +109,12 @@ fn unite(state: &mut SplatState, a: usize, b: usize) {
         splats.quats.set(c, a, v);
     }
     for c in 0..splats.sh.count() {
-        let v = shares[0] * splats.sh.get(c, a) + shares[1] * splats.sh.get(c, b);
+        let v = fractions[0] * splats.sh.get(c, a) + fractions[1] * splats.sh.get(c, b);
         splats.sh.set(c, a, v);
     }
     let opacity = total / volume(state, a).max(f32::MIN_POSITIVE);
     state.splats.opacity_logits.set(0, a, logit(opacity.clamp(1e-4, 0.999)));
-    state.forget_moments(a);
+    state.reset_moments(a);
 }
 
 /// Rotation to the principal axes and the variances along them, of a symmetric matrix: cyclic Jacobi rotations, which at
@@ -165,7 +165,7 @@ mod tests {
     }
 
     #[test]
-    fn the_union_keeps_mass_mean_and_covariance() {
+    fn the_union_preserves_mass_mean_and_covariance() {
         let turn = Quat::from_euler(glam::EulerRot::XYZ, 0.4, 0.2, -0.9);
         let mut splats = Splats::zeros(3, 0);
         splat(&mut splats, 0, Vec3::ZERO, turn, Vec3::new(1.0, 0.3, 0.2), 0.3, 0.1);
@@ -186,8 +186,8 @@ mod tests {
         };
         let masses = [mass(&state, near[0]), mass(&state, near[1])];
         let total = masses[0] + masses[1];
-        let shares = masses.map(|m| m / total);
-        let center = shares[0] * mean(&state, near[0]) + shares[1] * mean(&state, near[1]);
+        let fractions = masses.map(|m| m / total);
+        let center = fractions[0] * mean(&state, near[0]) + fractions[1] * mean(&state, near[1]);
         let options = MergeOptions {
             distance: 1.0,
             color: 0.1,
@@ -202,7 +202,7 @@ mod tests {
     }
 
     #[test]
-    fn principal_axes_rebuild_the_matrix() {
+    fn principal_axes_reconstruct_the_matrix() {
         let turn = Mat3::from_quat(Quat::from_euler(glam::EulerRot::XYZ, 1.1, -0.7, 0.3));
         let m = turn * Mat3::from_diagonal(Vec3::new(4.0, 0.25, 1.0)) * turn.transpose();
         let (q, v) = eigen(m);

@@ -1,4 +1,4 @@
-//! Density control: where splats are added and removed. One file a strategy.
+//! Density control: where splats are added and removed. One file per strategy.
 
 pub mod classic;
 pub mod fast;
@@ -7,10 +7,10 @@ pub mod merge;
 mod split;
 pub mod taming;
 
-/// What one round of density control did.
+/// The outcome of one round of density control.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct DensityChange {
-    /// Splats copied where they stand.
+    /// Splats cloned in place.
     pub cloned: usize,
     /// Splats replaced by two smaller ones.
     pub split: usize,

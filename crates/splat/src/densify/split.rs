@@ -1,4 +1,4 @@
-//! What strategies have in common: choosing splats by weight, and putting two in the place of one.
+//! Shared by the strategies: drawing splats by weight, and replacing one splat by two.
 
 use crate::{SplatState, Splats, logit, sigmoid};
 use glam::{Quat, Vec3};
@@ -6,8 +6,8 @@ use irradia_scene::Rng;
 
 /// Factor by which the two halves of a split splat are smaller: 0.8 times 2 (Inria code).
 const RANDOM_SHRINK: f32 = 1.6;
-/// Standard deviation of a half along the split axis, relative to the whole's. Two halves at distance sqrt(1 - k^2) from
-/// the middle have the whole's variance for any k; at 0.6 their sum is within 5 % of the whole's curve inside 2 sigma.
+/// Standard deviation of a half along the split axis, relative to the original's. Two halves at distance sqrt(1 - k^2) from
+/// the centre have the original's variance for any k; at 0.6 their sum is within 5 % of the original's curve inside 2 sigma.
 const HALF: f32 = 0.6;
 
 /// The largest standard deviation, world units.
@@ -18,7 +18,7 @@ pub(super) fn largest_scale(splats: &Splats, i: usize) -> f32 {
         .exp()
 }
 
-/// Whether position and size are numbers.
+/// Whether position and size are finite.
 pub(super) fn is_finite(splats: &Splats, i: usize) -> bool {
     (0..3).all(|c| splats.means.get(c, i).is_finite() && splats.log_scales.get(c, i).is_finite())
 }
@@ -34,22 +34,22 @@ fn shift(splats: &mut Splats, i: usize, offset: Vec3) {
     }
 }
 
-/// All but `gone` (ascending) of `count` splats.
+/// All indices below `count` except `gone` (ascending).
 pub(super) fn without(count: usize, gone: &[u32]) -> Vec<u32> {
     (0..count as u32).filter(|i| gone.binary_search(i).is_err()).collect()
 }
 
-/// Ends a round: `kept` stay, `added` come, statistics begin anew, Morton order is restored.
+/// Ends a round: keeps `kept`, appends `added`, clears the statistics and restores Morton order.
 pub(super) fn rebuild(state: &mut SplatState, kept: &[u32], added: &[&Splats]) {
     state.gather(kept);
     for splats in added {
         state.append(splats);
     }
     state.statistics.clear();
-    state.sort_by_place();
+    state.sort_morton();
 }
 
-/// Two draws from each of `indices`, smaller, side by side in the result (3DGS).
+/// Two random samples of each of `indices`, smaller, adjacent in the result (3DGS).
 pub(super) fn random_halves(splats: &Splats, indices: &[u32], rng: &mut Rng) -> Splats {
     let mut halves = twice(splats, indices);
     for i in 0..halves.len() {
@@ -67,8 +67,8 @@ pub(super) fn random_halves(splats: &Splats, indices: &[u32], rng: &mut Rng) -> 
     halves
 }
 
-/// Each of `indices` cut in two across its longest axis, side by side in the result: together they have its mass, mean and
-/// covariance, so that the image hardly changes when they take its place.
+/// Splits each of `indices` in two across its longest axis, adjacent in the result: together they have its mass, mean and
+/// covariance, so that the image hardly changes when they replace it.
 pub(super) fn long_axis_halves(splats: &Splats, indices: &[u32]) -> Splats {
     let mut halves = twice(splats, indices);
     for i in 0..halves.len() {
@@ -93,7 +93,7 @@ fn twice(splats: &Splats, indices: &[u32]) -> Splats {
     splats.gather(&doubled)
 }
 
-/// `count` draws of an index with probability in proportion to `weights`, with replacement; ascending.
+/// `count` draws of an index with probability proportional to `weights`, with replacement; ascending.
 pub(super) fn draw(weights: &[f32], count: usize, rng: &mut Rng) -> Vec<u32> {
     let mut sum = 0.0f64;
     let cumulative: Vec<f64> = weights
@@ -116,14 +116,14 @@ pub(super) fn draw(weights: &[f32], count: usize, rng: &mut Rng) -> Vec<u32> {
     drawn
 }
 
-/// At most `count` different indices, with probability in proportion to `weights`, ascending: the largest of `u^(1/w)`
-/// (Efraimidis and Spirakis 2006). Weights of zero are never chosen.
+/// At most `count` distinct indices, with probability proportional to `weights`, ascending: the largest of `u^(1/w)`
+/// (Efraimidis and Spirakis 2006). Weights of zero are never drawn.
 pub(super) fn draw_distinct(weights: &[f32], count: usize, rng: &mut Rng) -> Vec<u32> {
     let mut keys: Vec<(f32, u32)> = weights
         .iter()
         .enumerate()
         .filter_map(|(i, w)| {
-            // The logarithm of the key; one draw for every item, so that a weight does not shift the others' luck.
+            // The logarithm of the key; one random number per item, so that a weight does not affect other items' keys.
             let u = rng.uniform().max(f32::MIN_POSITIVE).ln();
             (*w > 0.0 && w.is_finite()).then(|| (u / w, i as u32))
         })
@@ -142,7 +142,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn halves_keep_mass_mean_and_variance() {
+    fn halves_preserve_mass_mean_and_variance() {
         let mut splats = Splats::zeros(1, 0);
         let q = Quat::from_euler(glam::EulerRot::XYZ, 0.3, -0.8, 0.5);
         for (c, v) in [q.w, q.x, q.y, q.z].into_iter().enumerate() {
@@ -170,7 +170,7 @@ mod tests {
     }
 
     #[test]
-    fn draws_follow_the_weights() {
+    fn draws_are_proportional_to_the_weights() {
         let mut rng = Rng::new(5, 5);
         let weights = [0.0, 1.0, 3.0, 0.0];
         let drawn = draw(&weights, 4000, &mut rng);

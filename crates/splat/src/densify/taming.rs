@@ -1,32 +1,32 @@
-//! Densification to an exact number by score: "Taming 3DGS" (Mallick et al. 2024), on the statistics that training
-//! gathers. Each round adds what the count's curve asks for, where the scores are high.
+//! Densification to an exact number by score: "Taming 3DGS" (Mallick et al. 2024), on the statistics accumulated during
+//! training. Each round adds the number of splats that the count curve prescribes, where the scores are high.
 
 use super::DensityChange;
 use super::split::{draw_distinct, is_finite, largest_scale, random_halves, rebuild, without};
 use crate::SplatState;
 use irradia_scene::Rng;
 
-/// Knobs.
+/// Options.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct TamingOptions {
-    /// How many splats there shall be after this round, before it removes any.
+    /// Number of splats after this round, before it removes any.
     pub target: usize,
     /// Mean screen gradient (normalised device coordinates) from which a splat may be densified; 0.0002.
     pub gradient_threshold: f32,
-    /// World size that divides what is cloned from what is split.
+    /// World size that separates splats to clone from splats to split.
     pub small: f32,
     /// Opacity below which a splat may be removed; 0.005.
     pub min_opacity: f32,
-    /// World size above which a splat may be removed; `None` until opacities were reset once; 0.1 times the scene's extent.
+    /// World size above which a splat may be removed; `None` until opacities have been reset once; 0.1 times the scene's extent.
     pub max_scale: Option<f32>,
-    /// Whether the round removes splats; the authors' first 27 do.
+    /// Whether the round removes splats; the authors' first 27 rounds do.
     pub prunes: bool,
     /// Weights of the score.
     pub weights: ScoreWeights,
 }
 
-/// How much each part of a splat's score counts, each part relative to its median over the splats that have it. The authors'
-/// depth, distance and number of pixels are left out.
+/// Weights of the terms of a splat's score, each term relative to its median over the splats that have it. The authors'
+/// depth, distance and number of pixels are omitted.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ScoreWeights {
     /// Mean screen gradient; 25.
@@ -43,19 +43,19 @@ pub struct ScoreWeights {
     pub volume: f32,
 }
 
-/// Added to scores before they are inverted, so that those of zero can be.
+/// Added to scores before inversion, to avoid division by zero.
 const SCORE_FLOOR: f32 = 1e-6;
 
-/// How many splats there shall be after a round: on the parabola that rises fastest at first and has its vertex at `last`
-/// when the stage ends (eq. 2), from `now` on. `share` is how much of the stage lies behind, now and at the round before.
-pub fn next_count(now: usize, last: usize, share: [f64; 2]) -> usize {
-    let [left, left_before] = share.map(|s| (1.0 - s.clamp(0.0, 1.0)).powi(2));
+/// Number of splats after a round, starting from `now`: on the parabola that rises fastest at first and has its vertex at `last`
+/// when the stage ends (eq. 2). `completed` is the fraction of the stage completed, now and at the previous round.
+pub fn next_count(now: usize, last: usize, completed: [f64; 2]) -> usize {
+    let [left, left_before] = completed.map(|s| (1.0 - s.clamp(0.0, 1.0)).powi(2));
     let room = last as f64 - now as f64;
     (last as f64 - room * (left / left_before.max(1e-9)).min(1.0)).round() as usize
 }
 
-/// Adds up to the target by score, then removes some of what is faint or oversized; clears the statistics and restores
-/// Morton order. What is not finite always goes.
+/// Adds splats up to the target by score, then removes some of the faint or oversized ones; clears the statistics and restores
+/// Morton order. Splats that are not finite are always removed.
 pub fn densify(state: &mut SplatState, options: &TamingOptions, rng: &mut Rng) -> DensityChange {
     let n = state.len();
     let finite: Vec<u32> = (0..n as u32)
@@ -63,9 +63,9 @@ pub fn densify(state: &mut SplatState, options: &TamingOptions, rng: &mut Rng) -
         .collect();
     state.gather(&finite);
     let scores = scores(state, &options.weights);
-    let [clone, split] = chosen(state, options, &scores, rng);
+    let [clone, split] = select(state, options, &scores, rng);
     let mut removed = removed(state, options, &scores, rng);
-    // What is split is gone already.
+    // Splats that were split are already gone.
     removed.retain(|i| split.binary_search(i).is_err());
     let halves = random_halves(&state.splats, &split, rng);
     let clones = state.splats.gather(&clone);
@@ -80,8 +80,8 @@ pub fn densify(state: &mut SplatState, options: &TamingOptions, rng: &mut Rng) -
     }
 }
 
-/// What is cloned and what is split, ascending: the same share of the small and of the large that qualify, drawn by score.
-fn chosen(state: &SplatState, options: &TamingOptions, scores: &[f32], rng: &mut Rng) -> [Vec<u32>; 2] {
+/// Splats to clone and to split, ascending: the same fraction of the small and of the large candidates, drawn by score.
+fn select(state: &SplatState, options: &TamingOptions, scores: &[f32], rng: &mut Rng) -> [Vec<u32>; 2] {
     let qualifies = |i: usize| state.mean_statistic(SplatState::GRADIENT, i) >= options.gradient_threshold;
     let is_small = |i: usize| largest_scale(&state.splats, i) <= options.small;
     let qualified: Vec<usize> = (0..state.len()).filter(|i| qualifies(*i)).collect();
@@ -97,8 +97,8 @@ fn chosen(state: &SplatState, options: &TamingOptions, scores: &[f32], rng: &mut
     })
 }
 
-/// What is removed, ascending: half as many as are faint or oversized are drawn of all, low scores first, and those of them
-/// go that are faint or oversized.
+/// Splats to remove, ascending: half as many as are faint or oversized are drawn among all, low scores first, and of these the
+/// faint or oversized ones are removed.
 fn removed(state: &SplatState, options: &TamingOptions, scores: &[f32], rng: &mut Rng) -> Vec<u32> {
     if !options.prunes {
         return Vec::new();
@@ -115,7 +115,7 @@ fn removed(state: &SplatState, options: &TamingOptions, scores: &[f32], rng: &mu
     drawn
 }
 
-/// The weighted sum of the parts, each over its median; zero for what no frame has seen.
+/// The weighted sum of the terms, each divided by its median; zero for splats that no frame has seen.
 fn scores(state: &SplatState, weights: &ScoreWeights) -> Vec<f32> {
     let n = state.len();
     let mut scores = vec![0.0f32; n];
@@ -171,7 +171,7 @@ mod tests {
         }
     }
 
-    /// 40 splats on the x axis, the first four faint, every second one large; a gradient of x, but no frame saw the last ten.
+    /// 40 splats on the x axis, the first four faint, every second one large; a gradient of x; the last ten seen by no frame.
     fn state() -> SplatState {
         let mut splats = Splats::zeros(40, 0);
         for i in 0..40 {
@@ -193,20 +193,20 @@ mod tests {
     }
 
     #[test]
-    fn the_count_is_exact_and_only_steep_gradients_are_densified() {
+    fn the_count_is_exact_and_only_large_gradients_are_densified() {
         let mut s = state();
         let change = densify(&mut s, &options(50), &mut Rng::new(1, 1));
-        // Of the 28 that qualify, x from 2 to 29, half are small and half are large.
+        // Of the 28 candidates, x from 2 to 29, half are small and half are large.
         assert_eq!((s.len(), change.cloned, change.split, change.pruned), (50, 5, 5, 0));
         let mut s = state();
         densify(&mut s, &options(500), &mut Rng::new(1, 1));
-        assert_eq!(s.len(), 40 + 28, "no more than qualify");
+        assert_eq!(s.len(), 40 + 28, "no more than the candidates");
         let small = |s: &SplatState, x: f32| (0..s.len()).filter(|i| s.splats.means.get(0, *i) == x).count();
         assert_eq!([1.0, 3.0, 29.0, 31.0].map(|x| small(&s, x)), [1, 2, 2, 1]);
     }
 
     #[test]
-    fn half_of_the_useless_are_drawn_the_lowest_scores_first() {
+    fn half_of_the_removable_are_drawn_lowest_scores_first() {
         let prunes = TamingOptions {
             max_scale: Some(0.5),
             prunes: true,
@@ -214,7 +214,7 @@ mod tests {
         };
         let mut s = state();
         let change = densify(&mut s, &prunes, &mut Rng::new(1, 1));
-        // 22 are faint or large, so eleven are drawn; the ten unseen, whose score is 0, come first, and five of them are large.
+        // 22 are faint or large, so 11 are drawn; the ten unseen ones, whose score is 0, come first, and five of them are large.
         assert!((5..=6).contains(&change.pruned), "{change:?}");
         assert_eq!(s.len(), 40 - change.pruned);
         let unseen = (0..s.len()).filter(|i| s.splats.means.get(0, *i) > 29.5).count();
@@ -231,7 +231,7 @@ mod tests {
     }
 
     #[test]
-    fn the_count_follows_its_parabola_whatever_the_rounds() {
+    fn the_count_follows_the_parabola_for_any_rounds() {
         assert_eq!(next_count(100, 500, [0.5, 0.0]), 400);
         assert_eq!(next_count(400, 500, [1.0, 0.5]), 500);
         let halfway = next_count(next_count(100, 500, [0.25, 0.0]), 500, [0.5, 0.25]);

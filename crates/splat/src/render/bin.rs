@@ -1,10 +1,10 @@
-//! Which splat touches which tile, front to back: one depth sort, then a stable split into tiles.
+//! Assigns splats to tiles, front to back: one depth sort, then a stable split into tiles.
 //!
 //! A tile is 32 x 32 pixels in 64 blocks of 8 x 2. A splat is tested against *bands* 8 pixels wide: within a band of x its
-//! ellipse (the set alpha >= 1/255) spans one exact interval of y, which gives at once the tiles touched and, in each, the
-//! blocks worth visiting. Blocks of 8 x 2 waste fewer lanes on small splats than rows of 16: on fox (12,000 splats)
-//! the blend visits 5.9 M pairs a frame instead of 7.2 M. Tiles of 32 and not 16, because what a splat costs in each tile
-//! it touches, reducing its gradients above all, is as much as eight blocks.
+//! ellipse (the set alpha >= 1/255) spans one exact interval of y, which gives the tiles touched and, in each, the blocks to
+//! visit. Blocks of 8 x 2 waste fewer lanes on small splats than rows of 16: on fox (12,000 splats) blending visits 5.9 M pairs
+//! per frame instead of 7.2 M. Tiles are 32 pixels wide and not 16, because a splat's cost per touched tile, mainly the reduction
+//! of its gradients, equals that of eight blocks.
 
 use super::blend::{Footprint2d, LOG2_ALPHA_MIN};
 use irradia_compute::simd::{Kernel, Lanes, Level, Simd};
@@ -19,14 +19,14 @@ pub(super) const TILE: usize = 32;
 pub(super) const BLOCK_WIDTH: usize = 8;
 /// Rows of a block.
 pub(super) const BLOCK_HEIGHT: usize = 2;
-/// Blocks above each other in a tile; block b is number `b % 16` from the top in the band `b / 16` from the left.
+/// Blocks per band of a tile; block b is at `b % 16` from the top in band `b / 16` from the left.
 pub(super) const BAND_BLOCKS: usize = TILE / BLOCK_HEIGHT;
 
 /// A splat in a tile.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Entry {
     pub splat: u32,
-    /// Bit b is set for the blocks to visit.
+    /// Bit b is set for each block to visit.
     pub blocks: u64,
 }
 
@@ -39,40 +39,40 @@ pub(super) struct Bins {
     order: Vec<Pair>,
     scratch: Vec<Pair>,
     parts: Vec<Part>,
-    /// Tile t holds `splats` and `blocks` `[starts[t]..starts[t + 1]]`.
+    /// Tile t's entries are `splats` and `blocks` `[starts[t]..starts[t + 1]]`.
     starts: Vec<u32>,
     splats: Vec<AtomicU32>,
     blocks: Vec<AtomicU64>,
     entry_count: usize,
-    /// Slots are splat-major: where the entry of each slot lies in the tiles' lists.
+    /// Splat-major slots: position of each slot's entry in the tiles' lists.
     positions: Vec<AtomicU32>,
-    /// For each visible splat: its first slot in the upper 32 bits, how many in the lower.
+    /// For each visible splat: its first slot in the upper 32 bits, the number of slots in the lower.
     slots: Vec<AtomicU64>,
 }
 
-/// What one thread found, for a run of the depth order.
+/// The hits of one run of the depth order.
 #[derive(Default)]
 struct Part {
-    /// Tile and blocks, splat by splat: a hit's number over all parts is its slot.
+    /// Tile and blocks, splat by splat: a hit's index over all parts is its slot.
     hits: Vec<(u32, u64)>,
-    /// For each splat of the run: how many hits.
+    /// Number of hits of each splat of the run.
     counts: Vec<u32>,
-    /// Hits a tile; then where this part's next hit of the tile goes.
+    /// Number of hits per tile; later the position of this part's next hit of the tile.
     tiles: Vec<u32>,
 }
 
 impl Bins {
-    /// Tiles there are.
+    /// Number of tiles.
     pub fn tile_count(&self) -> usize {
         self.tiles_x * self.tiles_y
     }
 
-    /// Splat-tile pairs.
+    /// Number of splat-tile pairs.
     pub fn entry_count(&self) -> usize {
         self.entry_count
     }
 
-    /// Visible splats.
+    /// Number of visible splats.
     pub fn visible(&self) -> usize {
         self.order.len()
     }
@@ -94,7 +94,7 @@ impl Bins {
             })
     }
 
-    /// Where the entries of visible splat `splat` lie among all entries, in a fixed order.
+    /// Positions of the entries of visible splat `splat` among all entries, in a fixed order.
     #[inline(always)]
     pub fn positions(&self, splat: usize) -> impl Iterator<Item = usize> {
         let packed = self.slots[splat].load(Relaxed);
@@ -108,7 +108,7 @@ impl Bins {
         self.order.len().div_ceil(rayon::current_num_threads() * 4).max(256)
     }
 
-    /// Sorts and splits. `depth_keys[i]` is the bit pattern of splat i's (positive) depth, `u32::MAX` where invisible.
+    /// Sorts and splits. `depth_keys[i]` is the bit pattern of splat i's (positive) depth, `u32::MAX` if invisible.
     pub fn build(&mut self, level: Level, width: u32, height: u32, footprints: &[Footprint2d], depth_keys: &[u32]) {
         self.tiles_x = (width as usize).div_ceil(TILE);
         self.tiles_y = (height as usize).div_ceil(TILE);
@@ -141,7 +141,7 @@ impl Bins {
                 });
             });
 
-        // Where each part's hits of each tile begin: tile-major, then part by part, which keeps the depth order.
+        // Start of each part's hits of each tile: tile-major, then part by part, which preserves the depth order.
         self.starts.clear();
         self.starts.reserve(tiles + 1);
         let mut at = 0u32;
@@ -195,7 +195,7 @@ impl Bins {
     }
 }
 
-/// Finds the tiles of one run of splats. A kernel only so that rounding is an instruction and not a library call.
+/// Finds the tiles of one run of splats. A kernel only so that rounding compiles to an instruction and not to a library call.
 struct FindHits<'a> {
     part: &'a mut Part,
     order: &'a [Pair],
@@ -223,8 +223,8 @@ impl Kernel for FindHits<'_> {
         part.counts.clear();
         part.tiles.clear();
         part.tiles.resize(tiles_x * tiles_y, 0);
-        // In depth order neighbours lie far apart in memory. Fetching a batch first lets its cache misses overlap: with a
-        // million splats that halves the time of this loop.
+        // In depth order, neighbours are far apart in memory. Fetching a batch first overlaps its cache misses: with a million
+        // splats that halves the time of this loop.
         let mut batch = [Footprint2d::default(); 32];
         for order in order.chunks(batch.len()) {
             for (footprint, item) in batch.iter_mut().zip(order) {
@@ -245,7 +245,7 @@ impl Kernel for FindHits<'_> {
 /// Calls `hit(tile, blocks)` for every tile in which some pixel centre may lie inside the splat's ellipse.
 #[inline(always)]
 fn touched_tiles(s: &Footprint2d, tiles_x: usize, tiles_y: usize, mut hit: impl FnMut(u32, u64)) {
-    /// Rounding in the bounds must not lose a pixel: this much is added on every side, pixels.
+    /// Margin on every side against rounding in the bounds, pixels.
     const SLACK: f32 = 1e-2;
     const WIDTH: f32 = BLOCK_WIDTH as f32;
     let [x, y] = s.xy;
@@ -263,24 +263,24 @@ fn touched_tiles(s: &Footprint2d, tiles_x: usize, tiles_y: usize, mut hit: impl 
     let t = s.log2_opacity - LOG2_ALPHA_MIN as f32;
     let (inv_ex, middle_slope) = (1.0 / ex.max(1e-6), -0.5 * b / c);
     let half_height_squared = -t / c;
-    // Where the ellipse is highest and lowest: dx = +- x_at_top.
+    // Highest and lowest point of the ellipse: dx = +- x_at_top.
     let x_at_top = -0.5 * b / a * ey;
     let last_image_row = (tiles_y * TILE) as f32 - 1.0;
-    // First and last block from the image's top within band k; the first is above the last where there is none.
+    // First and last block from the image's top within band k; first > last if there is none.
     let span = |k: usize| {
         let left = (k as f32 * WIDTH + 0.5 - x).max(-ex);
         let right = (k as f32 * WIDTH + WIDTH - 0.5 - x).min(ex);
-        // `right < left` only within the slack: then both clamps give an end of the ellipse.
+        // `right < left` only within the margin: then both clamps give an end of the ellipse.
         let dx_high = x_at_top.min(right).max(left);
         let dx_low = (-x_at_top).min(right).max(left);
         let (u_high, u_low) = (dx_high * inv_ex, dx_low * inv_ex);
         let high = middle_slope * dx_high + (half_height_squared * (1.0 - u_high * u_high).max(0.0)).sqrt();
         let low = middle_slope * dx_low - (half_height_squared * (1.0 - u_low * u_low).max(0.0)).sqrt();
-        // Rows whose centre r + 0.5 lies in [y + low, y + high].
+        // Rows whose centre r + 0.5 is in [y + low, y + high].
         let first_row = (y + low - 0.5 - SLACK).ceil().max(0.0);
         let last_row = (y + high - 0.5 + SLACK).floor().min(last_image_row);
         if first_row <= last_row {
-            // By way of i32: a float to usize takes three times the instructions.
+            // Via i32: converting a float to usize directly takes three times the instructions.
             (
                 first_row as i32 as usize / BLOCK_HEIGHT,
                 last_row as i32 as usize / BLOCK_HEIGHT,
@@ -322,9 +322,9 @@ mod tests {
     use irradia_scene::Rng;
     use std::collections::HashMap;
 
-    /// Every pixel that the formula touches is in a listed tile and block; and not many blocks are listed in vain.
+    /// Every pixel that the formula touches is in a listed tile and block; few blocks are listed unnecessarily.
     #[test]
-    fn no_touched_pixel_is_lost_and_blocks_are_tight() {
+    fn no_touched_pixel_is_missed_and_blocks_are_tight() {
         let mut rng = Rng::new(3, 1);
         let (tiles_x, tiles_y) = (3, 2);
         let (mut listed_blocks, mut needed_blocks) = (0usize, 0usize);
@@ -372,7 +372,7 @@ mod tests {
                 }
             }
         }
-        // Between pixel centres a thin ellipse may pass unseen; nothing else is listed in vain.
+        // A thin ellipse may pass between pixel centres; otherwise no block is listed unnecessarily.
         assert!(
             listed_blocks < needed_blocks + needed_blocks / 20,
             "{listed_blocks} listed, {needed_blocks} needed"

@@ -1,9 +1,9 @@
 //! Front-to-back alpha blending of one tile, and its vector-Jacobian product.
 //!
-//! Symbols: `p = a dx^2 + b dx dy + c dy^2 + l` is log2 of alpha before the cap (conic and opacity folded into it, so that
-//! a fragment costs two fused operations and one exponential), `T` transmittance, `w = alpha T` weight.
+//! Symbols: `p = a dx^2 + b dx dy + c dy^2 + l` is log2 of alpha before the cap (conic and opacity folded in, so that a
+//! fragment costs two fused operations and one exponential), `T` transmittance, `w = alpha T` weight.
 //! Pixels are held block by block (8 columns, 2 rows): a block is one AVX-512 vector, two of AVX2.
-//! A pixel that has ended (a splat would have brought T to 1e-4 or below) is stored with the sign of T flipped: every
+//! A pixel that has terminated (a splat would have reduced T to 1e-4 or below) is stored with the sign of T flipped: every
 //! later product then fails the same test, which saves a mask in the inner loop.
 
 use super::bin::{BAND_BLOCKS, BLOCK_HEIGHT, BLOCK_WIDTH, Entry, TILE};
@@ -13,12 +13,12 @@ use std::f64::consts::LN_2;
 
 /// Alpha never exceeds this (Inria code).
 pub const ALPHA_MAX: f64 = 0.99;
-/// A splat that would leave this transmittance or less is not drawn and ends the pixel (Inria code).
+/// A splat that would reduce the transmittance to this or less is not drawn and terminates the pixel (Inria code).
 pub const TRANSMITTANCE_MIN: f64 = 1e-4;
 /// log2 of [`super::project::ALPHA_MIN`].
 pub const LOG2_ALPHA_MIN: f64 = -7.994_353_436_858_858;
 
-/// What blending needs of a splat; one cache line.
+/// A splat as blending reads it; one cache line.
 #[derive(Clone, Copy, Debug, Default)]
 #[repr(C, align(64))]
 pub(super) struct Footprint2d {
@@ -30,7 +30,7 @@ pub(super) struct Footprint2d {
     pub log2_opacity: f32,
     pub color: [f32; 3],
     pub depth: f32,
-    /// Half sizes of the box outside which alpha < 1/255, pixels.
+    /// Half sizes of the bounding box outside which alpha < 1/255, pixels.
     pub extent: [f32; 2],
 }
 
@@ -38,13 +38,13 @@ pub(super) struct Footprint2d {
 pub(super) const BLOCK: usize = BLOCK_WIDTH * BLOCK_HEIGHT;
 /// Pixels of a tile.
 pub(super) const TILE_PIXELS: usize = TILE * TILE;
-/// Channels a tile's forward state has: red, green, blue, depth, transmittance; `[channel, block, pixel]`.
+/// Channels of a tile's forward state: red, green, blue, depth, transmittance; `[channel, block, pixel]`.
 pub(super) const CHANNELS: usize = 5;
-/// Sums a splat collects in each tile, in this order: the moments 1, dx, dy, dx^2, dx dy, dy^2 of v_p / ln 2, then the
-/// gradients of red, green, blue and depth; then the two that a [`super::Gather`] asks for.
+/// Sums that a splat accumulates in each tile, in this order: the moments 1, dx, dy, dx^2, dx dy, dy^2 of v_p / ln 2, then the
+/// gradients of red, green, blue and depth; then the two of [`super::Gather`].
 pub(super) const SUMS: usize = 12;
 
-/// What backward sums up for density control, as the blend's loops know it.
+/// [`super::Gather`] as a const parameter of the blending loops.
 pub(super) mod gather {
     /// Nothing.
     pub const NOTHING: u8 = 0;
@@ -54,42 +54,42 @@ pub(super) mod gather {
     pub const ERROR: u8 = 2;
 }
 
-/// What happens to one vector of pixels when a splat passes over it.
+/// A splat's effect on one vector of pixels.
 pub(super) struct Fragment<F: Lanes> {
     pub alpha: F,
     pub weight: F,
-    /// Transmittance behind, if drawn.
-    pub behind: F,
+    /// Transmittance behind the fragment, if drawn.
+    pub transmittance: F,
     /// Drawn here.
     pub drawn: F::Mask,
-    /// Alpha reaches 1/255 but the pixel has ended or ends now.
+    /// Alpha reaches 1/255 but the pixel has terminated or terminates now.
     pub ends: F::Mask,
-    /// The cap acts.
+    /// Alpha is capped.
     pub capped: F::Mask,
 }
 
-/// One splat over one vector of pixels: `p` as above, `transmittance` in front.
+/// One splat over one vector of pixels: `p` as above, `transmittance` in front of it.
 #[inline(always)]
 pub(super) fn fragment<F: Lanes>(p: F, transmittance: F) -> Fragment<F> {
-    let raw = p.exp2_in_range(); // Below -126 nothing is touched.
+    let raw = p.exp2_in_range(); // Below -126 alpha is below its threshold.
     let cap = p.splat(ALPHA_MAX);
     let alpha = raw.min(cap);
     let touched = p.splat(LOG2_ALPHA_MIN).le(p);
     let weight = alpha * transmittance;
     let behind = transmittance - weight;
-    let goes_on = p.splat(TRANSMITTANCE_MIN).lt(behind);
+    let visible = p.splat(TRANSMITTANCE_MIN).lt(behind);
     Fragment {
         alpha,
         weight,
-        behind,
-        drawn: touched.and(goes_on),
-        ends: touched.and_not(goes_on),
+        transmittance: behind,
+        drawn: touched.and(visible),
+        ends: touched.and_not(visible),
         capped: cap.lt(raw),
     }
 }
 
-/// The gradient of `p`, divided by ln 2, for a fragment that is drawn: `dL/dalpha = T g - rest / (1 - alpha)`, where `g` is the splat's
-/// colour (and depth) times the pixel's gradient and `rest` the same for all that lies behind, weighted, background too.
+/// The gradient of `p`, divided by ln 2, for a drawn fragment: `dL/dalpha = T g - rest / (1 - alpha)`, where `g` is the splat's
+/// colour (and depth) times the pixel's gradient and `rest` the same for everything behind it, weighted, including the background.
 #[inline(always)]
 pub(super) fn fragment_vjp<F: Lanes>(at: &Fragment<F>, transmittance: F, g: F, rest: F) -> F {
     let one = g.splat(1.0);
@@ -136,7 +136,7 @@ impl<I: Iterator<Item = Entry>> BlendTile<'_, I> {
         let (red, colors) = colors.split_at_mut(TILE_PIXELS);
         let (green, colors) = colors.split_at_mut(TILE_PIXELS);
         let (blue, depths) = colors.split_at_mut(TILE_PIXELS);
-        // Bit b: some pixel of block b has not ended.
+        // Bit b: some pixel of block b has not terminated.
         let mut live = u64::MAX;
         for entry in self.entries {
             let blocks = entry.blocks & live;
@@ -170,7 +170,7 @@ impl<I: Iterator<Item = Entry>> BlendTile<'_, I> {
                         if DEPTH {
                             w.mul_add(depth, simd.load(&depths[at..])).store(&mut depths[at..]);
                         }
-                        let t_next = f.behind.select(f.drawn, t);
+                        let t_next = f.transmittance.select(f.drawn, t);
                         t_next.store(&mut transmittances[at..]);
                         if !f.ends.none() {
                             (-t.abs()).select(f.ends, t_next).store(&mut transmittances[at..]);
@@ -186,20 +186,20 @@ impl<I: Iterator<Item = Entry>> BlendTile<'_, I> {
     }
 }
 
-/// The bits of `blocks` that lie in `band`, from bit 0.
+/// The bits of `blocks` in `band`, from bit 0.
 #[inline(always)]
 fn band_blocks(blocks: u64, band: usize) -> u32 {
     (blocks >> (band * BAND_BLOCKS)) as u32 & ((1 << BAND_BLOCKS) - 1)
 }
 
-/// The bit of `block` if all its pixels have ended, else 0.
+/// The bit of `block` if all its pixels have terminated, else 0.
 #[inline(always)]
 fn ended_block(transmittances: &[f32], block: usize) -> u64 {
     let all = transmittances[block * BLOCK..][..BLOCK].iter().all(|t| *t < 0.0);
     u64::from(all) << block
 }
 
-/// `p` over a band of a tile, with all that does not depend on the row worked out.
+/// `p` over a band of a tile, with everything independent of the row precomputed.
 struct Parabola<S: Simd> {
     c: S::F,
     /// For each part of a block: dx, dy in the topmost block, b dx, and a dx^2 + l.
@@ -248,11 +248,11 @@ where
     }
 }
 
-/// Centres of a block's pixels from its left edge.
+/// Centres of a block's pixels relative to its left edge.
 const PIXEL_X: [f32; BLOCK] = [
     0.5, 1.5, 2.5, 3.5, 4.5, 5.5, 6.5, 7.5, 0.5, 1.5, 2.5, 3.5, 4.5, 5.5, 6.5, 7.5,
 ];
-/// Centres of a block's pixels from its top edge.
+/// Centres of a block's pixels relative to its top edge.
 const PIXEL_Y: [f32; BLOCK] = [
     0.5, 0.5, 0.5, 0.5, 0.5, 0.5, 0.5, 0.5, 1.5, 1.5, 1.5, 1.5, 1.5, 1.5, 1.5, 1.5,
 ];
@@ -263,8 +263,8 @@ const BLOCK_TOP: [f32; BAND_BLOCKS] = [
 
 /// Walks one tile front to back again and writes every entry's [`SUMS`].
 ///
-/// Front to back, as forward: every test then has the very operands it had there. What lies behind is known because the
-/// whole pixel is: `rest` starts at the pixel's total and loses each splat's part.
+/// Front to back, as in the forward pass: every test then has exactly the same operands. The light from behind a splat follows
+/// from the pixel's total: `rest` starts at the total and loses each splat's contribution.
 pub(super) struct BlendTileVjp<'a, I> {
     pub footprints: &'a [Footprint2d],
     pub entries: I,
@@ -275,9 +275,9 @@ pub(super) struct BlendTileVjp<'a, I> {
     /// `color . v_color + depth v_depth - T v_alpha`, background included, `[blocks, BLOCK]`; overwritten.
     pub rest: &'a mut [f32; TILE_PIXELS],
     pub with_depth: bool,
-    /// One of [`gather`]'s.
+    /// One of the constants of [`gather`].
     pub gather: u8,
-    /// The entries' sums, in their order.
+    /// The entries' sums, in the order of the entries.
     pub sums: &'a mut [[f32; SUMS]],
 }
 
@@ -330,7 +330,7 @@ impl<I: Iterator<Item = Entry>> BlendTileVjp<'_, I> {
                     continue;
                 }
                 let over = Parabola::<S>::new(simd, s, self.corner, band);
-                // Moments 1, dy, dy^2 of v_p in each column; dx joins at the end, for it is the same in all blocks of a band.
+                // Moments 1, dy, dy^2 of v_p in each column; dx is applied at the end, since it is the same in all blocks of a band.
                 let mut moments = [[zero; 3]; 4];
                 while todo != 0 {
                     let block = todo.trailing_zeros() as usize;
@@ -377,7 +377,7 @@ impl<I: Iterator<Item = Entry>> BlendTileVjp<'_, I> {
                         let v_dy = v_p * dy;
                         m[1] += v_dy;
                         m[2] = v_dy.mul_add(dy, m[2]);
-                        let t_next = f.behind.select(f.drawn, t);
+                        let t_next = f.transmittance.select(f.drawn, t);
                         t_next.store(&mut transmittances[at..]);
                         if !f.ends.none() {
                             (-t.abs()).select(f.ends, t_next).store(&mut transmittances[at..]);

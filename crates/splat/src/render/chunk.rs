@@ -1,5 +1,5 @@
-//! Projection of a chunk of splats, and its vector-Jacobian product: what lies between the planar columns in memory and
-//! the arithmetic of [`super::project`] and [`super::sh`].
+//! Projection of a chunk of splats, and its vector-Jacobian product: connects the planar columns in memory to the arithmetic
+//! of [`super::project`] and [`super::sh`].
 
 use super::blend::{Footprint2d, SUMS};
 use super::harmonics::{CHUNK, Harmonics};
@@ -22,7 +22,7 @@ where
     }
 }
 
-/// The filter's variances from splat `at` on, where there is one.
+/// The filter's variances from splat `at` on, if there is a filter.
 #[inline(always)]
 fn load_filter<S: Simd>(simd: S, filter: &[f32], at: usize) -> Option<S::F>
 where
@@ -37,11 +37,11 @@ where
 
 pub(super) struct ProjectChunk<'a> {
     pub splats: &'a Splats,
-    /// As [`Renderer::set_filter`] was given it.
+    /// As passed to [`Renderer::set_filter`].
     pub filter: &'a [f32],
     pub view: &'a ViewParams,
     pub options: &'a RenderOptions,
-    /// Whether colours are final: nothing below 0.
+    /// Whether colours are final: clamped at 0.
     pub clamp: bool,
     pub first: usize,
     pub footprints: &'a mut [Footprint2d],
@@ -72,7 +72,7 @@ impl Kernel for ProjectChunk<'_> {
             if visible == 0 {
                 continue;
             }
-            harmonics.look(at, geometry.mean, view.center);
+            harmonics.evaluate_basis(at, geometry.mean, view.center);
             let mut columns = [[0.0f32; 16]; 9];
             let Footprint {
                 xy,
@@ -90,7 +90,7 @@ impl Kernel for ProjectChunk<'_> {
             for lane in (0..S::LANES).filter(|lane| visible >> lane & 1 == 1) {
                 let v = unroll!(i in 9 => columns[i][lane]);
                 if v.iter().any(|v| !v.is_finite()) {
-                    continue; // A poisoned splat is not drawn; the file reader and the optimiser are where it is told.
+                    continue; // Splats that are not finite are not drawn; the file reader and the optimiser report them.
                 }
                 keys[lane] = v[6].to_bits();
                 self.footprints[at + lane] = Footprint2d {
@@ -123,7 +123,7 @@ pub(super) struct GradientChunk<'a> {
     pub gathered: Vec<&'a mut [f32]>,
     pub columns: [Vec<&'a mut [f32]>; 5],
     pub non_finite: usize,
-    /// This chunk's part of it.
+    /// This chunk's contribution to the camera's gradient.
     pub camera: CameraGradient,
 }
 
@@ -132,7 +132,7 @@ pub(super) struct ProjectChunkVjp<'a, 'b> {
     pub splats: &'a Splats,
     pub view: &'a ViewParams,
     pub degree: u32,
-    /// Whether the camera's gradient is asked for.
+    /// Whether the camera's gradient is requested.
     pub camera: bool,
     pub first: usize,
     pub chunk: &'a mut GradientChunk<'b>,
@@ -167,13 +167,13 @@ impl ProjectChunkVjp<'_, '_> {
         let mut harmonics = Harmonics::new(self.degree);
         let mut v_colors = [[0.0f32; CHUNK]; 3];
         let mut magnitudes = [0.0f32; CHUNK];
-        // Sums over the chunk of the gradients of R, of t, and of the camera's centre through the direction of view.
+        // Sums over the chunk of the gradients of R, of t, and of the camera's centre through the viewing direction.
         let mut v_rotation = [[simd.splat(0.0); 3]; 3];
         let mut v_translation = [simd.splat(0.0); 3];
         let mut v_center = [simd.splat(0.0); 3];
         for at in (0..chunk.active.len()).step_by(S::LANES) {
             let first = self.first + at;
-            // Sum each visible splat's entries, in their order; [sum, lane]. What invisible lanes hold is masked below.
+            // Sum each visible splat's entries, in their order; [sum, lane]. Invisible lanes are masked below.
             let mut sums = [[0.0f32; 16]; SUMS];
             let mut image = [[1.0f32; 16]; 7];
             let mut visible = [0.0f32; 16];
@@ -215,18 +215,18 @@ impl ProjectChunkVjp<'_, '_> {
             let filter = load_filter(simd, &renderer.filter, first);
             let (v, v_camera) = project_vjp(&view, &geometry, filter, antialias, &v_footprint);
 
-            // Colour was clamped at 0 where it is not above.
+            // Colours not above 0 were clamped.
             let v_color = [
                 red.masked(zero.lt(shown_red)),
                 green.masked(zero.lt(shown_green)),
                 blue.masked(zero.lt(shown_blue)),
             ];
-            harmonics.look(at, geometry.mean, view.center);
+            harmonics.evaluate_basis(at, geometry.mean, view.center);
             for c in 0..3 {
                 v_color[c].store(&mut v_colors[c][at..]);
             }
 
-            // A sum of magnitudes is finite exactly where all of them are.
+            // A sum of magnitudes is finite exactly if all of them are.
             let mut magnitude = v.opacity_logit.abs() + v_color[0].abs() + v_color[1].abs() + v_color[2].abs();
             for value in v.mean.into_iter().chain(v.quat).chain(v.log_scale) {
                 magnitude += value.abs();

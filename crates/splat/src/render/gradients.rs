@@ -1,5 +1,5 @@
-//! Finite differences in double precision, through the very code that trains: projection, harmonics and fragments are
-//! generic over lanes, and here a lane is one `f64`. Only the loops around them are written again, plainly.
+//! Finite differences in double precision, through the code that trains: projection, harmonics and fragments are generic over
+//! lanes, and here a lane is one `f64`. Only the loops around them are written a second time, as simply as possible.
 
 use super::blend::{ALPHA_MAX, LOG2_ALPHA_MIN, TRANSMITTANCE_MIN, fragment, fragment_vjp};
 use super::project::{Geometry, footprint_gradient, project, project_vjp, quadratic};
@@ -28,7 +28,7 @@ struct Scene {
 }
 
 /// A projected splat.
-struct Shown {
+struct Projected {
     index: usize,
     xy: [f64; 2],
     quadratic: [f64; 3],
@@ -47,7 +47,7 @@ fn geometry(flat: &[f64]) -> Geometry<f64> {
 }
 
 impl Scene {
-    /// Of six configurations, `seed` 1 to 6, with an image of this size.
+    /// One of six configurations, `seed` 1 to 6, with an image of this size.
     fn new(seed: u64, width: u32, height: u32) -> Self {
         let (antialias, filter, degree) = [
             (false, None, 3),
@@ -61,7 +61,7 @@ impl Scene {
         let scale = f64::from(width) / 21.0;
         Self {
             view: ViewParams {
-                // A turned camera, off its own axis, with pixels that are not square.
+                // A rotated camera, off-centre, with pixels that are not square.
                 rotation: rotation(0.2, -0.1, 0.3),
                 translation: [0.1, -0.2, 0.05],
                 focal: [19.0, 23.0].map(|f| f * scale),
@@ -80,15 +80,15 @@ impl Scene {
         }
     }
 
-    /// Variance of splat `i`'s filter: no two splats of a vector have the same.
+    /// Variance of splat `i`'s filter: different for all splats of a vector.
     fn filter(&self, i: usize) -> Option<f64> {
         self.filter
             .map(|variance| f64::from((variance * (1.0 + 0.1 * i as f64)) as f32))
     }
 
-    fn show(&self, splats: &[Flat]) -> Vec<Shown> {
+    fn project(&self, splats: &[Flat]) -> Vec<Projected> {
         let view = self.view.lanes(Double);
-        let mut shown: Vec<Shown> = splats
+        let mut projected: Vec<Projected> = splats
             .iter()
             .enumerate()
             .filter_map(|(index, flat)| {
@@ -102,7 +102,7 @@ impl Scene {
                         .sum();
                     (sum + 0.5).max(0.0)
                 });
-                visible.then(|| Shown {
+                visible.then(|| Projected {
                     index,
                     xy: footprint.xy,
                     quadratic: quadratic(footprint.conic),
@@ -112,8 +112,8 @@ impl Scene {
                 })
             })
             .collect();
-        shown.sort_by(|a, b| a.depth.total_cmp(&b.depth));
-        shown
+        projected.sort_by(|a, b| a.depth.total_cmp(&b.depth));
+        projected
     }
 
     /// Calls `visit(pixel, [x, y])` for every pixel.
@@ -129,10 +129,10 @@ impl Scene {
     }
 
     /// A pixel's red, green, blue, alpha and depth.
-    fn pixel(&self, shown: &[Shown], at: [f64; 2]) -> [f64; 5] {
+    fn pixel(&self, projected: &[Projected], at: [f64; 2]) -> [f64; 5] {
         let mut out = [0.0; 5];
         let mut t = 1.0f64;
-        for s in shown {
+        for s in projected {
             let f = fragment(s.p(at).0, t);
             if f.ends {
                 break;
@@ -142,7 +142,7 @@ impl Scene {
                     out[c] += f.weight * s.color[c];
                 }
                 out[4] += f.weight * s.depth;
-                t = f.behind;
+                t = f.transmittance;
             }
         }
         for c in 0..3 {
@@ -153,25 +153,25 @@ impl Scene {
     }
 
     fn loss(&self, splats: &[Flat]) -> f64 {
-        let shown = self.show(splats);
+        let projected = self.project(splats);
         let mut loss = 0.0;
         self.pixels(|i, at| {
-            let out = self.pixel(&shown, at);
+            let out = self.pixel(&projected, at);
             loss += out.iter().zip(&self.weights[i]).map(|(v, w)| v * w).sum::<f64>();
         });
         loss
     }
 
     fn gradient(&self, splats: &[Flat]) -> (Vec<Flat>, CameraGradient) {
-        let shown = self.show(splats);
-        // Moments of v_p, then colour and depth, for each shown splat.
-        let mut sums = vec![[0.0; 10]; shown.len()];
+        let projected = self.project(splats);
+        // Moments of v_p, then colour and depth, for each projected splat.
+        let mut sums = vec![[0.0; 10]; projected.len()];
         self.pixels(|i, at| {
             let w = self.weights[i];
-            let out = self.pixel(&shown, at);
+            let out = self.pixel(&projected, at);
             let mut rest = (0..3).map(|c| out[c] * w[c]).sum::<f64>() + out[4] * w[4] - (1.0 - out[3]) * w[3];
             let mut t = 1.0;
-            for (s, sum) in shown.iter().zip(&mut sums) {
+            for (s, sum) in projected.iter().zip(&mut sums) {
                 let (p, [dx, dy]) = s.p(at);
                 let f = fragment(p, t);
                 if f.ends {
@@ -188,13 +188,13 @@ impl Scene {
                 for (sum, part) in sum.iter_mut().zip(parts.into_iter().chain(colors)) {
                     *sum += part;
                 }
-                t = f.behind;
+                t = f.transmittance;
             }
         });
         let view = self.view.lanes(Double);
         let mut gradients: Vec<Flat> = splats.iter().map(|s| vec![0.0; s.len()]).collect();
         let (mut v_rotation, mut v_translation, mut v_center) = ([[0.0; 3]; 3], [0.0; 3], [0.0; 3]);
-        for (s, sum) in shown.iter().zip(&sums) {
+        for (s, sum) in projected.iter().zip(&sums) {
             let flat = &splats[s.index];
             let g = geometry(flat);
             let moments = [sum[0], sum[1], sum[2], sum[3], sum[4], sum[5]];
@@ -227,25 +227,25 @@ impl Scene {
         (gradients, self.view.gradient(v_rotation, v_translation, v_center))
     }
 
-    /// Each pixel's smallest distance of a fragment from one of the hard decisions: a finite difference across one is void,
-    /// and rounding may take either side.
+    /// Each pixel's smallest distance of a fragment from one of the hard decisions: a finite difference across one is invalid,
+    /// and rounding may decide either way.
     fn margins(&self, splats: &[Flat]) -> Vec<f64> {
-        let shown = self.show(splats);
+        let projected = self.project(splats);
         let mut margins = Vec::new();
         self.pixels(|_, at| {
             let (mut t, mut margin) = (1.0, f64::MAX);
-            for s in &shown {
+            for s in &projected {
                 let p = s.p(at).0;
                 margin = margin.min((p - LOG2_ALPHA_MIN).abs()).min((p - ALPHA_MAX.log2()).abs());
                 let f = fragment(p, t);
                 if p >= LOG2_ALPHA_MIN {
-                    margin = margin.min((f.behind / TRANSMITTANCE_MIN - 1.0).abs());
+                    margin = margin.min((f.transmittance / TRANSMITTANCE_MIN - 1.0).abs());
                 }
                 if f.ends {
                     break;
                 }
                 if f.drawn {
-                    t = f.behind;
+                    t = f.transmittance;
                 }
             }
             margins.push(margin);
@@ -253,13 +253,13 @@ impl Scene {
         margins
     }
 
-    /// What each splat collects of `error`, an error a pixel, and of 1: the sums of its blending weights with them.
-    fn collected(&self, splats: &[Flat], error: &[f64]) -> Vec<[f64; 2]> {
-        let shown = self.show(splats);
+    /// The sums over each splat of its blending weights times `error`, an error per pixel, and of its blending weights.
+    fn gathered(&self, splats: &[Flat], error: &[f64]) -> Vec<[f64; 2]> {
+        let projected = self.project(splats);
         let mut sums = vec![[0.0; 2]; splats.len()];
         self.pixels(|i, at| {
             let mut t = 1.0;
-            for s in &shown {
+            for s in &projected {
                 let alpha = s.p(at).0.exp2().min(ALPHA_MAX);
                 if s.p(at).0 < LOG2_ALPHA_MIN {
                     continue;
@@ -276,7 +276,7 @@ impl Scene {
     }
 }
 
-impl Shown {
+impl Projected {
     fn p(&self, at: [f64; 2]) -> (f64, [f64; 2]) {
         let [dx, dy] = [at[0] - self.xy[0], at[1] - self.xy[1]];
         let [a, b, c] = self.quadratic;
@@ -284,7 +284,7 @@ impl Shown {
     }
 }
 
-/// The kinds of splat that break renderers, and ordinary ones.
+/// Degenerate splats that often break renderers, and ordinary ones.
 fn splats(rng: &mut Rng, degree: u32) -> Vec<Flat> {
     let mut make = |x: [f64; 3], log_scale: [f64; 3], logit: f64| {
         let mut uniform = |low: f32, high: f32| f64::from(rng.range(low, high));
@@ -300,25 +300,25 @@ fn splats(rng: &mut Rng, degree: u32) -> Vec<Flat> {
         make([-0.4, 0.3, 3.5], [-2.0, -1.5, -1.1], -1.0),
         make([0.0, 0.0, -2.0], [-1.0, -1.0, -1.0], 1.0), // behind the camera
         make([9.0, 0.0, 3.0], [-2.0, -2.0, -2.0], 1.0),  // off the image
-        make([2.6, 0.5, 1.4], [-0.3, -0.6, -0.5], 0.5),  // off-axis: the clamp of J acts
+        make([2.6, 0.5, 1.4], [-0.3, -0.6, -0.5], 0.5),  // off-axis: the clamp of J is active
         make([0.5, 0.5, 6.0], [0.9, 1.1, 1.0], -0.5),    // huge
         make([-0.2, 0.1, 2.5], [-1.0, -6.0, -6.5], 2.0), // needle
         make([0.1, 0.2, 2.8], [-1.0, -1.3, -1.2], -4.8), // nearly transparent
-        make([0.0, -0.1, 5.0], [-0.5, -0.7, -0.6], 6.5), // opaque: the cap of alpha acts
+        make([0.0, -0.1, 5.0], [-0.5, -0.7, -0.6], 6.5), // opaque: alpha is capped
         make([0.2, 0.1, 5.5], [-0.5, -0.4, -0.6], 3.0),
     ]
 }
 
 #[test]
-fn finite_differences_hold_every_gradient() {
+fn every_gradient_matches_finite_differences() {
     let mut compared = 0;
     for seed in 1..=6 {
         let scene = Scene::new(seed, 21, 18);
         let splats = splats(&mut Rng::new(seed, 78), scene.degree);
-        assert!(scene.show(&splats).len() >= 7, "most are seen");
+        assert!(scene.project(&splats).len() >= 7, "most are visible");
         assert!(
             scene.margins(&splats).iter().all(|margin| *margin > 1e-5),
-            "seed {seed} lies on a hard decision: choose another"
+            "seed {seed} is at a hard decision: choose another"
         );
         let (gradient, camera) = scene.gradient(&splats);
         let largest = gradient.iter().flatten().fold(0.0f64, |m, v| m.max(v.abs()));
@@ -332,10 +332,10 @@ fn finite_differences_hold_every_gradient() {
             of_largest: 1e-8,
             absolute: 0.0,
         };
-        let what = format!("seed {seed}, {each} values a splat");
+        let what = format!("seed {seed}, {each} values per splat");
         differences.check(&what, &flat, &gradient.concat(), 0..flat.len(), value);
         compared += flat.len();
-        // The camera, moved and turned: R -> exp(h [axis]) R.
+        // The camera, translated and rotated: R -> exp(h [axis]) R.
         for axis in 0..6 {
             let moved = |h: f64| {
                 let mut view = scene.view.clone();
@@ -375,20 +375,20 @@ fn finite_differences_hold_every_gradient() {
     assert!(compared > 1000);
 }
 
-/// The whole renderer, whose loops over chunks, tiles, blocks and lanes are its own, against the plain loops above.
+/// The whole renderer, with its own loops over chunks, tiles, blocks and lanes, against the simple loops above.
 #[test]
-fn every_level_renders_and_collects_what_double_precision_does() {
+fn every_level_matches_double_precision() {
     for seed in 1..=6 {
-        // Four tiles, whole ones or three that the image's border cuts; 66 splats fill no number of vectors.
+        // Four tiles, complete or three cut by the image's border; 66 splats do not fill a whole number of vectors.
         let whole = seed % 2 == 0;
         let (width, height) = if whole { (64, 64) } else { (63, 54) };
         let mut scene = Scene::new(seed, width, height);
         let mut rng = Rng::new(seed, 79);
         let mut flats: Vec<Flat> = (0..6).flat_map(|_| splats(&mut rng, scene.degree)).collect();
-        // Both sides see the same numbers.
+        // Both sides use the same numbers.
         flats.iter_mut().flatten().for_each(|v| *v = f64::from(*v as f32));
         let mut error: Vec<f64> = scene.weights.iter().map(|_| f64::from(rng.uniform())).collect();
-        // Where rounding may take another decision nothing is compared; the sum of weights is the only one that sees it.
+        // Pixels where rounding may change a decision have no weight; only the sum of blending weights includes them.
         let fragile: Vec<bool> = scene.margins(&flats).iter().map(|margin| *margin < 1e-4).collect();
         assert!(fragile.iter().filter(|f| **f).count() < fragile.len() / 20);
         for i in (0..fragile.len()).filter(|i| fragile[*i]) {
@@ -399,13 +399,13 @@ fn every_level_renders_and_collects_what_double_precision_does() {
             .iter_mut()
             .flatten()
             .for_each(|w| *w = f64::from(*w as f32));
-        let in_doubt = scene.collected(
+        let in_doubt = scene.gathered(
             &flats,
             &fragile.iter().map(|f| f64::from(u8::from(*f))).collect::<Vec<_>>(),
         );
 
         let (want, _) = scene.gradient(&flats);
-        let want_collected = scene.collected(&flats, &error);
+        let want_collected = scene.gathered(&flats, &error);
         let column = |from: usize, count: usize| -> Vec<f32> {
             flats
                 .iter()
@@ -484,7 +484,7 @@ fn every_level_renders_and_collects_what_double_precision_does() {
                     .collect();
                 let d = relative_difference(&values, &want, 1e-3);
                 println!("{}: {:.1e}", what(name), d.worst);
-                // Single precision, over some thousand pixels a splat: 9e-4 was seen.
+                // Single precision, over some thousand pixels per splat: 9e-4 was seen.
                 assert!(d.worst < 2e-3, "{}: {d:?}", what(name));
             }
             for (i, want) in want_collected.iter().enumerate().filter(|(i, _)| got.active[*i] > 0.0) {
@@ -495,7 +495,7 @@ fn every_level_renders_and_collects_what_double_precision_does() {
                     what("error")
                 );
                 let allowed = 1e-4 * want[1] + 1e-5 + in_doubt[i][0];
-                // What lies beyond the border in a tile that it cuts counts as weight, too.
+                // Pixels beyond the image's border in a tile count for the weight, too.
                 let weight = if whole { weight } else { weight.min(want[1]) };
                 assert!(
                     (weight - want[1]).abs() < allowed,

@@ -1,29 +1,29 @@
 //! Spherical harmonics over a chunk of splats, plane by plane.
 //!
-//! The coefficients are 48 planes. Splat by splat, forward and backward would touch some hundred places in memory in turn,
-//! more than caches and prefetchers follow: at 50,000 splats that was a quarter of a training step. Plane by plane each is
-//! read or written in one run.
+//! The coefficients are 48 planes. Splat by splat, forward and backward would access about a hundred places in memory in turn,
+//! more than caches and prefetchers follow: at 50,000 splats that was a quarter of a training step. Plane by plane, each is
+//! read or written sequentially.
 
 use super::sh::{MAX_COEFFICIENTS, basis, basis_vjp, direction, direction_vjp};
 use crate::Splats;
 use irradia_compute::simd::{Lanes, Simd};
 use irradia_scene::sh::coefficients;
 
-/// Splats a task projects: a multiple of every vector length, and few enough that what is held here stays in cache.
+/// Splats per task of projection: a multiple of every vector length, and small enough for the buffers to stay in cache.
 pub(super) const CHUNK: usize = 512;
 
 /// A chunk's harmonics.
 pub(super) struct Harmonics {
     degree: u32,
-    /// The basis at each splat's direction; after [`Harmonics::vjp`] the gradient of it.
+    /// The basis at each splat's direction; after [`Harmonics::vjp`], its gradient.
     basis: [[f32; CHUNK]; MAX_COEFFICIENTS],
-    /// Where the vectors of splats start that are looked at.
+    /// Start indices of the vectors of splats evaluated.
     starts: [u16; CHUNK],
     count: usize,
 }
 
 impl Harmonics {
-    /// Nothing looked at yet.
+    /// With no vectors evaluated.
     #[inline(always)]
     pub fn new(degree: u32) -> Self {
         Self {
@@ -34,9 +34,9 @@ impl Harmonics {
         }
     }
 
-    /// Looks at the vector of splats that starts at `at`, whose means are `mean`, from `center`.
+    /// Evaluates the basis for the vector of splats that starts at `at`, whose means are `mean`, seen from `center`.
     #[inline(always)]
-    pub fn look<F: Lanes<Scalar = f32>>(&mut self, at: usize, mean: [F; 3], center: [F; 3]) {
+    pub fn evaluate_basis<F: Lanes<Scalar = f32>>(&mut self, at: usize, mean: [F; 3], center: [F; 3]) {
         let (d, _) = direction(mean, center);
         let basis = basis(self.degree, d);
         for k in 0..coefficients(self.degree) {
@@ -46,14 +46,14 @@ impl Harmonics {
         self.count += 1;
     }
 
-    /// Starts of the vectors that were looked at.
+    /// Start indices of the vectors evaluated.
     #[inline(always)]
     pub fn starts(&self) -> impl Iterator<Item = usize> + use<> {
         let (starts, count) = (self.starts, self.count);
         (0..count).map(move |i| usize::from(starts[i]))
     }
 
-    /// Colours, clamped at 0 if `clamp`, of what was looked at; the chunk's first splat is `first`.
+    /// Colours of the vectors evaluated, clamped at 0 if `clamp`; `first` is the chunk's first splat.
     #[inline(always)]
     pub fn colors<S: Simd>(&self, simd: S, splats: &Splats, first: usize, clamp: bool) -> [[f32; CHUNK]; 3]
     where
@@ -81,7 +81,7 @@ impl Harmonics {
         colors
     }
 
-    /// Writes the coefficients' gradients for the colours' `v_colors` into the planes `v_sh`, and keeps the basis'.
+    /// Writes the gradients of the coefficients, given the colours' `v_colors`, into the planes `v_sh`, and keeps those of the basis.
     #[inline(always)]
     pub fn vjp<S: Simd>(
         &mut self,

@@ -1,7 +1,7 @@
-//! The differentiable renderer: project, bin, blend, and the same backwards.
+//! The differentiable renderer: project, bin, blend, and the backward pass of each.
 //!
-//! One [`Renderer`] owns every buffer, so that a training step allocates next to nothing. Work is split into pieces of a
-//! fixed size and reduced in a fixed order: the number of threads never changes a bit.
+//! One [`Renderer`] owns every buffer, so that a training step hardly allocates. Work is split into pieces of fixed size and
+//! reduced in a fixed order: results are bit-identical for any number of threads.
 
 mod bin;
 mod blend;
@@ -30,11 +30,11 @@ use rayon::prelude::*;
 /// How a frame is rendered.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RenderOptions {
-    /// Colour behind everything, sRGB.
+    /// Background colour, sRGB.
     pub background: [f32; 3],
-    /// SH bands used; those above are not looked at.
+    /// SH degree in use; higher bands are ignored.
     pub sh_degree: u32,
-    /// Scale opacity by the area ratio that dilation adds (Mip-Splatting's 2D filter, gsplat's "antialiased").
+    /// Scale opacity by the area ratio of the dilation (Mip-Splatting's 2D filter, gsplat's "antialiased").
     pub antialias: bool,
     /// Fill [`Renderer::depth`].
     pub depth: bool,
@@ -51,23 +51,23 @@ impl Default for RenderOptions {
     }
 }
 
-/// Gradients of the loss with regard to a frame.
+/// Gradients of the loss with respect to a frame.
 #[derive(Clone, Copy, Debug)]
 pub struct OutputGradient<'a> {
     /// `[3, H, W]`.
     pub color: &'a [f32],
     /// `[H, W]`.
     pub alpha: Option<&'a [f32]>,
-    /// `[H, W]`, of the accumulated depth; the frame must have been rendered with depth.
+    /// `[H, W]`, of the accumulated depth; requires a frame rendered with depth.
     pub depth: Option<&'a [f32]>,
-    /// What else to sum up for each splat.
+    /// What else to accumulate per splat.
     pub gather: Gather<'a>,
-    /// Whether to work out [`SplatGradients::camera`] too.
+    /// Whether to compute [`SplatGradients::camera`].
     pub camera: bool,
 }
 
 impl<'a> OutputGradient<'a> {
-    /// Of the colour alone, `[3, H, W]`.
+    /// Gradient of the colour only, `[3, H, W]`.
     pub fn of_color(color: &'a [f32]) -> Self {
         Self {
             color,
@@ -79,57 +79,57 @@ impl<'a> OutputGradient<'a> {
     }
 }
 
-/// A rendered frame, plane by plane.
+/// A rendered frame, as planes.
 #[derive(Clone, Copy, Debug)]
 pub struct FramePlanes<'a> {
     /// `[3, H, W]`, not clamped.
     pub color: &'a [f32],
-    /// `[H, W]`, one minus the transmittance that is left.
+    /// `[H, W]`, one minus the remaining transmittance.
     pub alpha: &'a [f32],
-    /// `[H, W]`, depth along +Z accumulated with the blending weights; empty when not asked for.
+    /// `[H, W]`, depth along +Z accumulated with the blending weights; empty if not requested.
     pub depth: &'a [f32],
 }
 
-/// What backward sums up for density control, beside the gradients.
+/// What the backward pass accumulates for density control, beside the gradients.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Gather<'a> {
     /// Nothing.
     Nothing,
-    /// The screen gradient of the centre with each fragment's part taken absolutely (AbsGS, Ye et al. 2024, eq. 6).
+    /// The screen gradient of the centre with absolute values summed over fragments (AbsGS, Ye et al. 2024, eq. 6).
     Absolute,
-    /// `[H, W]`, an error a pixel: each splat collects the error it shows, weighted by how much of the pixel it is, and
-    /// the sum of these weights (Rota Bulo et al. 2024, "Revising Densification in Gaussian Splatting", eq. 5). The weights
-    /// include those in pixels beyond the image's right and lower border that belong to its last tiles; errors are 0 there.
+    /// `[H, W]`, an error per pixel: each splat accumulates the error, weighted by its blending weight in the pixel, and the sum of
+    /// these weights (Rota Bulo et al. 2024, "Revising Densification in Gaussian Splatting", eq. 5). The weights include pixels
+    /// beyond the image's right and lower border in its last tiles; errors are 0 there.
     Error(&'a [f32]),
 }
 
-/// The gradient of the loss with regard to a camera: `x_cam = R x + t`, the entries of R taken as independent.
+/// The gradient of the loss with respect to a camera: `x_cam = R x + t`, the entries of R taken as independent.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct CameraGradient {
-    /// Of R, row-major.
+    /// With respect to R, row-major.
     pub rotation: [[f64; 3]; 3],
-    /// Of t.
+    /// With respect to t.
     pub translation: [f64; 3],
 }
 
-/// Gradients of the loss with regard to the splats.
+/// Gradients of the loss with respect to the splats.
 #[derive(Clone, Debug, Default)]
 pub struct SplatGradients {
-    /// Column by column. Items that are not active hold unspecified numbers.
+    /// Column by column. Inactive splats hold unspecified numbers.
     pub splats: Splats,
     /// `[stride]`: 1 where the splat was visible and its gradient is finite, else 0.
     pub active: Vec<f32>,
     /// Gradient of the projected centre, pixels: 2 planes.
     pub screen: Planes,
-    /// What [`OutputGradient::gather`] asked for, 2 planes: absolute screen gradients, or error and weight.
+    /// As [`OutputGradient::gather`] requests, 2 planes: absolute screen gradients, or error and weight.
     pub gathered: Planes,
-    /// Of the camera, where [`OutputGradient::camera`] asked for it.
+    /// Gradient of the camera, if [`OutputGradient::camera`] requests it.
     pub camera: Option<CameraGradient>,
-    /// Splats left out because a gradient was not finite.
+    /// Number of splats skipped because a gradient was not finite.
     pub non_finite: usize,
 }
 
-/// The renderer with its buffers, which are also the tape that [`Renderer::backward`] plays.
+/// The renderer with its buffers, which also hold the intermediate values for [`Renderer::backward`].
 pub struct Renderer {
     /// Instruction set to use.
     pub level: Level,
@@ -157,12 +157,12 @@ impl Default for Renderer {
 }
 
 impl Renderer {
-    /// With the best instructions this processor has.
+    /// At the best SIMD level of this processor.
     pub fn new() -> Self {
         Self::with_level(Level::detect())
     }
 
-    /// With a given instruction set.
+    /// At a given SIMD level.
     pub fn with_level(level: Level) -> Self {
         Self {
             level,
@@ -181,7 +181,7 @@ impl Renderer {
         }
     }
 
-    /// Convolves every splat with an isotropic Gaussian of this variance (world units squared, one a splat) from the next
+    /// Convolves every splat with an isotropic Gaussian of this variance (world units squared, one per splat) from the next
     /// frame on: the 3D smoothing filter of Mip-Splatting (Yu et al. 2024, eq. 8). Empty for none.
     pub fn set_filter(&mut self, variances: &[f32]) {
         self.filter.clear();
@@ -193,13 +193,13 @@ impl Renderer {
         &self.color
     }
 
-    /// One minus the transmittance that is left, `[H, W]`.
+    /// One minus the remaining transmittance, `[H, W]`.
     pub fn alpha(&self) -> &[f32] {
         &self.alpha
     }
 
-    /// Depth along +Z accumulated with the blending weights, `[H, W]` (divide by alpha for the expected depth); empty
-    /// when not asked for.
+    /// Depth along +Z accumulated with the blending weights, `[H, W]` (divide by alpha for the expected depth); empty if not
+    /// requested.
     pub fn depth(&self) -> &[f32] {
         &self.depth
     }
@@ -228,12 +228,12 @@ impl Renderer {
         self.view.as_ref().map(|view| [view.width, view.height])
     }
 
-    /// Half size of splat `i`'s box in the last frame in pixels, `None` where it was not visible.
+    /// Half size of splat `i`'s bounding box in the last frame, pixels; `None` if it was not visible.
     pub fn screen_extent(&self, i: usize) -> Option<[f32; 2]> {
         (self.depth_keys[i] != u32::MAX).then(|| self.footprints[i].extent)
     }
 
-    /// Splat-pixel pairs that the last frame's blending visited (whole blocks of 16): what a frame costs.
+    /// Splat-pixel pairs visited by blending in the last frame (whole blocks of 16): a frame's cost.
     pub fn pairs(&self) -> u64 {
         (0..self.bins.tile_count())
             .flat_map(|tile| self.bins.tile(tile))
@@ -247,8 +247,8 @@ impl Renderer {
         self.composite();
     }
 
-    /// The first half of a frame to whose colours something is added: `splats` are projected, colours not yet clamped.
-    /// [`Self::add_colors`] and [`Self::composite`] must follow.
+    /// The first half of a frame with added colours: projects `splats`, without clamping colours. [`Self::add_colors`] and
+    /// [`Self::composite`] must follow.
     pub fn project(&mut self, splats: &Splats, view: &ViewParams, options: &RenderOptions) {
         self.project_chunks(splats, view, options, false);
         self.in_view.clear();
@@ -261,11 +261,11 @@ impl Renderer {
         &self.in_view
     }
 
-    /// Adds `[r, g, b]` to the colour of each of [`Self::in_view`], then clamps it at 0. The gradient of what is added is
-    /// that of the splat's DC coefficient over [`irradia_scene::sh::C0`].
+    /// Adds `[r, g, b]` to the colour of each of [`Self::in_view`], then clamps it at 0. The gradient of the added colour is
+    /// that of the splat's DC coefficient divided by [`irradia_scene::sh::C0`].
     ///
     /// # Panics
-    /// When there is not one colour a splat in view.
+    /// When the number of colours differs from the number of splats in view.
     pub fn add_colors(&mut self, added: &[[f32; 3]]) {
         assert_eq!(added.len(), self.in_view.len(), "a colour for each splat in view");
         for (i, added) in self.in_view.iter().zip(added) {
@@ -274,7 +274,7 @@ impl Renderer {
         }
     }
 
-    /// The second half of a frame: what was projected is binned and blended.
+    /// The second half of a frame: bins and blends the projected splats.
     ///
     /// # Panics
     /// When nothing was projected.
@@ -339,7 +339,7 @@ impl Renderer {
         self.alpha.resize(pixels, 0.0);
         self.depth.resize(if options.depth { pixels } else { 0 }, 0.0);
         let tiles = &self.tiles;
-        // The eight pixels of a channel in row y from column x, a multiple of eight, on.
+        // The eight pixels of a channel in row y starting at column x, a multiple of eight.
         let run = |channel: usize, y: usize, x: usize| {
             let tile = (y / TILE) * bins.tiles_x + x / TILE;
             let at = (tile * CHANNELS + channel) * TILE_PIXELS + pixel_in_tile(x % TILE, y % TILE);
@@ -370,12 +370,12 @@ impl Renderer {
         });
     }
 
-    /// The vector-Jacobian product of the last [`Renderer::render`]: `splats` must be what was rendered.
+    /// The vector-Jacobian product of the last [`Renderer::render`]: `splats` must be the rendered ones.
     ///
-    /// SH gradients are written for the bands that were used; the others keep what they held.
+    /// SH gradients are written for the bands in use; the others keep their values.
     ///
     /// # Panics
-    /// When nothing was rendered, sizes differ, or a depth gradient comes without a rendered depth.
+    /// When nothing was rendered, sizes differ, or a depth gradient is given without a rendered depth.
     pub fn backward(&mut self, splats: &Splats, v_out: &OutputGradient, gradients: &mut SplatGradients) {
         let view = self.view.clone().expect("render comes first");
         let pixels = view.width as usize * view.height as usize;
@@ -431,23 +431,23 @@ impl Renderer {
                     for column in (0..columns).step_by(BLOCK_WIDTH) {
                         let (at, from) = (pixel_in_tile(column, row), image + column);
                         let v = |plane: &[f32], offset: usize| run_of(&plane[offset..], columns - column);
-                        let held = |channel: usize| -> &[f32; BLOCK_WIDTH] {
+                        let state_at = |channel: usize| -> &[f32; BLOCK_WIDTH] {
                             state[channel * TILE_PIXELS + at..].first_chunk().expect("a run")
                         };
-                        let t = held(CHANNELS - 1).map(f32::abs);
+                        let t = state_at(CHANNELS - 1).map(f32::abs);
                         let mut total = [0.0f32; BLOCK_WIDTH];
                         let mut put = |channel: usize, v: [f32; BLOCK_WIDTH]| {
                             v_tile[channel * TILE_PIXELS + at..][..BLOCK_WIDTH].copy_from_slice(&v);
                         };
                         for c in 0..3 {
-                            let (v, color) = (v(v_out.color, c * width * height + from), held(c));
+                            let (v, color) = (v(v_out.color, c * width * height + from), state_at(c));
                             for i in 0..BLOCK_WIDTH {
                                 total[i] += (color[i] + t[i] * background[c]) * v[i];
                             }
                             put(c, v);
                         }
                         if let Some(v_depth) = v_out.depth {
-                            let (v, depth) = (v(v_depth, from), held(3));
+                            let (v, depth) = (v(v_depth, from), state_at(3));
                             for i in 0..BLOCK_WIDTH {
                                 total[i] += depth[i] * v[i];
                             }
@@ -546,7 +546,7 @@ impl Renderer {
     }
 }
 
-/// The first eight of `values`, zeros from the `len`-th on.
+/// The first eight of `values`, with zeros from index `len` on.
 #[inline(always)]
 fn run_of(values: &[f32], len: usize) -> [f32; BLOCK_WIDTH] {
     match values.first_chunk() {
@@ -555,7 +555,7 @@ fn run_of(values: &[f32], len: usize) -> [f32; BLOCK_WIDTH] {
     }
 }
 
-/// Where pixel (x, y) of a tile lies in its block-wise order.
+/// Index of pixel (x, y) of a tile in its block-wise order.
 #[inline(always)]
 fn pixel_in_tile(x: usize, y: usize) -> usize {
     let block = (x / BLOCK_WIDTH) * BAND_BLOCKS + y / BLOCK_HEIGHT;

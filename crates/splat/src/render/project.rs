@@ -12,12 +12,12 @@ use std::f64::consts::{LN_2, LOG2_E};
 
 /// Pixels squared added to the diagonal of the 2D covariance (Inria code, "low-pass filter").
 pub const DILATION: f64 = 0.3;
-/// A fragment counts from this alpha on (Inria code).
+/// A fragment is drawn from this alpha on (Inria code).
 pub const ALPHA_MIN: f64 = 1.0 / 255.0;
 /// Floor of the ratio under the root of the antialiasing compensation: 0.005 squared (gsplat).
 const COMPENSATION_FLOOR: f64 = 0.005 * 0.005;
 
-/// One splat's geometry, one a lane.
+/// Splats' geometry, one splat per lane.
 #[derive(Clone, Copy)]
 pub(super) struct Geometry<F> {
     pub mean: [F; 3],
@@ -26,8 +26,8 @@ pub(super) struct Geometry<F> {
     pub opacity_logit: F,
 }
 
-/// The gradient of the camera, before the part that goes through the direction of view: `x = R m + t` with the entries of
-/// R taken as independent.
+/// The gradient of the camera, without the part through the viewing direction: `x = R m + t` with the entries of R taken as
+/// independent.
 #[derive(Clone, Copy)]
 pub(super) struct CameraTerms<F> {
     pub rotation: [[F; 3]; 3],
@@ -43,9 +43,9 @@ pub(super) struct Footprint<F> {
     pub depth: F,
     /// `[A, B, C]` of `sigma = (A dx^2 + C dy^2) / 2 + B dx dy`.
     pub conic: [F; 3],
-    /// After the antialiasing compensation, if any.
+    /// After the antialiasing compensation, if enabled.
     pub opacity: F,
-    /// Half the size of the box outside which alpha is below 1/255, pixels.
+    /// Half size of the bounding box outside which alpha is below 1/255, pixels.
     pub extent: [F; 2],
 }
 
@@ -58,30 +58,30 @@ pub(super) struct FootprintGradient<F> {
     pub opacity: F,
 }
 
-/// What forward and backward both need.
+/// Intermediate values shared by forward and backward.
 struct Intermediate<F> {
     x: [F; 3],
     inv_z: F,
-    /// Clamped tangents and whether the clamp acts.
+    /// Clamped tangents and whether the clamp is active.
     tangent: [F; 2],
     q: [F; 4],
     inv_q_norm: F,
     rot: [[F; 3]; 3],
     /// After the 3D filter.
     scale: [F; 3],
-    /// The variance along each axis before the 3D filter over that after it.
-    share: [F; 3],
+    /// Variance along each axis before the 3D filter divided by that after it.
+    fraction: [F; 3],
     /// Rows of J R.
     jr: [[F; 3]; 2],
     v: [[F; 3]; 2],
     /// Before dilation: a, b, c and the determinant.
     cov: [F; 3],
     det: F,
-    /// After.
+    /// After dilation.
     cov_dilated: [F; 3],
     det_dilated: F,
     sigmoid: F,
-    /// sqrt of the product of the shares: what the 3D filter takes from the opacity.
+    /// sqrt of the product of `fraction`: the factor of the 3D filter on opacity.
     thinning: F,
 }
 
@@ -119,8 +119,8 @@ fn intermediate<F: Lanes>(view: &ViewLanes<F>, g: &Geometry<F>, filter: Option<F
         ],
     ];
     let own_scale = unroll!(k in 3 => g.log_scale[k].exp());
-    // Mip-Splatting (Yu et al. 2024), eq. 8: convolved with an isotropic Gaussian, at the same mass.
-    let (scale, share, thinning) = match filter {
+    // Mip-Splatting (Yu et al. 2024), eq. 8: convolution with an isotropic Gaussian, preserving mass.
+    let (scale, fraction, thinning) = match filter {
         Some(variance) => {
             let scale: [F; 3] = unroll!(k in 3 => own_scale[k].mul_add(own_scale[k], variance).sqrt());
             let ratio: [F; 3] = unroll!(k in 3 => own_scale[k] / scale[k]);
@@ -156,7 +156,7 @@ fn intermediate<F: Lanes>(view: &ViewLanes<F>, g: &Geometry<F>, filter: Option<F
         inv_q_norm,
         rot,
         scale,
-        share,
+        fraction,
         jr,
         v,
         cov,
@@ -168,7 +168,7 @@ fn intermediate<F: Lanes>(view: &ViewLanes<F>, g: &Geometry<F>, filter: Option<F
     }
 }
 
-/// Projects; the mask holds the lanes that can touch the image. Lanes outside it hold unspecified numbers. `filter` is the
+/// Projects; the mask holds the lanes that may touch the image. Lanes outside it hold unspecified numbers. `filter` is the
 /// variance of the 3D smoothing filter, world units squared.
 #[inline(always)]
 pub(super) fn project<F: Lanes>(
@@ -221,7 +221,7 @@ pub(super) fn quadratic<F: Lanes>(conic: [F; 3]) -> [F; 3] {
     [conic[0] * half, conic[1] * (half + half), conic[2] * half]
 }
 
-/// The gradient of a footprint from what blending sums up: the moments 1, dx, dy, dx^2, dx dy, dy^2 of v_p / ln 2, where
+/// The gradient of a footprint from the sums of blending: the moments 1, dx, dy, dx^2, dx dy, dy^2 of v_p / ln 2, where
 /// dx = pixel - centre.
 #[inline(always)]
 pub(super) fn footprint_gradient<F: Lanes>(
@@ -300,7 +300,7 @@ pub(super) fn project_vjp<F: Lanes>(
     let v_log_filtered = unroll!(k in 3 => v_v[0][k] * at.v[0][k] + v_v[1][k] * at.v[1][k]);
     let v_log_thinning = v_own_opacity * own_opacity;
     let v_log_scale: [F; 3] = match filter {
-        Some(_) => unroll!(k in 3 => v_log_filtered[k] * at.share[k] + v_log_thinning * (one - at.share[k])),
+        Some(_) => unroll!(k in 3 => v_log_filtered[k] * at.fraction[k] + v_log_thinning * (one - at.fraction[k])),
         None => v_log_filtered,
     };
     let v_u: [[F; 3]; 2] = unroll!(r in 2 => unroll!(k in 3 => v_v[r][k] * at.scale[k]));
@@ -322,7 +322,7 @@ pub(super) fn project_vjp<F: Lanes>(
         let tangent = at.x[r] * at.inv_z;
         let [least, largest] = view.limits[r];
         let v_tangent = v_tangent.masked(least.lt(tangent).and(tangent.lt(largest)));
-        // The pixel position moves with the tangent too, unclamped.
+        // The pixel position moves with the tangent, too, unclamped.
         let v_free = v_tangent + v_out.xy[r] * view.f[r];
         v_x[r] += v_free * at.inv_z;
         v_x[2] -= v_free * tangent * at.inv_z;

@@ -4,7 +4,7 @@ use irradia_compute::simd::Lanes;
 use irradia_compute::unroll;
 use irradia_scene::sh::{C0, C1, C2, C3};
 
-/// Basis functions a degree-3 expansion has.
+/// Number of basis functions of a degree-3 expansion.
 pub(super) const MAX_COEFFICIENTS: usize = 16;
 
 /// The basis at the unit direction `[x, y, z]`; entries above `degree` are zero.
@@ -82,7 +82,7 @@ pub(super) fn basis_vjp<F: Lanes>(degree: u32, [x, y, z]: [F; 3], v: &[F; MAX_CO
     g
 }
 
-/// Unit direction from `center` to `mean`, and one over the distance.
+/// Unit direction from `center` to `mean`, and the inverse of the distance.
 #[inline(always)]
 pub(super) fn direction<F: Lanes>(mean: [F; 3], center: [F; 3]) -> ([F; 3], F) {
     let d: [F; 3] = unroll!(i in 3 => mean[i] - center[i]);

@@ -3,7 +3,7 @@ use irradia_compute::simd::Simd;
 use irradia_compute::unroll;
 use irradia_scene::Camera;
 
-/// A pinhole camera as the renderer uses it, in double precision so that tests lose nothing.
+/// A pinhole camera as the renderer uses it, in double precision for the tests.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ViewParams {
     /// Rotation of `x_cam = R x + t`, row-major.
@@ -23,7 +23,7 @@ pub struct ViewParams {
 }
 
 impl ViewParams {
-    /// From a scene camera; its lens is not looked at (readers undistort).
+    /// From a scene camera; its lens is ignored (readers undistort).
     pub fn new(camera: &Camera) -> Self {
         let (r, t) = camera.pose.camera_from_world_parts();
         let r = r.to_cols_array_2d();
@@ -44,7 +44,7 @@ impl ViewParams {
         std::array::from_fn(|j| -(0..3).map(|i| self.rotation[i][j] * self.translation[i]).sum::<f64>())
     }
 
-    /// The camera's whole gradient from its direct part and that of the centre, which moves the directions of view:
+    /// The camera's total gradient from its direct part and that of the centre, on which viewing directions depend:
     /// `center = -R^-1 t`, so `d center = -R^-1 (dR center + dt)`.
     pub(super) fn gradient(
         &self,
@@ -63,9 +63,9 @@ impl ViewParams {
         CameraGradient { rotation, translation }
     }
 
-    /// The least and the largest `X / Z` and `Y / Z`; beyond them J is evaluated at the limit. They lie 0.3 tan(fov / 2)
-    /// outside the image's borders wherever the principal point is (gsplat); Inria's lie about the axis, which is the same
-    /// where it is centred.
+    /// Minimum and maximum of `X / Z` and `Y / Z`; beyond them J is evaluated at the limit. They lie 0.3 tan(fov / 2)
+    /// outside the image's borders for any principal point (gsplat); Inria's are symmetric about the axis, which is the same for a
+    /// centred principal point.
     pub fn tangent_limits(&self) -> [[f64; 2]; 2] {
         let size = [self.width, self.height].map(f64::from);
         std::array::from_fn(|i| {
@@ -91,7 +91,7 @@ impl ViewParams {
     }
 }
 
-/// [`ViewParams`] in every lane.
+/// [`ViewParams`] broadcast to all lanes.
 pub(super) struct ViewLanes<F> {
     pub r: [[F; 3]; 3],
     pub t: [F; 3],

@@ -1,14 +1,14 @@
-//! The values that the clock carries, by the names of the parameters, so that a new parameter leaves old checkpoints readable.
+//! The values carried by the clock, by parameter name, so that a new parameter leaves old checkpoints readable.
 
 use super::reals;
 use crate::recipe::{Param, Values};
 use crate::trainer::TrainError;
 use safetensors::tensor::{Dtype, SafeTensors};
 
-/// What the names of their tensors begin with; a parameter's name follows.
+/// Prefix of the names of their tensors; a parameter's name follows.
 const PREFIX: &str = "carried.";
 
-/// The order of the values in format 4, where they stand without names after the numbers of `clock.real`.
+/// The order of the values in format 4, in which they follow the numbers of `clock.real` without names.
 const FORMAT_4_PARAMS: [Param; 32] = [
     Param::ImageScale,
     Param::ShDegree,
@@ -51,11 +51,11 @@ pub(super) fn named(values: &Values) -> impl Iterator<Item = (String, f64)> {
         .map(|param| (format!("{PREFIX}{}", param.name()), values[param]))
 }
 
-/// The values of `file`, those that format 4 has without names being `unnamed`. A parameter that is newer than the checkpoint
-/// has its default, since the recipe in the checkpoint does not name it.
+/// The values of `file`; those that format 4 has without names are in `unnamed`. A parameter newer than the checkpoint gets its
+/// default, since the recipe in the checkpoint does not set it.
 ///
 /// # Errors
-/// When a name is unknown: what the parameter did is not in this version, so that the run would not go on as it began.
+/// When a name is unknown: this version lacks that parameter, so that the run would not continue as it began.
 pub(super) fn read(file: &SafeTensors, unnamed: &[f64]) -> Result<Values, TrainError> {
     let mut values = Values::default_values();
     if !unnamed.is_empty() {

@@ -36,7 +36,7 @@ fn dataset() -> Arc<Dataset> {
     })
 }
 
-/// A trainer whose clock carries another value of each parameter, all within their bounds.
+/// A trainer whose clock carries a different value of each parameter, all within bounds.
 fn trainer() -> Trainer {
     let recipe = Recipe::parse("classic", Recipe::built_in("classic").unwrap(), &[]).unwrap();
     let mut trainer = Trainer::new(dataset(), recipe, TrainOptions::default()).unwrap();
@@ -47,7 +47,7 @@ fn trainer() -> Trainer {
 
 type Tensors = Vec<(String, Dtype, Vec<usize>, Vec<u8>)>;
 
-/// `bytes` with format `format` and what `change` makes of the tensors.
+/// `bytes` as format `format`, with its tensors modified by `change`.
 fn rewritten(bytes: &[u8], format: &str, change: impl Fn(&mut Tensors)) -> Vec<u8> {
     let file = SafeTensors::deserialize(bytes).unwrap();
     let (_, header) = SafeTensors::read_metadata(bytes).unwrap();
@@ -75,7 +75,7 @@ fn read(bytes: &[u8]) -> Result<Trainer, String> {
     from_bytes(bytes, dataset(), TrainOptions::default()).map_err(|error| error.to_string())
 }
 
-/// Leaves out the values by name and appends `count` of `values` to the clock's numbers, as format 4 has them.
+/// Removes the values by name and appends `count` of `values` to the clock's numbers, as in format 4.
 fn unname(tensors: &mut Tensors, values: &Values, count: usize) {
     tensors.retain(|(name, ..)| !name.starts_with("carried."));
     let (.., shape, bytes) = tensors.iter_mut().find(|(name, ..)| name == "clock.real").unwrap();
@@ -85,7 +85,7 @@ fn unname(tensors: &mut Tensors, values: &Values, count: usize) {
 }
 
 #[test]
-fn a_checkpoint_reads_back_as_what_was_written() {
+fn a_checkpoint_round_trips() {
     let trainer = trainer();
     let again = read(&to_bytes(&trainer)).unwrap();
     assert_eq!(again.clock, trainer.clock);
@@ -93,7 +93,7 @@ fn a_checkpoint_reads_back_as_what_was_written() {
 }
 
 #[test]
-fn what_sits_in_the_sockets_goes_on_as_if_nothing_had_happened() {
+fn socket_occupants_resume_exactly() {
     let overrides = ["exposure=true", "refine_poses=true", "params.rate_poses=0.001"].map(str::to_owned);
     let recipe = Recipe::parse("shiny", Recipe::built_in("shiny").unwrap(), &overrides).unwrap();
     let mut trainer = Trainer::new(dataset(), recipe, TrainOptions::default()).unwrap();
@@ -110,7 +110,7 @@ fn what_sits_in_the_sockets_goes_on_as_if_nothing_had_happened() {
         let tensors: Vec<_> = occupants.flat_map(|occupant| occupant.tensors()).collect();
         (trainer.engine.state().clone(), tensors, trainer.camera(0))
     });
-    assert!(learnt[0] == learnt[1], "a resumed run goes on as the unbroken one");
+    assert!(learnt[0] == learnt[1], "a resumed run equals the uninterrupted one");
     assert!(learnt[0].2 != trainer.dataset.views[0].camera, "poses have moved");
     let without = rewritten(&bytes, FORMAT, |tensors| {
         tensors.retain(|(name, ..)| name != "exposure.maps");
@@ -127,7 +127,7 @@ fn format_4_is_read_as_format_5() {
         unname(tensors, &trainer.clock.carried, 32);
     });
     let again = read(&old).unwrap();
-    // What came after format 4 has its default.
+    // Parameters newer than format 4 have their defaults.
     let mut clock = trainer.clock.clone();
     for param in Param::ALL.into_iter().skip(32) {
         clock.carried[param] = param.row().default;
@@ -155,7 +155,7 @@ fn a_parameter_newer_than_the_checkpoint_has_its_default() {
 }
 
 #[test]
-fn a_parameter_that_is_not_known_is_refused_by_name() {
+fn an_unknown_parameter_is_rejected_by_name() {
     let bytes = to_bytes(&trainer());
     let number = |name: &str, values: &[f64]| {
         let bytes = values.iter().flat_map(|v| v.to_le_bytes()).collect();

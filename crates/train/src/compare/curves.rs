@@ -1,48 +1,48 @@
-//! What is read off the course of a run.
+//! Figures derived from the curves of a run.
 
 use super::super::report::Report;
 use serde::Serialize;
 
-/// A look at the held-out views.
+/// An evaluation of the held-out views during a run.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
-pub struct Look {
-    /// Steps made.
+pub struct EvaluationPoint {
+    /// Steps completed.
     pub step: u64,
-    /// Seconds of training so far; looking is not training.
+    /// Seconds of training so far, excluding evaluation.
     pub seconds: f64,
     /// Mean over the held-out views, dB.
     pub psnr: f64,
 }
 
-/// Logged losses in a block, at most: about as many views as a small scene has, so that a block's mean says more about
-/// the model than about which views came up.
+/// Maximum number of logged losses per block: about the number of views of a small scene, so that a block's mean depends more
+/// on the model than on the views.
 const BLOCK: usize = 25;
 
-/// The looks of a run, in order; the last is the final scene.
-pub(super) fn looks(report: &Report) -> Vec<Look> {
+/// The evaluations of a run, in order; the last is that of the final scene.
+pub(super) fn evaluations(report: &Report) -> Vec<EvaluationPoint> {
     let measured = report.curve.iter().filter_map(|point| {
-        Some(Look {
+        Some(EvaluationPoint {
             step: point.step,
             seconds: point.seconds,
             psnr: point.psnr?,
         })
     });
-    let mut looks: Vec<Look> = measured.filter(|look| look.psnr.is_finite()).collect();
+    let mut evaluations: Vec<EvaluationPoint> = measured.filter(|point| point.psnr.is_finite()).collect();
     if report.psnr.is_finite() && report.training_seconds.is_finite() {
-        // The same scene with all bands of harmonics: it stands for a look at the last step.
-        looks.retain(|look| look.step < report.steps);
-        looks.push(Look {
+        // The same scene with all bands of harmonics: it replaces an evaluation at the last step.
+        evaluations.retain(|point| point.step < report.steps);
+        evaluations.push(EvaluationPoint {
             step: report.steps,
             seconds: report.training_seconds,
             psnr: report.psnr,
         });
     }
-    looks
+    evaluations
 }
 
-/// Every half dB that some run reached, at most 24 of them: what lies further below the best is left out.
-pub(super) fn levels(runs: &[Vec<Look>]) -> Vec<f64> {
-    let psnr = || runs.iter().flatten().map(|look| look.psnr);
+/// Every half dB that some run reached, at most the 24 highest.
+pub(super) fn levels(runs: &[Vec<EvaluationPoint>]) -> Vec<f64> {
+    let psnr = || runs.iter().flatten().map(|point| point.psnr);
     let (lowest, highest) = (
         psnr().fold(f64::INFINITY, f64::min),
         psnr().fold(f64::NEG_INFINITY, f64::max),
@@ -55,21 +55,21 @@ pub(super) fn levels(runs: &[Vec<Look>]) -> Vec<f64> {
     (first..=last).map(|half| half as f64 / 2.0).collect()
 }
 
-/// Where along `axis` (seconds or steps) a run first reached `psnr`, on the straight line between two looks; at its first
-/// look where it was above already, which is then an upper bound. `None` where it never was.
-pub fn reached(looks: &[Look], psnr: f64, axis: fn(&Look) -> f64) -> Option<f64> {
-    let at = looks.iter().position(|look| look.psnr >= psnr)?;
-    let here = &looks[at];
-    let Some(before) = at.checked_sub(1).map(|at| &looks[at]) else {
+/// Position along `axis` (seconds or steps) at which a run first reached `psnr`, linearly interpolated between two evaluations; if
+/// the first evaluation is above it, that evaluation's position, an upper bound. `None` if it was never reached.
+pub fn reached(evaluations: &[EvaluationPoint], psnr: f64, axis: fn(&EvaluationPoint) -> f64) -> Option<f64> {
+    let at = evaluations.iter().position(|point| point.psnr >= psnr)?;
+    let here = &evaluations[at];
+    let Some(before) = at.checked_sub(1).map(|at| &evaluations[at]) else {
         return Some(axis(here));
     };
     let part = (psnr - before.psnr) / (here.psnr - before.psnr);
     Some(axis(before) + part * (axis(here) - axis(before)))
 }
 
-/// The share of blocks of steps in which the training loss rises: the logged losses in order, cut into blocks of 25 (of
-/// fewer where there are under 250, but at least 5), whose means are compared, each with the one before. Single steps see
-/// different views and rise half of the time whatever happens. `None` with fewer than two blocks.
+/// The fraction of blocks of steps in which the training loss rises: the logged losses in order, in blocks of 25 (of fewer if
+/// there are under 250, but at least 5), the mean of each compared with the previous one. Single steps see different views and
+/// rise half of the time in any case. `None` with fewer than two blocks.
 pub fn rises(losses: &[f64]) -> Option<f64> {
     let losses: Vec<f64> = losses.iter().copied().filter(|loss| loss.is_finite()).collect();
     let block = (losses.len() / 10).clamp(5, BLOCK);
@@ -77,16 +77,16 @@ pub fn rises(losses: &[f64]) -> Option<f64> {
         .chunks_exact(block)
         .map(|block| block.iter().sum::<f64>() / block.len() as f64)
         .collect();
-    share(&means, |before, after| after > before)
+    fraction(&means, |before, after| after > before)
 }
 
-/// The share of looks at the held-out views that saw a lower PSNR than the look before. `None` with fewer than two.
-pub fn falls(looks: &[Look]) -> Option<f64> {
-    let psnr: Vec<f64> = looks.iter().map(|look| look.psnr).collect();
-    share(&psnr, |before, after| after < before)
+/// The fraction of evaluations of the held-out views with a lower PSNR than the previous one. `None` with fewer than two.
+pub fn falls(evaluations: &[EvaluationPoint]) -> Option<f64> {
+    let psnr: Vec<f64> = evaluations.iter().map(|point| point.psnr).collect();
+    fraction(&psnr, |before, after| after < before)
 }
 
-fn share(values: &[f64], worse: impl Fn(f64, f64) -> bool) -> Option<f64> {
+fn fraction(values: &[f64], worse: impl Fn(f64, f64) -> bool) -> Option<f64> {
     let pairs = values.windows(2);
     let count = pairs.len();
     (count > 0).then(|| pairs.filter(|pair| worse(pair[0], pair[1])).count() as f64 / count as f64)

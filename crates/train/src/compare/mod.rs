@@ -1,126 +1,126 @@
-//! Ways of training beside one another: what `irradia compare` measured, summed up.
+//! Comparisons of recipes: a summary of the runs of `irradia compare`.
 //!
-//! For every scene and recipe there is one run a seed. A figure over runs is a mean with the sample standard deviation
-//! ([`Spread`]); runs that failed are left out of it and counted.
+//! For every scene and recipe there is one run per seed. A figure over runs is a mean with the sample standard deviation
+//! ([`Spread`]); failed runs are excluded from it and counted.
 
 mod curves;
 mod page;
 mod table;
 
-pub use curves::{Look, falls, reached, rises};
+pub use curves::{EvaluationPoint, falls, reached, rises};
 pub use page::{picture, to_html};
 pub use table::{to_markdown, to_text};
 
 use crate::report::{Machine, Report};
 use serde::Serialize;
 
-/// Everything a comparison came to; its figures that are not finite are written as `null`.
+/// The results of a comparison; figures that are not finite are written as `null`.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct Comparison {
     /// Version of the program.
     pub version: String,
-    /// What was the same for all runs, in words, such as `150 steps`.
+    /// The conditions common to all runs, in words, such as `150 steps`.
     pub conditions: Vec<String>,
-    /// What computed, such as `CPU, 2 threads, avx512`.
+    /// The device, such as `CPU, 2 threads, avx512`.
     pub device: String,
-    /// Where it ran.
+    /// The machine.
     pub machine: Machine,
     /// The datasets.
     pub scenes: Vec<Scene>,
-    /// The recipes' means over the scenes, in the order of [`Scene::entries`].
+    /// The recipes' means over scenes, in the order of [`Scene::entries`].
     pub overall: Vec<Overall>,
 }
 
 /// One dataset.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct Scene {
-    /// What to call it.
+    /// Display name.
     pub name: String,
-    /// Where it lies, as the user said.
+    /// Its path, as the user gave it.
     pub data: String,
     /// The recipes, in the order of the command line.
     pub entries: Vec<Entry>,
-    /// What the first recipe's whole runs end with, mean over seeds: the mark that [`Entry::to_mark`] is about.
+    /// The final result of the first recipe, mean over seeds of its finished runs: the target of [`Entry::to_mark`].
     pub mark: Option<Mark>,
-    /// A held-out view as the recipes show it.
+    /// A held-out view, rendered by each recipe.
     pub view: Option<PictureRow>,
 }
 
-/// What the first recipe of a scene ends with.
+/// The final result of a scene's first recipe.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Mark {
     /// Held-out PSNR, dB.
     pub psnr: f64,
-    /// Seconds of training that it takes for that.
+    /// Seconds of training to reach it.
     pub seconds: f64,
 }
 
 /// A recipe on one scene.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct Entry {
-    /// The recipe with its changes, as the user wrote it.
+    /// The recipe with its overrides, as the user wrote it.
     pub recipe: String,
-    /// One a seed.
+    /// One per seed.
     pub runs: Vec<Run>,
     /// Held-out PSNR, dB.
     pub psnr: Option<Spread>,
     /// Held-out SSIM.
     pub ssim: Option<Spread>,
-    /// Held-out LPIPS, where there were weights.
+    /// Held-out LPIPS, if network weights are available.
     pub lpips: Option<Spread>,
     /// Wall-clock seconds of the training loop.
     pub seconds: Option<Spread>,
-    /// Processor seconds of the training loop.
+    /// CPU seconds of the training loop.
     pub cpu_seconds: Option<Spread>,
     /// Gaussians at the end; `None` for fields.
     pub splats: Option<Spread>,
-    /// Numbers of the field; `None` for splats.
+    /// Number of parameters of the field; `None` for splats.
     pub parameters: Option<Spread>,
-    /// Most memory the process held, bytes.
+    /// Peak memory of the process, bytes.
     pub peak_memory: Option<Spread>,
-    /// Share of blocks of steps whose mean training loss is above that of the block before; see [`rises`].
+    /// Fraction of blocks of steps whose mean training loss is above that of the previous block; see [`rises`].
     pub loss_rises: Option<Spread>,
-    /// Likewise of the mean squared error of the training views, which is the same measure for all recipes and stages.
+    /// The same for the mean squared error of the training views, which is comparable between recipes and stages.
     pub error_rises: Option<Spread>,
-    /// Share of evaluations whose held-out PSNR is below that of the one before; see [`falls`].
+    /// Fraction of evaluations whose held-out PSNR is below the previous one; see [`falls`].
     pub psnr_falls: Option<Spread>,
     /// When each half dB was reached.
     pub reached: Vec<Reached>,
-    /// When the scene's mark was.
+    /// When the scene's mark was reached.
     pub to_mark: Option<Reached>,
-    /// Seconds to the mark over those of the first recipe's whole run; `None` unless every finished run got there.
+    /// Seconds to the mark divided by those of the first recipe's whole run; `None` unless every finished run reached it.
     pub mark_share: Option<f64>,
 }
 
-/// One training.
+/// One training run.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct Run {
-    /// Its seed.
+    /// Random seed.
     pub seed: u64,
     /// Its folder, relative to the comparison's, with forward slashes.
     pub folder: String,
-    /// Why there are no figures, one line.
+    /// Why it has no figures, one line.
     pub error: Option<String>,
     /// The figures.
     pub figures: Option<Figures>,
 }
 
-/// What a run came to.
+/// The results of a run.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct Figures {
-    /// Steps made.
+    /// Steps completed.
     pub steps: u64,
     /// Wall-clock seconds of the training loop.
     pub seconds: f64,
-    /// Processor seconds of the training loop.
+    /// CPU seconds of the training loop.
     pub cpu_seconds: f64,
-    /// Wall-clock seconds of everything.
+    /// Wall-clock seconds in total.
     pub total_seconds: f64,
     /// Gaussians at the end.
     pub splats: u64,
-    /// Numbers of the field, where that is what was made.
+    /// Number of parameters of the field, if the result is one.
     pub parameters: Option<u64>,
-    /// Bytes.
+    /// Peak memory, bytes.
     pub peak_memory: u64,
     /// dB.
     pub psnr: f64,
@@ -128,10 +128,11 @@ pub struct Figures {
     pub ssim: f64,
     /// Perceptual distance.
     pub lpips: Option<f64>,
-    /// Its network.
+    /// Network of LPIPS.
     pub lpips_net: Option<String>,
-    /// Held-out PSNR as it grew, the final one included.
-    pub looks: Vec<Look>,
+    /// Evaluations of held-out PSNR, including the final one.
+    #[serde(rename = "looks")]
+    pub evaluations: Vec<EvaluationPoint>,
     /// See [`rises`].
     pub loss_rises: Option<f64>,
     /// See [`rises`].
@@ -147,11 +148,11 @@ pub struct Spread {
     pub mean: f64,
     /// Sample standard deviation (divided by n - 1); `None` for one run.
     pub deviation: Option<f64>,
-    /// Runs.
+    /// Number of runs.
     pub runs: usize,
 }
 
-/// When a PSNR was first reached; the means are over the runs that did.
+/// When a PSNR was first reached; means over the runs that reached it.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Reached {
     /// dB.
@@ -167,23 +168,23 @@ pub struct Reached {
 pub struct Overall {
     /// As [`Entry::recipe`].
     pub recipe: String,
-    /// How many scenes that is.
+    /// Number of those scenes.
     pub scenes: usize,
-    /// Mean over the scenes of the means over seeds, dB.
+    /// Mean over scenes of the means over seeds, dB.
     pub psnr: f64,
-    /// Likewise.
+    /// Mean over scenes of the means over seeds.
     pub ssim: f64,
-    /// Likewise, where there were weights.
+    /// Likewise, if network weights are available.
     pub lpips: Option<f64>,
     /// Likewise.
     pub seconds: f64,
-    /// Likewise; `None` where the recipe makes fields.
+    /// Likewise; `None` if the recipe trains fields.
     pub splats: Option<f64>,
-    /// Likewise, where it makes fields.
+    /// Likewise, if it trains fields.
     pub parameters: Option<f64>,
-    /// On how many of the scenes all runs reach what the first recipe ends with.
+    /// Number of scenes on which all runs reach the final result of the first recipe.
     pub marks: usize,
-    /// And on how many in a third of the first recipe's time, or less.
+    /// Number of those on which they do so in at most a third of the first recipe's time.
     pub marks_in_a_third: usize,
 }
 
@@ -192,25 +193,25 @@ pub struct Overall {
 pub struct PictureRow {
     /// Name within the dataset.
     pub name: String,
-    /// The photograph, a `data:` address.
+    /// The photograph, a `data:` URL.
     pub truth: String,
-    /// What each recipe's first run shows; `None` where there is none.
+    /// The rendering of each recipe's first run; `None` if there is none.
     pub renders: Vec<Option<Render>>,
 }
 
 /// A rendering of the held-out view.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct Render {
-    /// Seed of the run.
+    /// Random seed of the run.
     pub seed: u64,
-    /// dB, of this view.
+    /// PSNR of this view, dB.
     pub psnr: f64,
-    /// A `data:` address.
+    /// A `data:` URL.
     pub picture: String,
 }
 
 impl Comparison {
-    /// Heading of LPIPS with its network, or with all where the runs do not have one in common.
+    /// Heading of LPIPS with its network, or with all networks if the runs differ.
     pub fn lpips_head(&self) -> String {
         let entries = self.scenes.iter().flat_map(|scene| &scene.entries);
         let figures = entries
@@ -227,7 +228,7 @@ impl Comparison {
 }
 
 impl Spread {
-    /// Of values that are finite; `None` where there are none.
+    /// Spread of the finite values; `None` if there are none.
     pub fn of(values: impl IntoIterator<Item = f64>) -> Option<Self> {
         let values: Vec<f64> = values.into_iter().filter(|v| v.is_finite()).collect();
         let n = values.len() as f64;
@@ -245,9 +246,9 @@ impl Spread {
 }
 
 impl Figures {
-    /// From a run's report and the mean squared errors of the training views that it logged, in order.
+    /// From a run's report and the logged mean squared errors of the training views, in order.
     pub fn of(report: &Report, errors: &[f64]) -> Self {
-        let looks = curves::looks(report);
+        let evaluations = curves::evaluations(report);
         Self {
             steps: report.steps,
             seconds: report.training_seconds,
@@ -262,20 +263,20 @@ impl Figures {
             lpips_net: report.lpips_net.clone(),
             loss_rises: rises(&report.curve.iter().map(|point| point.loss).collect::<Vec<_>>()),
             error_rises: rises(errors),
-            psnr_falls: falls(&looks),
-            looks,
+            psnr_falls: falls(&evaluations),
+            evaluations,
         }
     }
 }
 
 impl Scene {
-    /// Sums up the runs of each recipe.
+    /// Summarises the runs of each recipe.
     pub fn new(name: String, data: String, runs: Vec<(String, Vec<Run>)>, view: Option<PictureRow>) -> Self {
         let figures = |runs: &[Run]| runs.iter().filter_map(|run| run.figures.clone()).collect::<Vec<_>>();
-        let all: Vec<Vec<Look>> = runs
+        let all: Vec<Vec<EvaluationPoint>> = runs
             .iter()
             .flat_map(|(_, runs)| figures(runs))
-            .map(|f| f.looks)
+            .map(|f| f.evaluations)
             .collect();
         let levels = curves::levels(&all);
         let mark = runs.first().and_then(|(_, runs)| {
@@ -291,11 +292,14 @@ impl Scene {
                 let figures = figures(&runs);
                 let spread = |of: &dyn Fn(&Figures) -> Option<f64>| Spread::of(figures.iter().filter_map(of));
                 let times = |psnr: f64| {
-                    let [seconds, steps] =
-                        [|l: &Look| l.seconds, |l: &Look| l.step as f64].map(|axis: fn(&Look) -> f64| {
-                            Spread::of(figures.iter().filter_map(|f| reached(&f.looks, psnr, axis)))
-                        });
-                    Reached { psnr, seconds, steps }
+                    let at = |axis: fn(&EvaluationPoint) -> f64| {
+                        Spread::of(figures.iter().filter_map(|f| reached(&f.evaluations, psnr, axis)))
+                    };
+                    Reached {
+                        psnr,
+                        seconds: at(|point| point.seconds),
+                        steps: at(|point| point.step as f64),
+                    }
                 };
                 let to_mark = mark.map(|mark| times(mark.psnr));
                 let mark_share = mark.zip(to_mark.as_ref()).and_then(|(mark, reached)| {
@@ -332,7 +336,7 @@ impl Scene {
     }
 }
 
-/// The recipes' means over the scenes on which all of them have figures; empty where there is no such scene.
+/// The recipes' means over the scenes on which all of them have figures; empty if there is no such scene.
 pub fn overall(scenes: &[Scene]) -> Vec<Overall> {
     let whole: Vec<&Scene> = scenes
         .iter()
@@ -349,7 +353,7 @@ pub fn overall(scenes: &[Scene]) -> Vec<Overall> {
                     .collect()
             };
             let mean = |values: Vec<f64>| values.iter().sum::<f64>() / values.len() as f64;
-            // Where every scene has one.
+            // If every scene has one.
             let all = |values: Vec<f64>| (values.len() == whole.len()).then(|| mean(values));
             let shares = || whole.iter().filter_map(|scene| scene.entries[i].mark_share);
             Overall {

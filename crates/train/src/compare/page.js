@@ -38,7 +38,7 @@
   const nets = [...new Set(runs.map((run) => run.figures && run.figures.lpips_net).filter(Boolean))].sort();
   const lpips = nets.length ? `LPIPS (${nets.join(", ")})` : "LPIPS";
 
-  // Mean and spread; the best mean of a column is set in bold where more than one recipe has one.
+  // Mean and spread; the best mean of a column is bold if more than one recipe has one.
   const MEASURES = [
     ["PSNR, dB", "psnr", (x) => fixed(x, 2), 1],
     ["SSIM", "ssim", (x) => fixed(x, 4), 1],
@@ -77,7 +77,7 @@
     return table(["Recipe", ...shown.map(([head]) => head), "Runs"], [...lines, ...failed], { class: "dense" });
   };
 
-  // Every run is a thin line in its recipe's colour, by steps or by seconds.
+  // Every run is a thin line in its recipe's colour, over steps or seconds.
   const curves = (entries, axis, title) =>
     chart(title, entries.flatMap((entry, i) =>
       entry.runs.filter((run) => run.figures).map((run) => ({
@@ -101,7 +101,7 @@
     return table(["Recipe", ...levels.map((i) => entries[0].reached[i].psnr.toFixed(1))], lines, { class: "dense" });
   };
 
-  // When each recipe reaches what the first one ends with, and that over the first one's whole time.
+  // When each recipe reaches the first one's final PSNR, also as a fraction of the first one's whole time.
   const toMark = (entries) => {
     const lines = entries.map((entry, i) => {
       const finished = entry.runs.filter((run) => run.figures).length;
@@ -165,22 +165,22 @@
       "In a third of its time"], lines));
     at("overall-note").textContent =
       `Means over the ${comparison.overall[0].scenes} scenes on which every recipe has figures, of the means over seeds. ` +
-      "Reaches the first: scenes on which all runs get to the PSNR that the first recipe ends with.";
+      "Reaches the first: scenes on which all runs reach the first recipe's final PSNR.";
   }
   for (const scene of comparison.scenes) {
     const section = make("section", undefined, { class: "scene" });
     const part = (title, ...content) => section.append(make("h3", title, { class: "part" }), ...content);
     section.append(make("h2", scene.name), make("p", scene.data, { class: "soft" }));
     section.append(scrolled(figures(scene.entries)));
-    section.append(make("p", "Mean ± sample standard deviation over seeds. Loss rises: share of blocks of 25 logged steps (of fewer " +
-      "in short runs) whose mean training loss is above that of the block before. Error rises: likewise of the mean squared error of the " +
-      "training views, the same measure for all recipes. PSNR falls: share of looks at the held-out " +
-      "views that saw less than the look before.", { class: "note" }));
+    section.append(make("p", "Mean ± sample standard deviation over seeds. Loss rises: fraction of blocks of 25 logged steps (of fewer " +
+      "in short runs) whose mean training loss is above that of the previous block. Error rises: the same for the mean squared error of the " +
+      "training views, which is comparable between recipes. PSNR falls: fraction of evaluations of the held-out " +
+      "views with a lower PSNR than the previous one.", { class: "note" }));
     if (scene.entries.some((entry) => entry.psnr)) {
       const both = make("div", undefined, { class: "two" });
       both.append(curves(scene.entries, "seconds", "Held-out PSNR over seconds of training"),
         curves(scene.entries, "step", "Held-out PSNR over steps"));
-      part("How they went", both);
+      part("Curves", both);
       if (scene.mark) {
         part(`Until a recipe reaches what ${scene.entries[0].recipe} ends with: ${fixed(scene.mark.psnr, 2)} dB, ` +
           `after ${fixed(scene.mark.seconds, 1)} s`, scrolled(toMark(scene.entries)));

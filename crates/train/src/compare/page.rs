@@ -1,5 +1,5 @@
-//! The comparison as one page: style, script, data and pictures are inside it, so that it opens from disk with no network
-//! and can be handed on by itself.
+//! The comparison as one page: style, script, data and pictures are embedded, so that it opens from disk without a network and
+//! can be shared as one file.
 
 use super::Comparison;
 use crate::report::filled;
@@ -8,12 +8,12 @@ const PAGE: &str = include_str!("page.html");
 const STYLE: &str = include_str!("page.css");
 const SCRIPT: &str = include_str!("page.js");
 
-/// The page; all text reaches it as data that the script sets as text, never as markup.
+/// The page; all text is embedded as data that the script sets as text, never as markup.
 pub fn to_html(comparison: &Comparison) -> String {
     filled(PAGE, STYLE, SCRIPT, comparison)
 }
 
-/// The bytes of a JPEG file as an address that holds them.
+/// A JPEG file as a `data:` URL.
 pub fn picture(jpeg: &[u8]) -> String {
     format!("data:image/jpeg;base64,{}", base64(jpeg))
 }
@@ -27,7 +27,7 @@ fn base64(bytes: &[u8]) -> String {
         let bits = byte(0) << 16 | byte(1) << 8 | byte(2);
         for digit in 0..4 {
             let value = bits >> (18 - 6 * digit) & 63;
-            // n bytes take n + 1 digits; the rest of the four is filled up.
+            // n bytes take n + 1 digits; the rest of the four is padding.
             let used = digit <= three.len();
             text.push(if used { char::from(DIGITS[value as usize]) } else { '=' });
         }
@@ -40,7 +40,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn base64_has_the_standards_own_examples() {
+    fn base64_matches_the_examples_of_the_standard() {
         let examples = [
             ("", ""),
             ("f", "Zg=="),

@@ -22,7 +22,7 @@ fn heads(comparison: &Comparison) -> Vec<String> {
     heads.map(str::to_owned).to_vec()
 }
 
-/// The table with aligned columns; errors and what the figures mean stand below it.
+/// The table with aligned columns; errors and explanations follow it.
 pub fn to_text(comparison: &Comparison) -> String {
     let mut text = columns(&[vec![heads(comparison)], rows(comparison)].concat(), 2);
     if let Some(lines) = marks(comparison) {
@@ -35,10 +35,10 @@ pub fn to_text(comparison: &Comparison) -> String {
 }
 
 /// What [`marks`] shows.
-const MARKS: &str = "Seconds of training until a recipe reaches what the first one ends with; in brackets, over the seconds of \
+const MARKS: &str = "Seconds of training until a recipe reaches the first one's final PSNR; in brackets, divided by the seconds of \
                      the first one's whole run";
 
-/// A row a scene and a column a recipe, below their heads; `None` where there is nothing to show.
+/// One row per scene and one column per recipe, below their headings; `None` if there is nothing to show.
 fn marks(comparison: &Comparison) -> Option<Vec<Vec<String>>> {
     let first = comparison.scenes.first()?;
     let name = &first.entries.first()?.recipe;
@@ -63,7 +63,7 @@ fn marks(comparison: &Comparison) -> Option<Vec<Vec<String>>> {
     (lines.len() > 1).then_some(lines)
 }
 
-/// The tables for a page of results: one of figures, one of the times to each whole dB.
+/// The tables for a results page: one of figures, one of the times to each whole dB.
 pub fn to_markdown(comparison: &Comparison) -> String {
     let mut text = format!("{}. {}.\n\n", comparison.conditions.join(", "), comparison.device);
     text += &markdown(&[vec![heads(comparison)], rows(comparison)].concat(), 2);
@@ -71,9 +71,9 @@ pub fn to_markdown(comparison: &Comparison) -> String {
     for line in errors(comparison) {
         text += &format!("- failed: {}\n", escaped(&line));
     }
-    text += "Mean ± sample standard deviation over seeds. *Loss rises*: share of blocks of 25 logged steps (of fewer in \
-             short runs) whose mean training loss is above that of the block before; *error rises*: likewise of the mean \
-             squared error of the training views, which is the same measure for all recipes.\n";
+    text += "Mean ± sample standard deviation over seeds. *Loss rises*: fraction of blocks of 25 logged steps (of fewer in \
+             short runs) whose mean training loss is above that of the previous block; *error rises*: the same for the mean \
+             squared error of the training views, which is comparable between recipes.\n";
     if let Some(lines) = marks(comparison) {
         text += &format!("\n{MARKS}:\n\n{}", markdown(&lines, 1));
     }
@@ -100,7 +100,7 @@ pub fn to_markdown(comparison: &Comparison) -> String {
     text
 }
 
-/// Mean seconds to a level, and how many of the runs got there where not all did.
+/// Mean seconds to a level, and the number of runs that reached it, if not all.
 fn time(entry: &Entry, level: Option<&Reached>) -> String {
     let finished = entry.runs.iter().filter(|run| run.figures.is_some()).count();
     match level.and_then(|reached| reached.seconds) {
@@ -154,7 +154,7 @@ fn rows(comparison: &Comparison) -> Vec<Vec<String>> {
     rows
 }
 
-/// Splats, or the parameters of a field.
+/// Number of splats, or of parameters of a field.
 fn size(entry: &Entry) -> String {
     let parameters = entry.parameters.map(|spread| of_field(spread.mean));
     parameters.unwrap_or_else(|| number(entry.splats, 0, 1.0))
@@ -164,7 +164,7 @@ fn of_field(parameters: f64) -> String {
     format!("{parameters:.0} parameters")
 }
 
-/// `scene, recipe, seed: error` of every run that failed.
+/// `scene, recipe, seed: error` of every failed run.
 fn errors(comparison: &Comparison) -> Vec<String> {
     let mut lines = Vec::new();
     for scene in &comparison.scenes {
@@ -186,7 +186,7 @@ fn number(spread: Option<Spread>, digits: usize, unit: f64) -> String {
         .map_or(mean.clone(), |d| format!("{mean} ± {:.digits$}", d * unit))
 }
 
-/// A table whose first line holds the heads and whose first `left` columns are text.
+/// A table whose first line is the header and whose first `left` columns are text.
 fn markdown(lines: &[Vec<String>], left: usize) -> String {
     let mut text = String::new();
     for (number, cells) in lines.iter().enumerate() {
@@ -203,7 +203,7 @@ fn markdown_row(cells: &[String]) -> String {
     format!("| {} |\n", cells.join(" | "))
 }
 
-/// Text that stays text within a table.
+/// Escapes text for a Markdown table.
 fn escaped(text: &str) -> String {
     text.replace('|', "\\|").replace(['\n', '\r'], " ")
 }

@@ -87,24 +87,24 @@ fn spreads_are_means_with_sample_deviations() {
 }
 
 #[test]
-fn a_level_is_reached_on_the_line_between_two_looks() {
-    let look = |step, seconds, psnr| Look { step, seconds, psnr };
-    let looks = [
-        look(10, 1.0, 20.0),
-        look(20, 3.0, 24.0),
-        look(30, 5.0, 22.0),
-        look(40, 9.0, 25.0),
+fn levels_are_interpolated_between_evaluations() {
+    let point = |step, seconds, psnr| EvaluationPoint { step, seconds, psnr };
+    let evaluations = [
+        point(10, 1.0, 20.0),
+        point(20, 3.0, 24.0),
+        point(30, 5.0, 22.0),
+        point(40, 9.0, 25.0),
     ];
-    let seconds = |psnr| reached(&looks, psnr, |l| l.seconds);
+    let seconds = |psnr| reached(&evaluations, psnr, |l| l.seconds);
     assert_eq!(seconds(21.0), Some(1.5));
     assert_eq!(seconds(24.0), Some(3.0));
-    // Only the first time counts, and the fall in between is a detour.
+    // Only the first time counts; the fall in between is ignored.
     assert_eq!(seconds(25.0), Some(9.0));
-    assert_eq!(seconds(19.0), Some(1.0), "no later than the first look");
+    assert_eq!(seconds(19.0), Some(1.0), "no later than the first evaluation");
     assert_eq!(seconds(25.1), None);
-    assert_eq!(reached(&looks, 22.0, |l| l.step as f64), Some(15.0));
-    assert_eq!(falls(&looks), Some(1.0 / 3.0));
-    assert_eq!(falls(&looks[..1]), None);
+    assert_eq!(reached(&evaluations, 22.0, |l| l.step as f64), Some(15.0));
+    assert_eq!(falls(&evaluations), Some(1.0 / 3.0));
+    assert_eq!(falls(&evaluations[..1]), None);
 }
 
 #[test]
@@ -113,7 +113,7 @@ fn rises_are_counted_between_blocks() {
     assert_eq!(rises(&falling), Some(0.0));
     let rising: Vec<f64> = falling.iter().rev().copied().collect();
     assert_eq!(rises(&rising), Some(1.0));
-    // Up and down from step to step, but falling over ten.
+    // Alternating from step to step, but falling over ten.
     let noisy: Vec<f64> = (0..100)
         .map(|i| 10.0 - 0.05 * f64::from(i) + f64::from(i % 2))
         .collect();
@@ -123,7 +123,7 @@ fn rises_are_counted_between_blocks() {
 }
 
 #[test]
-fn a_scene_sums_up_its_runs_without_those_that_failed() {
+fn a_scene_summarises_its_runs_without_failed_ones() {
     let scene = room();
     let [classic, fast] = &scene.entries[..] else {
         panic!("two recipes")
@@ -135,11 +135,11 @@ fn a_scene_sums_up_its_runs_without_those_that_failed() {
     let levels: Vec<f64> = fast.reached.iter().map(|r| r.psnr).collect();
     assert_eq!(levels, [23.5, 24.0, 24.5, 25.0, 25.5, 26.0, 26.5, 27.0]);
     let at = |entry: &Entry, psnr: f64| entry.reached.iter().find(|r| r.psnr == psnr).unwrap().seconds;
-    // The final look is that of the report, not the one at the same step before it.
-    assert_eq!(classic.runs[0].figures.as_ref().unwrap().looks.len(), 2);
+    // The final evaluation is that of the report and replaces the one at the same step.
+    assert_eq!(classic.runs[0].figures.as_ref().unwrap().evaluations.len(), 2);
     assert_eq!(at(fast, 25.5).unwrap().mean, 4.0);
     assert_eq!(at(fast, 26.0), None);
-    // 25 dB: at 7.5 s by one run; at 6 s, its first look, by the other.
+    // 25 dB: at 7.5 s by one run; at 6 s, its first evaluation, by the other.
     assert_eq!(at(classic, 25.0).unwrap().mean, 6.75);
     assert_eq!(at(classic, 26.5).map(|s| s.runs), Some(1));
     assert_eq!(
@@ -152,7 +152,7 @@ fn a_scene_sums_up_its_runs_without_those_that_failed() {
 }
 
 #[test]
-fn the_mark_is_what_the_first_recipe_ends_with() {
+fn the_mark_is_the_final_result_of_the_first_recipe() {
     let runs = vec![
         ("classic".to_owned(), vec![run(0, Some(report(12.0, 26.0)))]),
         (
@@ -169,13 +169,13 @@ fn the_mark_is_what_the_first_recipe_ends_with() {
         panic!("three recipes")
     };
     assert_eq!(classic.mark_share, Some(1.0));
-    // At 3 s, half way from 25 to 27 dB, by one run; at its end by the other.
+    // At 3 s, half-way from 25 to 27 dB, by one run; at its end by the other.
     assert_eq!(fast.to_mark.as_ref().unwrap().seconds.unwrap().mean, 3.5);
     assert_eq!(fast.mark_share, Some(3.5 / 12.0));
     assert_eq!(slow.to_mark.as_ref().unwrap().seconds.unwrap().runs, 1);
     assert_eq!(
         slow.mark_share, None,
-        "a run that never gets there is not left out of a mean"
+        "a run that never reaches it is not excluded from a mean"
     );
     let means = overall(std::slice::from_ref(&scene));
     let marks: Vec<_> = means.iter().map(|o| (o.marks, o.marks_in_a_third)).collect();
@@ -189,7 +189,7 @@ fn the_mark_is_what_the_first_recipe_ends_with() {
 }
 
 #[test]
-fn the_mean_over_scenes_takes_only_scenes_that_all_have() {
+fn the_mean_over_scenes_covers_only_scenes_with_figures_of_all_recipes() {
     let mut half = room();
     half.entries[1].psnr = None;
     assert!(overall(&[half.clone()]).is_empty());
@@ -233,7 +233,7 @@ fn tables_show_spreads_and_failures() {
 }
 
 #[test]
-fn the_page_stands_by_itself_and_hostile_text_stays_data() {
+fn the_page_is_self_contained_and_hostile_text_stays_data() {
     let mut comparison = comparison();
     comparison.scenes[0].name = "</script><script>alert(1)</script>".into();
     let html = to_html(&comparison);

@@ -1,11 +1,11 @@
-//! Switches that take one ingredient out of a curriculum, so that its share in the outcome can be measured.
+//! Switches that remove one ingredient from a curriculum, so that its contribution can be measured.
 
 use super::keys::documented;
 use super::{Group, Param, Recipe};
 use serde::{Deserialize, Serialize};
 
 documented! {
-    /// Which ingredients of a curriculum are in force; all when nothing is said.
+    /// Which ingredients of a curriculum are active; all by default.
     #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
     #[serde(deny_unknown_fields)]
     pub struct Ingredients {
@@ -15,10 +15,10 @@ documented! {
         /// Images and the number of splats grow (`image_scale`, `count_share`).
         #[serde(default = "on")]
         pub data_schedule: bool,
-        /// Losses change from stage to stage; the last stage's hold throughout otherwise.
+        /// Losses change from stage to stage; otherwise the last stage's hold throughout.
         #[serde(default = "on")]
         pub loss_schedule: bool,
-        /// Stages end when they have done their work (`exit`).
+        /// Stages end early when their exit rule holds (`exit`).
         #[serde(default = "on")]
         pub adaptive_transitions: bool,
     }
@@ -40,21 +40,21 @@ impl Default for Ingredients {
 }
 
 impl Ingredients {
-    /// Whether nothing is switched off.
+    /// Whether all are active.
     pub fn are_all(&self) -> bool {
         *self == Self::default()
     }
 
-    /// Takes out of `recipe` what is switched off.
+    /// Removes the inactive ingredients from `recipe`.
     pub(super) fn apply(self, recipe: &mut Recipe) {
         if !self.parameter_groups {
-            forget(recipe, |param| param == Param::TrainedShare);
+            remove(recipe, |param| param == Param::TrainedShare);
         }
         if !self.data_schedule {
-            forget(recipe, |param| param.row().group == Group::Data);
+            remove(recipe, |param| param.row().group == Group::Data);
         }
         if !self.loss_schedule {
-            // A knob that the last stage does not name holds from the last stage that does.
+            // A parameter that the last stage does not set holds from the last stage that does.
             for param in Param::ALL.into_iter().filter(|param| param.is_of_loss()) {
                 let last = recipe
                     .stage
@@ -62,7 +62,7 @@ impl Ingredients {
                     .rev()
                     .find_map(|stage| stage.params.get(&param).cloned());
                 if let Some(knob) = last {
-                    forget(recipe, |other| other == param);
+                    remove(recipe, |other| other == param);
                     recipe.params.insert(param, knob);
                 }
             }
@@ -75,10 +75,10 @@ impl Ingredients {
     }
 }
 
-fn forget(recipe: &mut Recipe, forgotten: impl Fn(Param) -> bool) {
+fn remove(recipe: &mut Recipe, removed: impl Fn(Param) -> bool) {
     let stages = recipe.stage.iter_mut().map(|stage| &mut stage.params);
     for knobs in stages.chain([&mut recipe.params]) {
-        knobs.retain(|param, _| !forgotten(*param));
+        knobs.retain(|param, _| !removed(*param));
     }
 }
 
@@ -87,7 +87,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn each_switch_takes_out_its_ingredient_and_no_other() {
+    fn each_switch_removes_its_ingredient_and_no_other() {
         let text = Recipe::built_in("curriculum").unwrap();
         let whole = Recipe::parse("curriculum", text, &[]).unwrap();
         let without = |name: &str| Recipe::parse("curriculum", text, &[format!("ingredients.{name}=false")]).unwrap();
@@ -117,7 +117,7 @@ mod tests {
         assert_eq!(
             again,
             without("data_schedule"),
-            "what a run writes down is read as the same"
+            "a resolved recipe parses to the same recipe"
         );
     }
 }

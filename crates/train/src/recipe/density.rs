@@ -1,4 +1,4 @@
-//! How a stage adds, removes and merges splats: the knobs of each strategy, with sizes in units of the scene's extent.
+//! How a stage adds, removes and merges splats: the parameters of each strategy, with sizes in units of the scene's extent.
 
 use super::keys::documented;
 use irradia_splat::Statistics;
@@ -12,74 +12,74 @@ use serde::{Deserialize, Serialize};
 /// A strategy.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "strategy", rename_all = "snake_case")]
-pub enum Density {
+pub enum DensityControl {
     /// Clone, split, prune and reset, as in 3DGS; also AbsGS's variant of it.
     Classic(ClassicKnobs),
     /// Relocation and growth by opacity, as in 3DGS-MCMC.
     Mcmc(McmcKnobs),
     /// Growth to an exact number by score, as in Taming 3DGS.
     Taming(TamingKnobs),
-    /// Splits where the pictures are wrong, to a planned number.
+    /// Splits by image error, to a planned number.
     Fast(FastKnobs),
 }
 
-impl Density {
+impl DensityControl {
     /// Steps (of the run, not stretched) between rounds.
     pub fn every(&self) -> u64 {
         match self {
-            Density::Classic(knobs) => knobs.every,
-            Density::Mcmc(knobs) => knobs.every,
-            Density::Taming(knobs) => knobs.every,
-            Density::Fast(knobs) => knobs.every,
+            DensityControl::Classic(knobs) => knobs.every,
+            DensityControl::Mcmc(knobs) => knobs.every,
+            DensityControl::Taming(knobs) => knobs.every,
+            DensityControl::Fast(knobs) => knobs.every,
         }
     }
 
-    /// Steps (of the run, not stretched) between resets of the opacities and what they are lowered to.
+    /// Steps (of the run, not stretched) between resets of the opacities and the value to which they are reset.
     pub fn reset(&self) -> Option<(u64, f32)> {
         match self {
-            Density::Classic(knobs) => (knobs.reset_every > 0).then_some((knobs.reset_every, knobs.reset_to)),
-            Density::Taming(knobs) => (knobs.reset_every > 0).then_some((knobs.reset_every, knobs.reset_to)),
-            Density::Mcmc(_) | Density::Fast(_) => None,
+            DensityControl::Classic(knobs) => (knobs.reset_every > 0).then_some((knobs.reset_every, knobs.reset_to)),
+            DensityControl::Taming(knobs) => (knobs.reset_every > 0).then_some((knobs.reset_every, knobs.reset_to)),
+            DensityControl::Mcmc(_) | DensityControl::Fast(_) => None,
         }
     }
 
-    /// Whether its statistics begin in the stage before, as those of the 3DGS code begin with the run and not with
+    /// Whether its statistics are gathered from the stage before, like those of the 3DGS code, which begin with the run and not with
     /// `densify_from_iter`.
-    pub fn gathers_ahead(&self) -> bool {
+    pub fn gathers_early(&self) -> bool {
         match self {
-            Density::Classic(_) | Density::Taming(_) => true,
-            Density::Mcmc(_) | Density::Fast(_) => false,
+            DensityControl::Classic(_) | DensityControl::Taming(_) => true,
+            DensityControl::Mcmc(_) | DensityControl::Fast(_) => false,
         }
     }
 
-    /// Share of the cap that a run may fill in which `pace` recipe steps go by in one step.
-    pub fn limit_share(&self, pace: f64) -> f64 {
+    /// Fraction of the cap available to a run with `pace` recipe steps per step.
+    pub fn limit_fraction(&self, pace: f64) -> f64 {
         match self {
-            Density::Fast(_) => pace.max(1.0).powf(-0.5),
-            Density::Classic(_) | Density::Mcmc(_) | Density::Taming(_) => 1.0,
+            DensityControl::Fast(_) => pace.max(1.0).powf(-0.5),
+            DensityControl::Classic(_) | DensityControl::Mcmc(_) | DensityControl::Taming(_) => 1.0,
         }
     }
 
-    /// Share of the photograph's edges in the error that is gathered for it.
+    /// Weight of the photograph's edges in the gathered error.
     pub fn edge_share(&self) -> f32 {
         match self {
-            Density::Taming(knobs) => knobs.edge_share,
-            Density::Classic(_) | Density::Mcmc(_) | Density::Fast(_) => 0.0,
+            DensityControl::Taming(knobs) => knobs.edge_share,
+            DensityControl::Classic(_) | DensityControl::Mcmc(_) | DensityControl::Fast(_) => 0.0,
         }
     }
 
-    /// What has to be gathered for it.
+    /// The statistics that it needs.
     pub fn statistics(&self) -> Statistics {
         match self {
-            Density::Classic(knobs) if knobs.absolute => Statistics::AbsoluteGradient,
-            Density::Classic(_) | Density::Mcmc(_) => Statistics::Gradient,
-            Density::Taming(_) | Density::Fast(_) => Statistics::Error,
+            DensityControl::Classic(knobs) if knobs.absolute => Statistics::AbsoluteGradient,
+            DensityControl::Classic(_) | DensityControl::Mcmc(_) => Statistics::Gradient,
+            DensityControl::Taming(_) | DensityControl::Fast(_) => Statistics::Error,
         }
     }
 }
 
 documented! {
-    /// Knobs of [`irradia_splat::densify::classic`].
+    /// Parameters of [`irradia_splat::densify::classic`].
     #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
     #[serde(deny_unknown_fields)]
     pub struct ClassicKnobs {
@@ -87,27 +87,27 @@ documented! {
         pub every: u64,
         /// Mean screen gradient, normalised device coordinates, from which a splat is densified.
         pub gradient_threshold: f32,
-        /// Whether the gradients of a splat's fragments are added absolutely (AbsGS).
+        /// Whether the gradients of a splat's fragments are summed as absolute values (AbsGS).
         #[serde(default)]
         pub absolute: bool,
-        /// Whether clones share the opacity of what they copy.
+        /// Whether both splats of a clone get a reduced opacity.
         #[serde(default)]
         pub revised_opacity: bool,
-        /// Size that divides what is cloned from what is split, in units of the scene's extent.
+        /// Size that separates splats to clone from splats to split, in units of the scene's extent.
         pub small: f32,
         /// Opacity below which a splat is removed.
         pub min_opacity: f32,
-        /// World size above which a splat is removed, in units of the scene's extent, once opacities were reset.
+        /// World size above which a splat is removed, in units of the scene's extent, once opacities have been reset.
         pub max_scale: f32,
         /// Steps (of the run, not stretched) between resets of the opacities; 0 for never.
         pub reset_every: u64,
-        /// Opacity that a reset leaves at most.
+        /// Maximum opacity after a reset.
         pub reset_to: f32,
     }
 }
 
 impl ClassicKnobs {
-    /// With sizes in world units.
+    /// Options with sizes in world units.
     pub fn options(&self, extent: f32, prune_large: bool, max_splats: usize) -> ClassicOptions {
         ClassicOptions {
             gradient_threshold: self.gradient_threshold,
@@ -121,21 +121,21 @@ impl ClassicKnobs {
 }
 
 documented! {
-    /// Knobs of [`irradia_splat::densify::mcmc`].
+    /// Parameters of [`irradia_splat::densify::mcmc`].
     #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
     #[serde(deny_unknown_fields)]
     pub struct McmcKnobs {
         /// Steps (of the run, not stretched) between rounds, at least 1.
         pub every: u64,
-        /// Factor on the number of splats in `every` recipe steps.
+        /// Growth factor of the number of splats in `every` recipe steps.
         pub growth: f32,
-        /// Opacity from which down a splat is dead.
+        /// Opacity up to which a splat is dead.
         pub min_opacity: f32,
     }
 }
 
 impl McmcKnobs {
-    /// For a run in which `pace` recipe steps go by in one step.
+    /// Options for a run with `pace` recipe steps per step.
     pub fn options(&self, pace: f64, max_splats: usize) -> McmcOptions {
         McmcOptions {
             min_opacity: self.min_opacity,
@@ -146,7 +146,7 @@ impl McmcKnobs {
 }
 
 documented! {
-    /// Knobs of [`irradia_splat::densify::taming`].
+    /// Parameters of [`irradia_splat::densify::taming`].
     #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
     #[serde(deny_unknown_fields)]
     pub struct TamingKnobs {
@@ -154,23 +154,23 @@ documented! {
         pub every: u64,
         /// Mean screen gradient, normalised device coordinates, from which a splat may be densified.
         pub gradient_threshold: f32,
-        /// Size that divides what is cloned from what is split, in units of the scene's extent.
+        /// Size that separates splats to clone from splats to split, in units of the scene's extent.
         pub small: f32,
         /// Opacity below which a splat may be removed.
         pub min_opacity: f32,
-        /// World size above which a splat may be removed, in units of the scene's extent, once opacities were reset.
+        /// World size above which a splat may be removed, in units of the scene's extent, once opacities have been reset.
         pub max_scale: f32,
-        /// Rounds, from the stage's first, that remove splats.
+        /// Number of rounds, from the stage's first, that remove splats.
         pub prune_rounds: u64,
         /// Steps (of the run, not stretched) between resets of the opacities; 0 for never.
         pub reset_every: u64,
-        /// Opacity that a reset leaves at most.
+        /// Maximum opacity after a reset.
         pub reset_to: f32,
-        /// Share of the photograph's edges in the error that pixels give to the score, 0 to 1; the rest is the absolute difference.
+        /// Weight of the photograph's edges in the error of a pixel for the score, 0 to 1; the rest is the absolute difference.
         pub edge_share: f32,
         /// Weight of the mean screen gradient in the score.
         pub score_gradient: f32,
-        /// Weight of the mean error shown in the score.
+        /// Weight of the mean error in the score.
         pub score_error: f32,
         /// Weight of the mean blending weight in the score.
         pub score_weight: f32,
@@ -184,7 +184,7 @@ documented! {
 }
 
 impl TamingKnobs {
-    /// With sizes in world units, for round number `round` of the stage, from 1.
+    /// Options with sizes in world units, for round `round` of the stage, from 1.
     pub fn options(&self, extent: f32, prune_large: bool, round: u64, target: usize) -> TamingOptions {
         TamingOptions {
             target,
@@ -206,8 +206,8 @@ impl TamingKnobs {
 }
 
 documented! {
-    /// Knobs of [`irradia_splat::densify::fast`], for a run of as many steps as the recipe has. A run of a quarter of them has
-    /// less to give to each splat: it may fill half the cap, and what it cuts shows four times the error.
+    /// Parameters of [`irradia_splat::densify::fast`], for a run of as many steps as the recipe has. A run of a quarter of them can
+    /// train fewer splats: it may use half the cap, and splits from four times the error.
     #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
     #[serde(deny_unknown_fields)]
     pub struct FastKnobs {
@@ -215,17 +215,17 @@ documented! {
         pub every: u64,
         /// Opacity below which a splat is removed.
         pub min_opacity: f32,
-        /// Mean weight a frame, in pixels, below which a splat is removed.
+        /// Mean weight per frame, in pixels, below which a splat is removed.
         pub min_weight: f32,
-        /// Mean error a frame, mean absolute colour difference times pixels, from which a splat is cut in two.
+        /// Mean error per frame, mean absolute colour difference times pixels, from which a splat is split.
         pub error_threshold: f32,
-        /// Half size on screen in pixels from which a splat is worth cutting.
+        /// Half size on screen, pixels, from which a splat is worth splitting.
         pub min_extent: f32,
     }
 }
 
 impl FastKnobs {
-    /// For at most `target` splats after the round, in a run in which `pace` recipe steps go by in one step.
+    /// Options for at most `target` splats after the round, in a run with `pace` recipe steps per step.
     pub fn options(&self, pace: f64, target: usize) -> FastOptions {
         FastOptions {
             target,
@@ -238,21 +238,21 @@ impl FastKnobs {
 }
 
 documented! {
-    /// When and what a stage merges ([`irradia_splat::densify::merge`]).
+    /// Parameters of merging in a stage ([`irradia_splat::densify::merge`]).
     #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
     #[serde(deny_unknown_fields)]
     pub struct MergeKnobs {
         /// Steps (of the run, not stretched) between rounds, at least 1.
         pub every: u64,
-        /// Largest distance of splats that are merged, in units of the smaller one's median axis.
+        /// Maximum distance of splats to merge, in units of the smaller one's median axis.
         pub distance: f32,
-        /// Largest difference of splats that are merged, in any channel of the base colour.
+        /// Maximum difference of splats to merge, in any channel of the base colour.
         pub color: f32,
     }
 }
 
 impl MergeKnobs {
-    /// As the strategy takes it.
+    /// The strategy's options.
     pub fn options(&self) -> MergeOptions {
         MergeOptions {
             distance: self.distance,

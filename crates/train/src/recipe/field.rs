@@ -1,4 +1,4 @@
-//! The knobs of a radiance field.
+//! The parameters of a radiance field.
 
 use super::keys::documented;
 use irradia_field::net::NetShape;
@@ -10,43 +10,43 @@ documented! {
     #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
     #[serde(deny_unknown_fields)]
     pub struct FieldKnobs {
-        /// Where it lives: `auto`, `bounded`, `unbounded` or `ndc`.
+        /// The space of the field: `auto`, `bounded`, `unbounded` or `ndc`.
         #[serde(default)]
         pub space: FieldSpace,
-        /// Samples of a step: the number of rays follows from it.
+        /// Samples per step: the number of rays follows from it.
         pub samples: usize,
         /// Decay of Adam's second moment.
         pub beta2: f32,
-        /// Splats that a later stage of splats begins with at most; 0 without such a stage.
+        /// Maximum number of splats on its surfaces, with which a later stage of splats begins; 0 without such a stage.
         #[serde(default)]
         pub points: usize,
-        /// Degree in direction, 0 to 3, of a background that is learnt with the field, for photographs without alpha; absent: what
-        /// lies behind is fixed or random.
+        /// Degree in direction, 0 to 3, of a background learnt with the field, for photographs without alpha; absent: the background
+        /// is constant or random.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         pub background_degree: Option<u32>,
-        /// Takes the place of the networks' `density_bias` where photographs have no alpha: there is something in each of their
-        /// pixels, and a field that begins dense enough to hide what lies behind learns at once; absent: as it is.
+        /// Replaces the networks' `density_bias` if photographs have no alpha: each pixel shows a surface, and a field that is dense
+        /// enough initially to hide the background learns at once; absent: `density_bias` is used.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         pub opaque_density_bias: Option<f32>,
-        /// The network that gives out colour: `encoding`, `width`, `depth`, `skip`, `geometry`, `activation`, `density_bias`, `color`;
+        /// The network that outputs colour: `encoding`, `width`, `depth`, `skip`, `geometry`, `activation`, `density_bias`, `color`;
         /// see `NetShape` of the crate `irradia-field`.
         pub net: NetShape,
-        /// Where along a ray samples lie: `kind` is `occupancy`, `hierarchy` or `proposal`; see `Sampler` of the crate `irradia-field`.
+        /// How samples are placed along a ray: `kind` is `occupancy`, `hierarchy` or `proposal`; see `Sampler` of the crate `irradia-field`.
         pub sampler: Sampler,
     }
 }
 
 documented! {
-    /// A small field that adds a view-dependent colour to splats: reflections that harmonics cannot hold.
+    /// A small field that adds a view-dependent colour to splats: reflections that harmonics cannot represent.
     #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
     #[serde(deny_unknown_fields)]
     pub struct ResidualKnobs {
         /// Decay of Adam's second moment.
         pub beta2: f32,
-        /// Whether it is asked by the direction that a mirror would show, across the splat's shortest axis, and not by that of
-        /// view (Ref-NeRF, Verbin et al. 2022): what surroundings a place reflects then depends little on the place.
+        /// Whether it is queried by the viewing direction reflected across the splat's shortest axis instead of the viewing direction
+        /// (Ref-NeRF, Verbin et al. 2022): the reflected surroundings then depend little on the position.
         pub mirrored: bool,
-        /// Its network, as `field.net`, of which the density is not used.
+        /// Its network, as `field.net`; its density is unused.
         pub net: NetShape,
     }
 }
@@ -54,22 +54,21 @@ documented! {
 impl ResidualKnobs {
     pub(super) fn validate(&self) -> Result<(), String> {
         if !(0.0..1.0).contains(&self.beta2) {
-            return Err("residual.beta2 must lie between 0 and 1".into());
+            return Err("residual.beta2 must be between 0 and 1".into());
         }
         let checked = FieldConfig::residual(self.net, self.mirrored).check();
         checked.map_err(|error| format!("residual: {error}"))
     }
 }
 
-/// Where a field lives.
+/// The space of a field.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum FieldSpace {
-    /// `ndc` where every view names its depth bounds (LLFF captures), `bounded` where every photograph has alpha,
-    /// `unbounded` elsewhere.
+    /// `ndc` if every view has depth bounds (LLFF captures), `bounded` if every photograph has alpha, `unbounded` otherwise.
     #[default]
     Auto,
-    /// The cube that the cameras look at.
+    /// The cube on which the cameras focus.
     Bounded,
     /// That cube, and the rest of the world contracted around it (mip-NeRF 360).
     Unbounded,
@@ -78,8 +77,8 @@ pub enum FieldSpace {
 }
 
 impl FieldKnobs {
-    /// For `images` photographs in `space`: steps grow with distance only where space is unbounded, and behind photographs with
-    /// alpha (`transparent`) there is nothing to learn or to hide.
+    /// Configuration for `images` photographs in `space`: steps grow with distance only in unbounded space, and photographs with
+    /// alpha (`transparent`) have no background to learn or to hide.
     pub fn config(&self, images: usize, space: &Space, transparent: bool) -> FieldConfig {
         let mut sampler = self.sampler.clone();
         if let (Sampler::Occupancy(occupancy), false) = (&mut sampler, space.outside == Outside::Contracted) {
@@ -102,7 +101,9 @@ impl FieldKnobs {
             return Err("field.samples must be at least 1 and field.beta2 between 0 and 1".into());
         }
         if matches!(self.sampler, Sampler::Given { .. }) {
-            return Err("field.sampler cannot be given points: say occupancy, hierarchy or proposal".into());
+            return Err(
+                "field.sampler = \"given\" is only for residual fields; use occupancy, hierarchy or proposal".into(),
+            );
         }
         self.config(1, &Space::contracted([0.0; 3], 1.0), false)
             .check()
@@ -116,7 +117,7 @@ mod tests {
     use irradia_field::Space;
 
     #[test]
-    fn a_field_begins_denser_where_photographs_are_opaque() {
+    fn a_field_is_initially_denser_if_photographs_are_opaque() {
         let recipe = Recipe::parse("hashgrid", Recipe::built_in("hashgrid").unwrap(), &[]).unwrap();
         let knobs = recipe.field.unwrap();
         let space = Space::contracted([0.0; 3], 1.0);

@@ -1,5 +1,5 @@
-//! Every key that a recipe may have, with what it means: from the table of parameters, and from the documentation of the
-//! structs that a recipe is read into.
+//! Every key of a recipe with its meaning: from the table of parameters, and from the documentation of the structs into which
+//! a recipe is parsed.
 
 use super::edit_distance;
 use super::{
@@ -11,40 +11,40 @@ use std::collections::BTreeSet;
 /// A key of a recipe.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Key {
-    /// What it belongs to: a heading.
+    /// The section's heading.
     pub section: String,
-    /// As `--set` takes it, with `STAGE` for a stage's name.
+    /// As in `--set`, with `STAGE` for a stage's name.
     pub path: String,
-    /// Unit of its value, or what kind of value it is.
+    /// Unit or type of its value.
     pub value: String,
-    /// What holds where it is absent; `required` where it must not be.
+    /// Value if absent; `required` if it must be present.
     pub default: String,
-    /// What it may be; empty where the kind of value says all.
+    /// Allowed values; empty if the type says it all.
     pub bounds: String,
-    /// What it is, one line of Markdown.
+    /// Description, one line of Markdown.
     pub doc: String,
-    /// Paper or code that it is from; empty where the built-in recipes say it beside their numbers.
+    /// Paper or code of its origin; empty if the built-in recipes name it beside their numbers.
     pub source: String,
 }
 
-/// A field of a struct that is read from a recipe.
+/// A field of a struct that is parsed from a recipe.
 #[derive(Debug)]
 pub(crate) struct Documented {
-    /// Of the key.
+    /// Name of the key.
     pub name: &'static str,
-    /// Rust's type.
+    /// Rust type.
     pub kind: &'static str,
-    /// Serde's attributes.
+    /// Serde attributes.
     pub serde: &'static str,
     /// Lines of a doc comment, each with a space before it.
     pub doc: &'static str,
 }
 
-/// A variant: its name, what it is, and its fields.
+/// A variant: its name, description and fields.
 pub(crate) type Variant = (&'static str, &'static str, &'static [Documented]);
 
-/// A struct, or an enum of such, that keeps what its fields' doc comments say: `KEYS`, or `VARIANTS` with the keys of each.
-/// A field's doc comment stands before its `serde` attribute.
+/// Defines a struct, or an enum of structs, and keeps the doc comments of its fields: `KEYS`, or `VARIANTS` with the keys of each.
+/// A field's doc comment precedes its `serde` attribute.
 macro_rules! documented {
     ($(#[$meta:meta])* pub struct $name:ident { $(
         $(#[doc = $doc:literal])+ $(#[serde($($serde:tt)*)])? pub $field:ident: $kind:ty,
@@ -87,7 +87,7 @@ macro_rules! documented {
 }
 pub(super) use documented;
 
-/// A doc comment without the escapes that rustdoc needs.
+/// A doc comment without rustdoc's escapes.
 fn prose(doc: &str) -> String {
     doc.trim().replace("\\[", "[").replace("\\]", "]")
 }
@@ -139,7 +139,7 @@ impl Param {
             Group::Data => "Parameters: data",
             Group::Splats => "Parameters: splats",
             Group::Loss | Group::PartOf(_) => "Parameters: losses",
-            Group::Regularizer => "Parameters: losses on the splats themselves",
+            Group::Regularizer => "Parameters: regularisers",
             Group::Rate => "Parameters: learning rates of splats",
             Group::Field => "Parameters: radiance fields",
             Group::Socket => "Parameters: exposure and poses",
@@ -170,11 +170,7 @@ pub fn keys() -> Vec<Key> {
         ("Rendering", "render", RenderKnobs::KEYS),
         ("First splats", "init", InitKnobs::KEYS),
         ("Adam", "adam", AdamKnobs::KEYS),
-        (
-            "Losses on the splats themselves",
-            "regularizers",
-            RegularizerKnobs::KEYS,
-        ),
+        ("Regularisers", "regularizers", RegularizerKnobs::KEYS),
         ("Ingredients of a curriculum", "ingredients", Ingredients::KEYS),
         ("Stages", "stage.STAGE", Stage::KEYS),
         ("Density control, `strategy = \"classic\"`", density, ClassicKnobs::KEYS),
@@ -198,7 +194,7 @@ pub fn keys() -> Vec<Key> {
             Key { doc, ..key }
         })
     });
-    // Rows of a group that stand apart in the table stand together here.
+    // Rows of one group, wherever they are in the table, are listed together.
     let params: Vec<Key> = Param::ALL.into_iter().map(Param::key).collect();
     let mut sections: Vec<&str> = params.iter().map(|key| key.section.as_str()).collect();
     let mut seen = BTreeSet::new();
@@ -209,10 +205,10 @@ pub fn keys() -> Vec<Key> {
     of_tables.chain(of_exits).chain(of_params.cloned()).collect()
 }
 
-/// The keys whose path or description has `word` in it, in any case.
+/// The keys whose path or description contains `word`, ignoring case.
 ///
 /// # Errors
-/// Where there is none: the path of the key whose name is nearest.
+/// When there is none: the path of the key with the nearest name.
 pub fn find(word: &str) -> Result<Vec<Key>, String> {
     let small = word.to_lowercase();
     let has = |text: &str| text.to_lowercase().contains(&small);
@@ -231,7 +227,7 @@ mod tests {
     use super::*;
     use crate::recipe::BUILT_IN;
 
-    /// The paths of what stands in `value`, with `STAGE` for stages' names.
+    /// The paths of the keys in `value`, with `STAGE` for stages' names.
     fn paths(value: &toml::Value, path: &str, to: &mut BTreeSet<String>) {
         match value {
             toml::Value::Table(table) => {
@@ -260,7 +256,7 @@ mod tests {
             paths(&text.parse().map(toml::Value::Table).unwrap(), "", &mut there);
             for path in there {
                 let parts: Vec<&str> = path.split('.').collect();
-                // A knob's value, and what the field's own types are read from, are told with the key above them.
+                // The value of a curve, and the types of the field crate, are documented with the key above them.
                 let known = (1..=parts.len()).any(|n| {
                     let path = parts[..n].join(".").replace("stage.STAGE.params.", "params.");
                     let is_table = ["params", "stage", "stage.STAGE.params"].contains(&path.as_str())
@@ -274,7 +270,7 @@ mod tests {
     }
 
     #[test]
-    fn every_key_says_what_it_is_and_stands_once() {
+    fn every_key_is_documented_and_unique() {
         let keys = keys();
         for key in &keys {
             assert!(key.doc.ends_with('.') && key.doc.len() > 10, "{key:?}");
@@ -287,7 +283,7 @@ mod tests {
     }
 
     #[test]
-    fn keys_are_found_by_a_part_of_their_name_and_the_nearest_is_named() {
+    fn keys_are_found_by_a_part_of_their_name_and_the_nearest_is_suggested() {
         let found = find("SSIM").unwrap();
         assert!(
             found
@@ -297,7 +293,7 @@ mod tests {
         assert_eq!(find("ssim_wieght").unwrap_err(), "params.ssim_weight");
         assert_eq!(find("params.rate_maens").unwrap_err(), "params.rate_means");
         let every = find("density.every").unwrap();
-        assert_eq!(every.len(), 4, "one a strategy");
+        assert_eq!(every.len(), 4, "one per strategy");
         let tau = find("exit.tau").unwrap();
         assert!(tau.len() == 1 && tau[0].section.contains("threshold"), "{tau:?}");
     }

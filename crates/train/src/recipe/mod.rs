@@ -1,4 +1,4 @@
-//! A recipe: one way of training, as a file. Raw TOML, then overrides, then this validated value.
+//! A recipe: a training configuration, as a file. Raw TOML, then overrides, then this validated value.
 
 mod ablation;
 mod density;
@@ -8,7 +8,7 @@ mod param;
 mod table;
 
 pub use ablation::Ingredients;
-pub use density::{ClassicKnobs, Density, FastKnobs, McmcKnobs, MergeKnobs, TamingKnobs};
+pub use density::{ClassicKnobs, DensityControl, FastKnobs, McmcKnobs, MergeKnobs, TamingKnobs};
 pub use field::{FieldKnobs, FieldSpace, ResidualKnobs};
 use irradia_splat::regularize::Regularized;
 use keys::documented;
@@ -17,7 +17,7 @@ pub use param::{Knob, Params, Shape, Values};
 use serde::{Deserialize, Serialize};
 pub use table::{Group, Param, Row};
 
-/// The recipes that come with the program: name and text.
+/// The built-in recipes: name and text.
 pub const BUILT_IN: [(&str, &str); 12] = [
     ("classic", include_str!("../../recipes/classic.toml")),
     ("absgrad", include_str!("../../recipes/absgrad.toml")),
@@ -33,18 +33,18 @@ pub const BUILT_IN: [(&str, &str); 12] = [
     ("hybrid", include_str!("../../recipes/hybrid.toml")),
 ];
 
-/// Why a recipe was refused: one line that names the key.
+/// Why a recipe is invalid: one line that names the key.
 #[derive(Debug, thiserror::Error)]
 pub enum RecipeError {
     /// No such built-in recipe.
     #[error("no recipe is called `{name}`; there are {known}, or give the path of a .toml file")]
     Unknown {
-        /// What was asked for.
+        /// The requested name.
         name: String,
-        /// What there is.
+        /// The known names.
         known: String,
     },
-    /// Not TOML, or not this shape.
+    /// Not TOML, or not of this structure.
     #[error("recipe {origin}: {message}")]
     Invalid {
         /// File or built-in name.
@@ -52,7 +52,7 @@ pub enum RecipeError {
         /// One line.
         message: String,
     },
-    /// A `--set` that does not fit.
+    /// An invalid `--set`.
     #[error("--set {assignment}: {message}")]
     Override {
         /// As given.
@@ -63,17 +63,17 @@ pub enum RecipeError {
 }
 
 documented! {
-    /// One way of training.
+    /// A training configuration.
     #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
     #[serde(deny_unknown_fields)]
     pub struct Recipe {
         /// Short name.
         pub name: String,
-        /// What it is and where it comes from.
+        /// Description and origin.
         pub about: String,
-        /// Never more splats than this; at least 1.
+        /// Maximum number of splats; at least 1.
         pub max_splats: usize,
-        /// Never more splats than this for each pixel of a training image, all views' mean; no such limit when absent.
+        /// Maximum number of splats per pixel of a training image, averaged over views; no such limit when absent.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         pub splats_per_pixel: Option<f32>,
         /// Steps between evaluations of held-out views while training; at least 1.
@@ -86,27 +86,27 @@ documented! {
         pub init: InitKnobs,
         /// Adam's constants.
         pub adam: AdamKnobs,
-        /// What the losses on the splats themselves are taken over.
+        /// Options of the regularisers.
         #[serde(default, skip_serializing_if = "RegularizerKnobs::is_default")]
         pub regularizers: RegularizerKnobs,
-        /// What of a curriculum is in force.
+        /// The active ingredients of a curriculum.
         #[serde(default, skip_serializing_if = "Ingredients::are_all")]
         pub ingredients: Ingredients,
         /// The radiance field of the stages that train one.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         pub field: Option<FieldKnobs>,
-        /// Each photograph has an exposure and white balance of its own, an affine map of colours.
+        /// Train a separate exposure and white balance, an affine colour map, for each photograph.
         #[serde(default, skip_serializing_if = "is_false")]
         pub exposure: bool,
-        /// The photographs put their cameras' poses right.
+        /// Refine the cameras' poses.
         #[serde(default, skip_serializing_if = "is_false")]
         pub refine_poses: bool,
-        /// What adds to the splats' colours.
+        /// A field that adds to the splats' colours.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         pub residual: Option<ResidualKnobs>,
-        /// Knobs over the whole run; a stage may overrule them.
+        /// Parameters over the whole run; a stage may override them.
         pub params: Params,
-        /// What happens, in order.
+        /// The stages, in order.
         pub stage: Vec<Stage>,
     }
 }
@@ -116,11 +116,11 @@ documented! {
     #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
     #[serde(deny_unknown_fields)]
     pub struct RenderKnobs {
-        /// Behind the scene, sRGB; images with alpha are laid over it.
+        /// Background colour, sRGB; images with alpha are composited over it.
         pub background: [f32; 3],
-        /// Scale opacities by the area that the 0.3 pixel dilation adds.
+        /// Scale opacities by the area ratio of the 0.3 pixel dilation.
         pub antialias: bool,
-        /// Keep splats from being finer than the training views can show (Mip-Splatting's 3D smoothing filter).
+        /// Limit the resolution of splats to the sampling rate of the training views (Mip-Splatting's 3D smoothing filter).
         #[serde(default)]
         pub smoothing_filter: bool,
     }
@@ -133,12 +133,12 @@ documented! {
     pub struct InitKnobs {
         /// Opacity, between 0 and 1.
         pub opacity: f32,
-        /// Opacity of splats at random places, most of them in empty space; `init.opacity` when absent.
+        /// Opacity of splats at random positions, most of them in empty space; `init.opacity` when absent.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         pub random_opacity: Option<f32>,
         /// Size as a factor on the distance to the nearest neighbours, above 0.
         pub scale: f32,
-        /// Number of splats where the dataset has no points.
+        /// Number of splats if the dataset has no points.
         pub random_points: usize,
     }
 }
@@ -154,14 +154,14 @@ documented! {
         pub beta2: f32,
         /// Added to the root of the second moment.
         pub epsilon: f32,
-        /// `dense`: every splat steps, with a gradient of zero where the frame did not see it, as in 3DGS. `sparse`: those that
-        /// the frame did not see keep parameters and moments.
+        /// `dense`: all splats step, with a gradient of zero if not visible in the frame, as in 3DGS. `sparse`: splats that are not
+        /// visible keep parameters and moments.
         #[serde(default, skip_serializing_if = "AdamKind::is_sparse")]
         pub kind: AdamKind,
     }
 }
 
-/// Which splats Adam steps.
+/// Which splats Adam updates.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum AdamKind {
@@ -179,14 +179,14 @@ impl AdamKind {
 }
 
 documented! {
-    /// What the losses on the splats themselves are taken over.
+    /// Options of the regularisers.
     #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
     #[serde(deny_unknown_fields)]
     pub struct RegularizerKnobs {
-        /// The splats of which they are a mean: `visible`, those that the frame saw, or `all`.
+        /// The splats over which they are averaged: `visible`, those visible in the frame, or `all`.
         #[serde(default)]
         pub of: RegularizedKind,
-        /// The unit of sizes: `extent`, the scene's, or `world`, the dataset's own.
+        /// Unit of sizes: `extent`, the scene's, or `world`, the dataset's own.
         #[serde(default)]
         pub unit: LengthUnit,
     }
@@ -198,11 +198,11 @@ impl RegularizerKnobs {
     }
 }
 
-/// Splats that are regularised.
+/// Splats to regularise.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum RegularizedKind {
-    /// Those that the frame saw.
+    /// Those visible in the frame.
     #[default]
     Visible,
     /// All.
@@ -225,7 +225,7 @@ pub enum LengthUnit {
     /// The scene's extent.
     #[default]
     Extent,
-    /// The dataset's own.
+    /// The dataset's own unit.
     World,
 }
 
@@ -236,21 +236,21 @@ documented! {
     pub struct Stage {
         /// Short name, unique in the recipe.
         pub name: String,
-        /// Its length in recipe steps, at least 1: `--steps` and `--budget` stretch or shrink the whole run.
+        /// Its length in recipe steps, at least 1: `--steps` and `--budget` stretch or compress the whole run.
         pub steps: u64,
-        /// What it trains, `splats` or `field`. Splats that come after a field begin as its surfaces.
+        /// What it trains, `splats` or `field`. Splats after a field begin as its surfaces.
         #[serde(default, skip_serializing_if = "Represents::is_splats")]
         pub represents: Represents,
-        /// Knobs over this stage.
+        /// Parameters over this stage.
         #[serde(default)]
         pub params: Params,
-        /// How splats are added and removed; none are when absent.
+        /// How splats are added and removed; none are if absent.
         #[serde(default)]
-        pub density: Option<Density>,
-        /// How adjacent splats are merged; none are when absent.
+        pub density: Option<DensityControl>,
+        /// How adjacent splats are merged; none are if absent.
         #[serde(default)]
         pub merge: Option<MergeKnobs>,
-        /// When the stage may end before its steps are over; never when absent.
+        /// When the stage may end before its steps are completed; never if absent.
         #[serde(default)]
         pub exit: Option<Exit>,
     }
@@ -274,8 +274,8 @@ impl Represents {
 }
 
 documented! {
-    /// When a stage has done its work: rules on S, the mean L1 error over the training views (CurriculumGS's S_t), of which a
-    /// running estimate is kept and which is measured now and then.
+    /// When a stage may end early: rules on S, the mean L1 error over the training views (CurriculumGS's S_t), which is estimated
+    /// continuously and measured at intervals.
     #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
     #[serde(tag = "when", rename_all = "snake_case", deny_unknown_fields)]
     pub enum Exit {
@@ -284,14 +284,14 @@ documented! {
             /// Mean absolute difference of colours in \[0, 1\].
             tau: f64,
         },
-        /// S falls below `ratio` of what it was when the stage had seen every view once: a tau that no one has to tune.
+        /// S falls below `ratio` times its value when the stage had seen every view once: a tau without tuning.
         Relative {
-            /// Share of the stage's first S.
+            /// Fraction of the stage's first S.
             ratio: f64,
         },
-        /// S has not fallen by the share `drop` within `window` recipe steps.
+        /// S has not fallen by the fraction `drop` within `window` recipe steps.
         Plateau {
-            /// Share of the best S so far.
+            /// Fraction of the best S so far.
             drop: f64,
             /// Recipe steps.
             window: u64,
@@ -303,7 +303,7 @@ impl Recipe {
     /// The text of the built-in recipe `name`.
     ///
     /// # Errors
-    /// When there is none, naming those there are.
+    /// When there is none, naming the known ones.
     pub fn built_in(name: &str) -> Result<&'static str, RecipeError> {
         BUILT_IN
             .iter()
@@ -318,7 +318,7 @@ impl Recipe {
     /// Parses `text`, applies `overrides` (`stage.grow.params.ssim_weight=0.3`, `max_splats=50000`) and validates.
     ///
     /// # Errors
-    /// One line that names the key and, for an unknown one, the nearest that is known.
+    /// One line that names the key and, for an unknown one, the nearest known one.
     pub fn parse(origin: &str, text: &str, overrides: &[String]) -> Result<Self, RecipeError> {
         let invalid = |message: String| RecipeError::Invalid {
             origin: origin.to_owned(),
@@ -349,7 +349,7 @@ impl Recipe {
         Ok(recipe)
     }
 
-    /// Gives what sits in a socket a rate where the recipe has none: a value that falls over the run, as all others do.
+    /// Adds a rate for components in sockets if the recipe has none: a value that falls over the run, like all others.
     fn complete_sockets(&mut self) {
         let mut default = |wanted: bool, param: Param, from: f64, to: f64| {
             if wanted {
@@ -363,19 +363,19 @@ impl Recipe {
             }
         };
         let (exposure, poses) = (self.exposure, self.refine_poses);
-        // A photograph comes up 30 to 100 times in a run, and gains of 1.6 must be reached in them.
+        // A photograph is used 30 to 100 times in a run, within which gains of 1.6 must be reached.
         default(exposure, Param::RateExposure, 0.03, 0.001);
         default(exposure, Param::ExposureReg, 0.01, 0.001);
         // Half a degree (9e-3) within as many steps.
         default(poses, Param::RatePoses, 1e-3, 1e-5);
     }
 
-    /// The resolved recipe as TOML, to be written into the run.
+    /// The resolved recipe as TOML, as written to the run's folder.
     pub fn to_toml(&self) -> String {
         toml::to_string(self).expect("a recipe is always valid TOML")
     }
 
-    /// A hash of the resolved recipe (FNV-1a, 64 bits, hexadecimal), by which runs of the same recipe are known.
+    /// A hash of the resolved recipe (FNV-1a, 64 bits, hexadecimal), which identifies runs of the same recipe.
     pub fn hash(&self) -> String {
         let hash = self.to_toml().bytes().fold(0xcbf2_9ce4_8422_2325u64, |h, b| {
             (h ^ u64::from(b)).wrapping_mul(0x0100_0000_01b3)
@@ -397,7 +397,7 @@ impl Recipe {
         }
         let opacities = [self.init.opacity, self.init.random_opacity.unwrap_or(self.init.opacity)];
         if opacities.iter().any(|opacity| !(*opacity > 0.0 && *opacity < 1.0)) || self.init.scale <= 0.0 {
-            return Err("init.opacity and random_opacity must lie between 0 and 1 and init.scale above 0".into());
+            return Err("init.opacity and random_opacity must be between 0 and 1 and init.scale above 0".into());
         }
         if let Some(field) = &self.field {
             field.validate()?;
@@ -421,11 +421,11 @@ impl Recipe {
                     stage.name
                 ));
             }
-            if let Some(Density::Taming(knobs)) = &stage.density
+            if let Some(DensityControl::Taming(knobs)) = &stage.density
                 && !(0.0..=1.0).contains(&knobs.edge_share)
             {
                 return Err(format!(
-                    "stage.{}.density.edge_share must lie between 0 and 1",
+                    "stage.{}.density.edge_share must be between 0 and 1",
                     stage.name
                 ));
             }
@@ -461,7 +461,7 @@ fn is_false(value: &bool) -> bool {
 }
 
 impl Recipe {
-    /// Whether what stage `i` trains can follow what came before.
+    /// Whether what stage `i` trains can follow the stages before.
     fn validate_order(&self, i: usize) -> Result<(), String> {
         let stage = &self.stage[i];
         let before = i.checked_sub(1).map(|before| self.stage[before].represents);
@@ -475,16 +475,16 @@ impl Recipe {
                 Err(format!("stage.{name}: a field has neither density control nor merging"))
             }
             (Represents::Splats, Some(Represents::Field)) if self.field.as_ref().is_none_or(|f| f.points == 0) => Err(
-                format!("stage.{name} begins as a field's surfaces: say how many splats in field.points"),
+                format!("stage.{name} begins with splats on a field's surfaces: set their number in field.points"),
             ),
             _ => Ok(()),
         }
     }
 }
 
-/// Sets one value by its path; a list of tables (`stage`) is entered by its items' `name`.
+/// Sets one value by its path; in a list of tables (`stage`) an item is selected by its `name`.
 fn apply(root: &mut toml::Value, assignment: &str) -> Result<(), String> {
-    let (path, value) = assignment.split_once('=').ok_or("say key=value")?;
+    let (path, value) = assignment.split_once('=').ok_or("expected key=value")?;
     let value: toml::Value = format!("v = {value}")
         .parse::<toml::Table>()
         .or_else(|_| format!("v = {value:?}").parse::<toml::Table>())
@@ -492,7 +492,7 @@ fn apply(root: &mut toml::Value, assignment: &str) -> Result<(), String> {
         .remove("v")
         .ok_or("no value")?;
     let keys: Vec<&str> = path.trim().split('.').collect();
-    let (last, parents) = keys.split_last().expect("split gives one at least");
+    let (last, parents) = keys.split_last().expect("split gives at least one");
     let mut at = root;
     for key in parents {
         at = match at {
@@ -509,7 +509,7 @@ fn apply(root: &mut toml::Value, assignment: &str) -> Result<(), String> {
                     .find(|item| item.get("name").and_then(toml::Value::as_str) == Some(key))
                     .ok_or_else(|| format!("no `{key}` there; there are {}", names.join(", ")))?
             }
-            other => return Err(format!("`{key}` lies inside a {}", other.type_str())),
+            other => return Err(format!("`{key}` is inside a {}", other.type_str())),
         };
     }
     match at {
@@ -517,7 +517,7 @@ fn apply(root: &mut toml::Value, assignment: &str) -> Result<(), String> {
             table.insert((*last).to_owned(), value);
             Ok(())
         }
-        other => Err(format!("`{last}` lies inside a {}", other.type_str())),
+        other => Err(format!("`{last}` is inside a {}", other.type_str())),
     }
 }
 
@@ -525,7 +525,7 @@ fn one_line(error: &toml::de::Error) -> String {
     error.message().lines().collect::<Vec<_>>().join(" ")
 }
 
-/// Where an error lies: the place in the text, or the key. Only the error's long form knows it.
+/// The position of an error: line and column, or the key. Only the error's long form contains it.
 fn place(error: &toml::de::Error) -> String {
     let long = error.to_string();
     let in_text = long.lines().next().and_then(|line| line.split_once(" at line "));
@@ -547,11 +547,11 @@ fn suggest(message: &str) -> String {
     let nearest = names[1..]
         .iter()
         .min_by_key(|known| edit_distance(unknown, known))
-        .expect("one at least");
+        .expect("at least one");
     format!("unknown key `{unknown}`; the nearest known one is `{nearest}`")
 }
 
-/// Levenshtein's distance.
+/// Levenshtein distance.
 fn edit_distance(a: &str, b: &str) -> usize {
     let b: Vec<char> = b.chars().collect();
     let mut row: Vec<usize> = (0..=b.len()).collect();
@@ -577,7 +577,7 @@ mod tests {
     }
 
     #[test]
-    fn every_built_in_recipe_is_valid_and_survives_being_written() {
+    fn every_built_in_recipe_is_valid_and_round_trips() {
         for (name, text) in BUILT_IN {
             let recipe = Recipe::parse(name, text, &[]).unwrap();
             assert_eq!(recipe.name, name);
@@ -605,7 +605,7 @@ mod tests {
     }
 
     #[test]
-    fn unknown_keys_are_refused_with_the_nearest_known() {
+    fn unknown_keys_are_rejected_with_the_nearest_known_one() {
         for (bad, near) in [
             ("max_splat=5", "max_splats"),
             ("params.ssim_wieght=0.2", "ssim_weight"),
@@ -626,13 +626,13 @@ mod tests {
     }
 
     #[test]
-    fn senseless_values_are_refused_by_name() {
+    fn invalid_values_are_rejected_by_name() {
         for (bad, part) in [
             ("stage.grow.steps=0", "stage.grow.steps"),
             ("params.ssim_weight=1.5", "params.ssim_weight: 1.5"),
             ("params.rate_means={ to = 0.0, shape = 'log' }", "log ramp"),
             ("params.sh_degree={ steps = [[5, 1]] }", "start at 0"),
-            ("params.sh_degree={ steps = [[0, 1]], to = 3 }", "a knob is"),
+            ("params.sh_degree={ steps = [[0, 1]], to = 3 }", "expected a number"),
             ("params.sh_degree=true", "in `params.sh_degree`"),
             ("init.opacity=1", "init.opacity"),
             ("nonsense", "key=value"),

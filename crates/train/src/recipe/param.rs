@@ -1,4 +1,4 @@
-//! What changes over time in a run, and how.
+//! Values that change over time in a run, and their curves.
 
 use super::table::{Group, Param, ROWS, Row};
 use serde::de::Error;
@@ -7,29 +7,29 @@ use std::collections::BTreeMap;
 use std::ops::{Index, IndexMut};
 use std::sync::LazyLock;
 
-/// Knobs by name.
+/// Curves by parameter.
 pub type Params = BTreeMap<Param, Knob>;
 
 /// Names by [`Param::ALL`].
 static NAMES: LazyLock<[&str; Param::ALL.len()]> = LazyLock::new(|| Param::ALL.map(Param::name));
 
 impl Param {
-    /// All that the table says about it.
+    /// The parameter's row in the table.
     pub fn row(self) -> &'static Row {
         &ROWS[self as usize]
     }
 
-    /// As recipes write it.
+    /// Its name in recipes.
     pub fn name(self) -> &'static str {
         self.row().name
     }
 
-    /// The parameter that recipes call `name`.
+    /// The parameter with the name `name` in recipes.
     pub fn named(name: &str) -> Option<Self> {
         Self::ALL.into_iter().find(|param| param.name() == name)
     }
 
-    /// Whether it says what a frame is compared by.
+    /// Whether it belongs to a loss.
     pub fn is_of_loss(self) -> bool {
         matches!(self.row().group, Group::Loss | Group::PartOf(_))
     }
@@ -48,23 +48,23 @@ impl<'de> Deserialize<'de> for Param {
     }
 }
 
-/// A value for each parameter.
+/// A value of each parameter.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Values([f64; Param::ALL.len()]);
 
 impl Values {
-    /// `value(param)` for each.
+    /// `value(param)` for each parameter.
     pub fn of(value: impl FnMut(Param) -> f64) -> Self {
         Self(Param::ALL.map(value))
     }
 
-    /// Where no recipe says anything.
+    /// The defaults.
     pub fn default_values() -> Self {
         Self::of(|param| param.row().default)
     }
 
-    /// The value as a step uses it: `photo_weight` is what is left for L1 and `ssim_weight` what 1 - SSIM gets of it; all
-    /// others are as they are.
+    /// The value in effect: `photo_weight` is the weight of L1, what `ssim_weight` leaves, and `ssim_weight` that of 1 - SSIM; all
+    /// others are unchanged.
     pub fn in_effect(&self, param: Param) -> f64 {
         let ssim = || self[Param::SsimWeight] * self[Param::PhotoWeight];
         match param {
@@ -89,20 +89,20 @@ impl Index<Param> for Values {
     }
 }
 
-/// A value over time.
+/// A parameter's value over time.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 #[serde(untagged)]
 pub enum Knob {
-    /// Always the same.
+    /// Constant.
     Const(f64),
     /// From one value to another over the stage (or the run).
     Ramp {
-        /// At the start; goes on from the value in force when absent.
+        /// Value at the start; continues from the value in effect when absent.
         #[serde(skip_serializing_if = "Option::is_none")]
         from: Option<f64>,
-        /// At the end.
+        /// Value at the end.
         to: f64,
-        /// How it goes from one to the other.
+        /// Interpolation from one to the other.
         shape: Shape,
     },
     /// `[at, value]` pairs: `value` holds from recipe step `at` of the stage (or run) on.
@@ -112,20 +112,20 @@ pub enum Knob {
     },
 }
 
-/// How a ramp runs.
+/// Interpolation of a ramp.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, Default)]
 #[serde(rename_all = "snake_case")]
 pub enum Shape {
-    /// Straight.
+    /// Linear.
     #[default]
     Linear,
-    /// Straight in the logarithm; both ends must be positive.
+    /// Linear in the logarithm; both ends must be positive.
     Log,
     /// Half a cosine.
     Cosine,
 }
 
-/// What a file may say for a knob; serde's own message for an untagged enum would name nothing.
+/// The raw form of a knob in a file; serde's own message for an untagged enum would name nothing.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct RawKnob {
@@ -150,19 +150,19 @@ impl<'de> Deserialize<'de> for Knob {
                     }),
                     (None, Some(steps)) if raw.from.is_none() && raw.shape.is_none() => Ok(Knob::Steps { steps }),
                     _ => Err(D::Error::custom(
-                        "a knob is a number, { from, to, shape } or { steps = [[at, value], ..] }",
+                        "expected a number, { from, to, shape } or { steps = [[at, value], ..] }",
                     )),
                 }
             }
             other => Err(D::Error::custom(format!(
-                "a knob is a number or a table, not {}",
+                "expected a number or a table, not {}",
                 other.type_str()
             ))),
         }
     }
 }
 
-/// Whether `knob` makes sense for `param`.
+/// Validates `knob` for `param`.
 pub(super) fn check_knob(param: Param, knob: &Knob) -> Result<(), String> {
     let values: Vec<f64> = match knob {
         Knob::Const(v) => vec![*v],

@@ -1,52 +1,52 @@
-//! The table of parameters: everything that a recipe can change over time, a row each.
+//! The table of parameters: every value that a recipe can change over time, one row each.
 //!
-//! A row is all that is said about a parameter. The names that recipes use, bounds and their errors, `irradia recipe keys`,
-//! `docs/recipe-keys.md`, the losses that `ingredients` and `recipe show` list, the curves of a report and what a checkpoint
-//! carries are made from it. Recipes are written in the order of the rows.
+//! A row is the only definition of a parameter. The names in recipes, bounds and their errors, `irradia recipe keys`,
+//! `docs/recipe-keys.md`, the losses listed by `ingredients` and `recipe show`, the curves of a report and the values in a
+//! checkpoint are generated from it. Recipes are written in the order of the rows.
 
 use std::ops::RangeInclusive;
 
-/// What a parameter is for.
+/// The purpose of a parameter.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Group {
-    /// How much of the data and how many splats are in use: what `ingredients.data_schedule` holds.
+    /// Amount of data and number of splats in use: the parameters of `ingredients.data_schedule`.
     Data,
-    /// What splats may be.
+    /// Constraints on splats.
     Splats,
     /// Weight of a loss.
     Loss,
-    /// Says more about the loss with the weight named.
+    /// Detail of the loss whose weight is named.
     PartOf(Param),
-    /// Weight of a loss on the splats themselves.
+    /// Weight of a regulariser.
     Regularizer,
     /// Learning rate of splats.
     Rate,
     /// Rates and weights of a radiance field.
     Field,
-    /// Rates and weights of what sits in a step's sockets beside the splats.
+    /// Rates and weights of occupants of a step's sockets.
     Socket,
-    /// On from 0.5, off below.
+    /// On from 0.5 up, off below.
     Switch,
 }
 
 /// One parameter.
 #[derive(Debug)]
 pub struct Row {
-    /// As recipes write it.
+    /// Its name in recipes.
     pub name: &'static str,
-    /// Of its value; empty where it has none.
+    /// Unit of its value; empty if dimensionless.
     pub unit: &'static str,
-    /// Where no recipe says anything.
+    /// Value if no recipe sets it.
     pub default: f64,
-    /// What it may be.
+    /// Allowed values.
     pub bounds: RangeInclusive<f64>,
-    /// What it is for.
+    /// Its purpose.
     pub group: Group,
-    /// Its curve in a report, `chart.label`; none for switches, and for parts of a loss that are no weight.
+    /// Its curve in a report, `chart.label`; none for switches and for details of a loss that are not weights.
     pub curve: Option<&'static str>,
-    /// Where it comes from: paper or code.
+    /// Its origin: paper or code.
     pub source: &'static str,
-    /// What it is; lines of a doc comment, each with a space before it.
+    /// Description; lines of a doc comment, each with a space before it.
     pub doc: &'static str,
 }
 
@@ -55,7 +55,7 @@ const NOT_NEGATIVE: RangeInclusive<f64> = 0.0..=f64::MAX;
 
 macro_rules! table {
     ($($(#[doc = $doc:literal])+ $param:ident { $($row:tt)+ })+) => {
-        /// What can change over time; the rows of the table.
+        /// Values that can change over time; the rows of the table.
         #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
         pub enum Param {
             $($(#[doc = $doc])+ $param,)+
@@ -66,7 +66,7 @@ macro_rules! table {
             pub const ALL: [Param; [$(Param::$param),+].len()] = [$(Param::$param),+];
         }
 
-        /// By [`Param::ALL`].
+        /// In the order of [`Param::ALL`].
         pub(super) static ROWS: [Row; Param::ALL.len()] = [
             $(Row { doc: concat!($($doc),+), $($row)+ },)+
         ];
@@ -82,7 +82,7 @@ table! {
         bounds: 0.01..=1.0,
         group: Group::Data,
         curve: Some("scale.image"),
-        source: "Irradia; CurriculumGS shrinks images for the loss instead (`coarse_weight`)",
+        source: "Irradia; CurriculumGS downscales images for the loss instead (`coarse_weight`)",
     }
     /// SH bands in use.
     ShDegree {
@@ -94,7 +94,7 @@ table! {
         curve: Some("degree.SH"),
         source: "3DGS (Kerbl et al. 2023), section 5.1: one band more every 1000 steps",
     }
-    /// How many splats there may be, as a fraction of the recipe's cap.
+    /// Maximum number of splats, as a fraction of the recipe's cap.
     CountShare {
         name: "count_share",
         unit: "fraction",
@@ -104,7 +104,7 @@ table! {
         curve: Some("count.allowed"),
         source: "Irradia",
     }
-    /// Fraction of the visible splats whose place and shape are trained, the largest first; of the others opacity and colour are.
+    /// Fraction of the visible splats whose position and shape are trained, the largest first; opacity and colour of all are.
     TrainedShare {
         name: "trained_share",
         unit: "fraction",
@@ -124,7 +124,7 @@ table! {
         curve: Some("loss.L1"),
         source: "3DGS (Kerbl et al. 2023), eq. 7",
     }
-    /// w in the photometric loss: the part that 1 - SSIM has in it.
+    /// w in the photometric loss: the weight of 1 - SSIM in it.
     SsimWeight {
         name: "ssim_weight",
         unit: "fraction",
@@ -144,7 +144,7 @@ table! {
         curve: Some("loss.squared"),
         source: "Irradia",
     }
-    /// Weight of the mean squared error of images shrunk by `coarse_factor`.
+    /// Weight of the mean squared error of images downscaled by `coarse_factor`.
     CoarseWeight {
         name: "coarse_weight",
         unit: "",
@@ -154,7 +154,7 @@ table! {
         curve: Some("loss.coarse"),
         source: "CurriculumGS",
     }
-    /// By how much the coarse loss shrinks images, pixels to one.
+    /// Downscaling factor of the coarse loss.
     CoarseFactor {
         name: "coarse_factor",
         unit: "pixels",
@@ -164,7 +164,7 @@ table! {
         curve: None,
         source: "CurriculumGS",
     }
-    /// Weight of LPIPS, on a patch of the image; left out where its weights are absent.
+    /// Weight of LPIPS, on a crop of the image; skipped if its network weights are absent.
     PerceptualWeight {
         name: "perceptual_weight",
         unit: "",
@@ -174,7 +174,7 @@ table! {
         curve: Some("loss.perceptual"),
         source: "LPIPS (Zhang et al. 2018); as a training loss CurriculumGS",
     }
-    /// Weight of the mean |alpha - alpha of the photograph|, where it has one.
+    /// Weight of the mean |alpha - alpha of the photograph|, if it has alpha.
     AlphaWeight {
         name: "alpha_weight",
         unit: "",
@@ -184,8 +184,8 @@ table! {
         curve: Some("loss.alpha"),
         source: "Irradia",
     }
-    /// Weight of the mean |depth - depth of the points that the view sees|, relative to that depth; for a field of the mean
-    /// squared difference of distance, in the units in which its samples are spread, at pixels where such points lie.
+    /// Weight of the mean |depth - depth of the points visible in the view|, relative to that depth; for a field, of the mean
+    /// squared difference of distance, in the units in which its samples are spaced, at pixels with such points.
     DepthWeight {
         name: "depth_weight",
         unit: "",
@@ -205,7 +205,7 @@ table! {
         curve: Some("loss.smooth"),
         source: "Godard et al. 2017; CurriculumGS",
     }
-    /// Photographs with alpha are laid over a new random colour in each step, and so is the scene.
+    /// Composite photographs with alpha, and the scene, over a new random colour in each step.
     RandomBackground {
         name: "random_background",
         unit: "",
@@ -365,7 +365,7 @@ table! {
         curve: Some("rate.appearance codes"),
         source: "NeRF-W (Martin-Brualla et al. 2021)",
     }
-    /// Weight of the interlevel loss, where a field's samples are proposed.
+    /// Weight of the interlevel loss, for a field with a proposal sampler.
     InterlevelWeight {
         name: "interlevel_weight",
         unit: "",
@@ -385,7 +385,7 @@ table! {
         curve: Some("loss.distortion"),
         source: "mip-NeRF 360 (Barron et al. 2022), eq. 15",
     }
-    /// The residual field of a recipe that has one adds to the splats' colours, from then on for the rest of the run.
+    /// Whether the residual field of a recipe that has one adds to the splats' colours, from then on for the rest of the run.
     Residual {
         name: "residual",
         unit: "",
@@ -395,7 +395,7 @@ table! {
         curve: None,
         source: "Irradia",
     }
-    /// Learning rate of the photographs' exposures, where the recipe has `exposure`.
+    /// Learning rate of the photographs' exposures, if the recipe has `exposure`.
     RateExposure {
         name: "rate_exposure",
         unit: "",
@@ -403,7 +403,7 @@ table! {
         bounds: NOT_NEGATIVE,
         group: Group::Socket,
         curve: Some("rate.exposure"),
-        source: "Irradia: 0.03 falling to 0.001 where a recipe with `exposure` says nothing; Hierarchical 3DGS (Kerbl et al. 2024) has 0.01 to 0.001 over 30,000 steps",
+        source: "Irradia: 0.03 falling to 0.001 if a recipe with `exposure` does not set it; Hierarchical 3DGS (Kerbl et al. 2024) uses 0.01 to 0.001 over 30,000 steps",
     }
     /// Weight of the mean squared difference of a photograph's exposure from the identity.
     ExposureReg {
@@ -413,9 +413,9 @@ table! {
         bounds: NOT_NEGATIVE,
         group: Group::Socket,
         curve: Some("loss.exposure"),
-        source: "Irradia: 0.01 falling to 0.001 where a recipe with `exposure` says nothing",
+        source: "Irradia: 0.01 falling to 0.001 if a recipe with `exposure` does not set it",
     }
-    /// Learning rate of the poses, in radians and in extents of the scene, where the recipe has `refine_poses`.
+    /// Learning rate of the poses, in radians and in extents of the scene, if the recipe has `refine_poses`.
     RatePoses {
         name: "rate_poses",
         unit: "radians, extents of the scene",
@@ -423,7 +423,7 @@ table! {
         bounds: NOT_NEGATIVE,
         group: Group::Socket,
         curve: Some("rate.poses"),
-        source: "Irradia: 1e-3 falling to 1e-5 where a recipe with `refine_poses` says nothing; BARF (Lin et al. 2021) has 1e-3 to 1e-5",
+        source: "Irradia: 1e-3 falling to 1e-5 if a recipe with `refine_poses` does not set it; BARF (Lin et al. 2021) uses 1e-3 to 1e-5",
     }
 }
 
@@ -438,7 +438,7 @@ mod tests {
     }
 
     #[test]
-    fn every_parameter_has_one_row_that_says_all() {
+    fn every_parameter_has_one_complete_row() {
         for param in Param::ALL {
             let row = param.row();
             let same = |text: fn(&Row) -> Option<&str>| ROWS.iter().filter(|other| text(other) == text(row)).count();
@@ -476,7 +476,7 @@ mod tests {
     }
 
     #[test]
-    fn every_parameter_is_listed_and_drawn() {
+    fn every_parameter_is_listed_and_plotted() {
         let keys = keys();
         let page = include_str!("../report/page.js");
         for param in Param::ALL {

@@ -1,4 +1,4 @@
-/// Lines of a table as text in columns of equal width: the first `left` begin at their left, the others end at their right.
+/// Formats the lines of a table in aligned columns: the first `left` are left-aligned, the others right-aligned.
 pub fn columns(lines: &[Vec<String>], left: usize) -> String {
     let length = |cell: &String| cell.chars().count();
     let count = lines.iter().map(Vec::len).max().unwrap_or(0);

@@ -1,4 +1,4 @@
-//! What the run ran on, and what it took of it. Read from `/proc` on Linux; elsewhere what is unknown stays empty or 0.
+//! The machine of a run, and the memory it used. Read from `/proc` on Linux; elsewhere unknown values are empty or 0.
 
 use serde::{Deserialize, Serialize};
 use std::fs;
@@ -6,9 +6,9 @@ use std::fs;
 /// A computer.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Machine {
-    /// Model of the processor; its architecture where the model is unknown.
+    /// Model of the CPU; its architecture if the model is unknown.
     pub cpu: String,
-    /// Cores this process may use.
+    /// Cores available to this process.
     pub cores: u64,
     /// Bytes of memory; 0 where unknown.
     pub memory: u64,
@@ -31,12 +31,12 @@ pub fn machine() -> Machine {
     }
 }
 
-/// The most memory this process ever held, bytes; 0 where the system does not say.
+/// Peak memory of this process, bytes; 0 if the system does not report it.
 pub fn peak_rss_bytes() -> u64 {
     kibibytes(&fs::read_to_string("/proc/self/status").unwrap_or_default(), "VmHWM:")
 }
 
-/// What follows `key` on the first line that starts with it.
+/// The value of the first line that starts with `key`.
 fn field<'a>(text: &'a str, key: &str) -> Option<&'a str> {
     text.lines().find_map(|line| line.strip_prefix(key)).map(str::trim)
 }
@@ -52,7 +52,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn lines_of_proc_are_understood() {
+    fn lines_of_proc_are_parsed() {
         let status = "VmPeak:\t  10 kB\nVmHWM:\t   2048 kB\n";
         assert_eq!(kibibytes(status, "VmHWM:"), 2 << 20);
         assert_eq!(kibibytes("VmHWM:\tmuch\n", "VmHWM:"), 0);
@@ -60,7 +60,7 @@ mod tests {
 
     #[test]
     #[cfg(target_os = "linux")]
-    fn this_process_is_seen() {
+    fn this_process_is_measured() {
         assert!(peak_rss_bytes() > 1 << 20);
         let machine = machine();
         assert!(machine.cores > 0 && machine.memory > 1 << 27 && !machine.cpu.is_empty() && !machine.os.is_empty());

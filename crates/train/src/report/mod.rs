@@ -1,7 +1,7 @@
-//! What a run came to: the figures (`report.json`) and a page that shows them (`report.html`).
+//! The results of a run: figures (`report.json`) and a page that shows them (`report.html`).
 //!
-//! The page is one file: style, script and data are inside it, pictures are named relative to it. It opens from disk
-//! with no network.
+//! The page is one file: style, script and data are embedded, pictures are named relative to it. It opens from disk
+//! without a network.
 
 mod columns;
 mod machine;
@@ -14,12 +14,12 @@ pub use schedule::{KnobCurve, Schedule, schedule};
 use crate::times::Times;
 use serde::{Deserialize, Deserializer, Serialize};
 
-/// Everything a run is judged by. Numbers that are not finite are written as `null` and read back as NaN.
+/// All results of a run. Numbers that are not finite are written as `null` and read back as NaN.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Report {
     /// Version of the program.
     pub version: String,
-    /// What computed, such as `cpu, 2 threads, avx512`.
+    /// The device, such as `cpu, 2 threads, avx512`.
     pub device: String,
     /// The dataset, as the user named it.
     pub dataset: String,
@@ -29,67 +29,67 @@ pub struct Report {
     pub recipe_hash: String,
     /// The resolved recipe.
     pub recipe_toml: String,
-    /// Seed of the run.
+    /// Random seed of the run.
     pub seed: u64,
-    /// Steps taken.
+    /// Steps completed.
     pub steps: u64,
-    /// Wall-clock seconds of everything between the first step and the last; earlier versions told `training_seconds` here.
+    /// Wall-clock seconds between the first step and the last; earlier versions wrote `training_seconds` here.
     #[serde(deserialize_with = "or_nan")]
     pub seconds: f64,
-    /// Wall-clock seconds of the steps alone.
+    /// Wall-clock seconds of the steps only.
     #[serde(default = "nan", deserialize_with = "or_nan")]
     pub training_seconds: f64,
-    /// What `seconds` and `total_seconds` went into.
+    /// Breakdown of `seconds` and `total_seconds`.
     #[serde(default)]
     pub breakdown: Breakdown,
-    /// Processor seconds of the steps alone, all threads together.
+    /// CPU seconds of the steps only, all threads together.
     #[serde(deserialize_with = "or_nan")]
     pub cpu_seconds: f64,
-    /// Wall-clock seconds of everything that this process did for the run, from reading the dataset to the last evaluation.
+    /// Wall-clock seconds of this process for the run, from reading the dataset to the last evaluation.
     #[serde(deserialize_with = "or_nan")]
     pub total_seconds: f64,
     /// Gaussians at the end.
     pub splats: u64,
-    /// Numbers of the field, where the run made one.
+    /// Number of parameters of the field, if the result is one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub parameters: Option<u64>,
-    /// Most memory the process ever held, bytes; 0 where the system does not say.
+    /// Peak memory of the process, bytes; 0 if the system does not report it.
     pub peak_rss_bytes: u64,
-    /// What it was trained over and is scored over, for people.
+    /// The training and the evaluation background, in words.
     #[serde(default)]
     pub background: String,
-    /// Mean over the held-out views, dB; NaN, and absent from files, where none could be measured.
+    /// Mean over the held-out views, dB; NaN, and absent from files, if none could be measured.
     #[serde(default = "nan", deserialize_with = "or_nan", skip_serializing_if = "is_nan")]
     pub psnr: f64,
-    /// Mean over the held-out views, likewise.
+    /// Mean over the held-out views; NaN, and absent from files, if none could be measured.
     #[serde(default = "nan", deserialize_with = "or_nan", skip_serializing_if = "is_nan")]
     pub ssim: f64,
-    /// Mean over the held-out views; `None` without the network's weights.
+    /// Mean over the held-out views; `None` without network weights.
     pub lpips: Option<f64>,
-    /// The network whose features it compares: `squeeze`, `alex` or `vgg`.
+    /// The network of LPIPS: `squeeze`, `alex` or `vgg`.
     #[serde(default)]
     pub lpips_net: Option<String>,
     /// PSNR in dB over the right halves of the held-out views, after their exposure or pose was fitted on their left
-    /// halves; `None` where the recipe learns neither.
+    /// halves; `None` if the recipe trains neither.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub half_fit_psnr: Option<f64>,
     /// The held-out views.
     pub views: Vec<ViewReport>,
     /// The stages of the recipe, in order.
     pub stages: Vec<StageReport>,
-    /// The knobs over the run; empty in reports of versions that did not write it.
+    /// Parameter curves over the run; empty in reports of versions without them.
     #[serde(default)]
     pub schedule: Schedule,
-    /// How the run went, in order of steps.
+    /// Metrics over the run, in order of steps.
     pub curve: Vec<CurvePoint>,
-    /// Where it ran.
+    /// The machine.
     pub machine: Machine,
-    /// What went wrong without ending the run, one line each.
+    /// Warnings of the run, one line each.
     pub warnings: Vec<String>,
 }
 
-/// Wall-clock seconds by what they were spent on. Those of `inside` add up to [`Report::seconds`]; those of `beside` are this
-/// process's own, where a run was resumed.
+/// Breakdown of wall-clock seconds. Those of `inside` add up to [`Report::seconds`]; those of `beside` are only this process's if
+/// the run was resumed.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Breakdown {
     /// Between the first step and the last.
@@ -105,7 +105,7 @@ pub struct Inside {
     pub steps: f64,
     /// Density control.
     pub density: f64,
-    /// Waiting for photographs.
+    /// Loading photographs.
     pub loading: f64,
     /// Evaluating held-out views.
     pub evaluating: f64,
@@ -120,14 +120,14 @@ pub struct Inside {
 /// Wall-clock seconds before a run's first step and after its last.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Beside {
-    /// Reading the dataset, making or reading the first state.
+    /// Reading the dataset, creating or reading the initial state.
     pub preparing: f64,
-    /// Writing the scene, evaluating it.
+    /// Writing and evaluating the scene.
     pub finishing: f64,
 }
 
 impl Inside {
-    /// What `times` and the seconds of the steps say.
+    /// The breakdown of `times` and the seconds of the steps.
     pub fn of(times: &Times, training_seconds: f64) -> Self {
         let Times {
             wall,
@@ -155,29 +155,29 @@ impl Inside {
 pub struct ViewReport {
     /// Name within the dataset.
     pub name: String,
-    /// dB; NaN, and absent from files, where the view's mask leaves no pixel.
+    /// dB; NaN, and absent from files, if the view's mask excludes all pixels.
     #[serde(default = "nan", deserialize_with = "or_nan", skip_serializing_if = "is_nan")]
     pub psnr: f64,
-    /// Structural similarity, likewise.
+    /// Structural similarity; NaN, and absent from files, if the view's mask excludes all pixels.
     #[serde(default = "nan", deserialize_with = "or_nan", skip_serializing_if = "is_nan")]
     pub ssim: f64,
-    /// Perceptual distance, where there are weights.
+    /// Perceptual distance, if network weights are available.
     pub lpips: Option<f64>,
-    /// PSNR in dB of the right half after a fit on the left half, where the report has it.
+    /// PSNR in dB of the right half after a fit on the left half, if measured.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub half_fit_psnr: Option<f64>,
-    /// The photograph, a path relative to the report with forward slashes; empty where none was written.
+    /// Path of the photograph, relative to the report with forward slashes; empty if not written.
     pub truth: String,
-    /// The rendering, likewise.
+    /// Path of the rendering, likewise.
     pub render: String,
-    /// Their difference, likewise.
+    /// Path of their difference, likewise.
     pub error: String,
 }
 
 /// One stage of the recipe.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct StageReport {
-    /// As the recipe names it.
+    /// Its name in the recipe.
     pub name: String,
     /// Its first step.
     pub first_step: u64,
@@ -188,18 +188,18 @@ pub struct StageReport {
     pub seconds: f64,
 }
 
-/// The run at one step.
+/// Metrics of one step.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct CurvePoint {
-    /// Steps taken.
+    /// Steps completed.
     pub step: u64,
     /// Wall-clock seconds of the steps so far.
     #[serde(deserialize_with = "or_nan")]
     pub seconds: f64,
-    /// Training loss; NaN, and absent from files, where only PSNR was measured.
+    /// Training loss; NaN, and absent from files, if only PSNR was measured.
     #[serde(default = "nan", deserialize_with = "or_nan", skip_serializing_if = "is_nan")]
     pub loss: f64,
-    /// PSNR in dB, where it was measured at this step.
+    /// PSNR in dB, if measured at this step.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub psnr: Option<f64>,
     /// Gaussians.
@@ -220,24 +220,24 @@ fn or_nan<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f64, D::Error> {
 
 const PAGE: &str = include_str!("page.html");
 const SCRIPT: &str = include_str!("page.js");
-/// What every page looks like.
+/// Style of every page.
 const STYLE: &str = include_str!("page.css");
-/// Charts and dividers, for every page.
+/// Charts and image sliders of every page.
 const WIDGETS: &str = include_str!("widgets.js");
 
-/// The report as one HTML page, for a file beside the pictures its views name.
+/// The report as one HTML page, to be written beside the pictures that its views name.
 ///
-/// All text reaches the page as data that the script sets as text, never as markup.
+/// All text is embedded as data that the script sets as text, never as markup.
 pub fn to_html(report: &Report) -> String {
     filled(PAGE, "", SCRIPT, report)
 }
 
-/// `page` with what all pages share, what this one adds to the style, its script, and its data.
+/// `page` with the style, scripts and data inserted.
 pub(crate) fn filled(page: &str, style: &str, script: &str, data: &impl Serialize) -> String {
     let data = serde_json::to_string(data).expect("plain data always serialises");
     // Within a script element only `<` can end the data (`</script>`, `<!--`); JSON strings may escape any character.
     let data = data.replace('<', "\\u003c");
-    // The data goes in last: nothing in it is looked at for marks.
+    // The data is inserted last: it is not searched for placeholders.
     page.replace("/*STYLE*/", &format!("{STYLE}{style}"))
         .replace("/*SCRIPT*/", &format!("{WIDGETS}{script}"))
         .replace("/*DATA*/", &data)
@@ -275,7 +275,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_finite_becomes_null_and_comes_back_as_nan() {
+    fn non_finite_numbers_become_null_and_read_back_as_nan() {
         let report = Report {
             psnr: f64::NAN,
             ssim: f64::INFINITY,
@@ -321,9 +321,9 @@ mod tests {
     }
 
     #[test]
-    fn the_page_asks_nothing_of_the_network() {
+    fn the_page_uses_no_network() {
         let html = to_html(&Report::default());
-        // The one address allowed is the name of the SVG namespace, which is never fetched.
+        // The only URL allowed is the name of the SVG namespace, which is never fetched.
         let rest = html.replace("http://www.w3.org/2000/svg", "");
         for word in ["http://", "https://", "src=\"//", "@import", "url("] {
             assert!(!rest.contains(word), "{word}");

@@ -1,7 +1,7 @@
 (() => {
   const report = JSON.parse(document.getElementById("data").textContent);
   const lpips = report.lpips_net ? `LPIPS (${report.lpips_net})` : "LPIPS";
-  // Of a field its numbers are told; there are no splats to count.
+  // A field has a number of parameters instead of splats.
   const isField = known(report.parameters);
   document.title = `${report.dataset || "Report"} – Irradia`;
   at("version").textContent = report.version;
@@ -28,7 +28,7 @@
     for (const line of report.warnings) at("warning-list").append(make("li", line));
   }
 
-  // Held-out views: a selector, truth and render with a divider, the error beside them.
+  // Held-out views: a selector, truth and render with a slider, the error beside them.
   let chosen = 0;
   const views = report.views;
   const show = (index) => {
@@ -47,7 +47,7 @@
   at("previous").addEventListener("click", () => show(chosen - 1));
   at("next").addEventListener("click", () => show(chosen + 1));
 
-  // The table of metrics; a click on a heading sorts, a second one turns the order.
+  // The table of metrics; a click on a heading sorts, a second click reverses the order.
   const columns = [
     ["View", (v) => v.name, (v) => v.name],
     ["PSNR, dB", (v) => v.psnr, (v) => fixed(v.psnr, 2)],
@@ -129,7 +129,7 @@
   at("over-seconds").addEventListener("click", () => curves("seconds"));
   curves("step");
 
-  // The knobs over steps, those of a kind in one chart; a kind that never changes is said in words.
+  // The parameters over steps, one chart per kind; a kind that never changes is listed as text.
   const { schedule } = report;
   if (schedule && schedule.steps.length > 1) {
     at("schedule-part").hidden = false;
@@ -138,7 +138,7 @@
     const still = [];
     for (const [kind, title, options] of [
       ["scale", "Image scale", { zero: true }],
-      ["count", "Splats allowed and trained, shares", { zero: true }],
+      ["count", "Splats allowed and trained, fractions", { zero: true }],
       ["degree", "Degree of spherical harmonics", { zero: true }],
       ["rate", "Learning rates", { log: true }],
       ["loss", "Weights of losses", { zero: true }],
@@ -156,8 +156,8 @@
         points: values.map((y, j) => ({ x: schedule.steps[j], y })).filter((p) => !options.log || p.y > 0) }));
       at("schedule").append(chart(title, lines, { ...options, marks, legend: lines.length > 1, tell: brief }));
     }
-    const source = schedule.done ? "As it was done, over steps" :
-      "As planned, laid over the steps that each stage took: how early stages ended is not known of a run fitted into a time";
+    const source = schedule.done ? "As executed, over steps" :
+      "As planned, aligned with the steps of each stage: how early stages ended is not known for a run fitted into a time";
     const names = report.stages.map((stage) => stage.name).join(", ");
     at("schedule-note").textContent =
       `${source}; lines part the stages ${names}.${still.length ? ` Unchanged: ${still.join("; ")}.` : ""}`;
@@ -173,10 +173,10 @@
     ["Memory", bytes(machine.memory)],
     ["System", machine.os],
     ["Device", report.device],
-    ["Steps alone", `${duration(report.training_seconds)} (${duration(report.cpu_seconds)} of processor time)`],
+    ["Steps only", `${duration(report.training_seconds)} (${duration(report.cpu_seconds)} of CPU time)`],
     ["First to last step", [duration(report.seconds), spent(report.breakdown?.inside)].filter(Boolean).join(": ")],
     ["Before and after", spent(report.breakdown?.beside)],
-    ["All included", duration(report.total_seconds)],
+    ["Total", duration(report.total_seconds)],
     ["Per step", known(report.training_seconds) && report.steps ? `${((1e3 * report.training_seconds) / report.steps).toFixed(1)} ms` : "–"],
     ["Background", report.background],
     ["Seed", String(report.seed)],

@@ -1,39 +1,39 @@
-//! The knobs over a run's steps, to be drawn.
+//! Parameter curves over a run's steps, for plotting.
 //!
-//! What a run did follows from its recipe and from when it entered its stages: the schedule is gone through again.
+//! A run's schedule follows from its recipe and from the start of its stages: the schedule is replayed.
 
 use super::StageReport;
 use crate::recipe::{Exit, Param, Recipe};
-use crate::schedule::{Clock, Signal, plan};
+use crate::schedule::{Clock, StepMetrics, plan};
 use serde::{Deserialize, Serialize};
 
-/// Knobs over the steps of a run.
+/// Parameter curves over the steps of a run.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Schedule {
-    /// True where it is what the run did. False where it is the plan alone, laid over the steps that each stage took: a
-    /// run fitted into a time whose stages may end early does not tell by how much they did. Within a stage recipe time is
-    /// taken to go evenly over the steps, as it does but for the drift of a budget's pace.
+    /// Whether this is what the run did. Otherwise it is the plan, aligned with the steps of each stage: for a run fitted into a
+    /// time whose stages may end early, the skipped time is unknown. Within a stage recipe time is assumed to be proportional to
+    /// steps, which is exact up to the drift of a budget's pace.
     pub done: bool,
-    /// Steps gone by.
+    /// Steps completed.
     pub steps: Vec<f32>,
-    /// The knobs at those steps; those that are 0 throughout are left out.
+    /// The parameters at those steps; those that are always 0 are omitted.
     pub knobs: Vec<KnobCurve>,
 }
 
-/// A knob's values.
+/// A parameter's values.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct KnobCurve {
-    /// What it is, such as `loss.ssim`; the part before the dot is shared by those that are drawn together.
+    /// Its name, such as `loss.ssim`; curves with the same part before the dot share a chart.
     pub name: String,
     /// At [`Schedule::steps`].
     pub values: Vec<f32>,
 }
 
-/// Samples of a run, about.
+/// Approximate number of samples of a run.
 const SAMPLES: f64 = 160.0;
 
-/// The schedule of a run of `recipe` that stands at `clock` and entered the stages as `stages` say. `steps` is how many it
-/// was fitted into, `timed` whether it was fitted into a time instead.
+/// The schedule of a run of `recipe` at `clock` with the stages `stages`. `steps` is the number of steps into which it was
+/// fitted, `timed` whether it was fitted into a time instead.
 pub fn schedule(recipe: &Recipe, stages: &[StageReport], clock: &Clock, steps: Option<u64>, timed: bool) -> Schedule {
     let spans = spans(recipe, stages, clock, steps, timed);
     let mut run = Clock::new(recipe);
@@ -44,7 +44,7 @@ pub fn schedule(recipe: &Recipe, stages: &[StageReport], clock: &Clock, steps: O
         done: spans.iter().all(|span| span.known),
         ..Schedule::default()
     };
-    let signal = Signal {
+    let metrics = StepMetrics {
         error: 0.0,
         measured: None,
         views: 1,
@@ -52,13 +52,13 @@ pub fn schedule(recipe: &Recipe, stages: &[StageReport], clock: &Clock, steps: O
     for (i, span) in spans.iter().enumerate() {
         let full = recipe.stage[i].steps as f64;
         let parts = (SAMPLES * span.lasted / total.max(1.0)).ceil().clamp(1.0, SAMPLES) as usize;
-        // Just before its end the stage is still in force.
+        // Just before its end the stage is still current.
         let last = (span.lasted - 1e-3).max(0.0);
         let mut before = 0.0;
         for part in 0..=parts {
             let time = last * part as f64 / parts as f64;
             if part > 0 {
-                run.tick(&quiet, time - before, signal);
+                run.tick(&quiet, time - before, metrics);
             }
             before = time;
             if run.stage == i {
@@ -67,12 +67,12 @@ pub fn schedule(recipe: &Recipe, stages: &[StageReport], clock: &Clock, steps: O
             }
         }
         if span.lasted < full {
-            // An error of 0 is below this limit, so that the stage ends as it did in the run.
+            // An error of 0 is below this limit, so that the stage ends as in the run.
             let mut leaving = quiet.clone();
             leaving.stage[i].exit = Some(Exit::Threshold { tau: f64::INFINITY });
-            run.tick(&leaving, span.lasted - last, signal);
+            run.tick(&leaving, span.lasted - last, metrics);
         } else if run.stage == i {
-            run.tick(&quiet, full - last, signal);
+            run.tick(&quiet, full - last, metrics);
         }
     }
     schedule
@@ -81,25 +81,25 @@ pub fn schedule(recipe: &Recipe, stages: &[StageReport], clock: &Clock, steps: O
     schedule
 }
 
-/// How long a run was in a stage.
+/// The extent of a stage in a run.
 struct Span {
-    /// Steps made when it was entered.
+    /// Steps completed at its start.
     entered: u64,
     /// Steps made in it.
     steps: u64,
-    /// Recipe steps that went by in it.
+    /// Recipe steps completed in it.
     lasted: f64,
     /// Whether that is certain.
     known: bool,
 }
 
-/// Of the stages that the run came to.
+/// The spans of the stages that the run has entered.
 fn spans(recipe: &Recipe, stages: &[StageReport], clock: &Clock, steps: Option<u64>, timed: bool) -> Vec<Span> {
     let total = recipe.total_steps() as f64;
     let (mut spans, mut entered, mut time) = (Vec::new(), 0, 0.0);
     for (i, stage) in recipe.stage.iter().enumerate().take(clock.stage + 1) {
         let full = stage.steps as f64;
-        // A stage of less than a step was never entered.
+        // A stage shorter than a step was never entered.
         let report = stages.iter().find(|report| report.name == stage.name);
         let end = report.map_or(entered, |report| report.last_step.max(entered));
         let made = end - entered;
@@ -114,7 +114,7 @@ fn spans(recipe: &Recipe, stages: &[StageReport], clock: &Clock, steps: Option<u
             (full, false)
         } else {
             let lasted = made as f64 * pace;
-            // The step in which a stage would have ended by itself counts as its end.
+            // If the stage would have ended by itself in that step, it was complete.
             let whole = report.is_none() || lasted > full - 1.01 * pace;
             (if whole { full } else { lasted }, true)
         };
@@ -149,7 +149,7 @@ impl Schedule {
     }
 }
 
-/// The curves of the table of parameters.
+/// The parameters with curves.
 fn drawn() -> impl Iterator<Item = (&'static str, Param)> {
     let curve = |param: Param| param.row().curve.map(|name| (name, param));
     Param::ALL.into_iter().filter_map(curve)
@@ -227,8 +227,8 @@ mod tests {
     }
 
     #[test]
-    fn a_stage_left_early_shows_what_was_done() {
-        // As the clock itself goes when the first stage ends after 40 steps.
+    fn a_stage_ended_early_shows_what_was_done() {
+        // As the clock advances if the first stage ends after 40 steps.
         let recipe = recipe("stage.warmup.exit={ when = 'threshold', tau = 0.1 }");
         let mut clock = Clock::new(&recipe);
         let mut truth = Vec::new();
@@ -236,12 +236,12 @@ mod tests {
         while !clock.finished(&recipe) {
             truth.push(plan(&recipe, &clock));
             let error = if clock.step + 1 < 40 { 1.0 } else { 0.0 };
-            let signal = Signal {
+            let metrics = StepMetrics {
                 error,
                 measured: Some(error),
                 views: 1,
             };
-            if clock.tick(&recipe, 1.0, signal) {
+            if clock.tick(&recipe, 1.0, metrics) {
                 entered.push(clock.step);
             }
         }
@@ -268,7 +268,7 @@ mod tests {
     }
 
     #[test]
-    fn a_run_that_was_stopped_ends_where_it_stands_and_a_timed_one_says_what_it_is() {
+    fn a_stopped_run_ends_at_its_last_step_and_a_timed_one_is_marked_as_plan() {
         let recipe = recipe("stage.warmup.exit={ when = 'threshold', tau = 0.1 }");
         let clock = Clock {
             stage: 1,

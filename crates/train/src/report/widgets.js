@@ -1,5 +1,5 @@
 "use strict";
-// What the pages share: text, a divider between two pictures, and charts.
+// Shared by the pages: text, a slider between two pictures, and charts.
 const at = (id) => document.getElementById(id);
 const make = (name, text, attributes = {}) => {
   const element = document.createElement(name);
@@ -8,7 +8,7 @@ const make = (name, text, attributes = {}) => {
   return element;
 };
 
-// A number that was not finite arrives as null and is shown as a dash.
+// Numbers that are not finite are null and are shown as a dash.
 const known = (x) => typeof x === "number" && Number.isFinite(x);
 const fixed = (x, digits) => (known(x) ? x.toFixed(digits) : "–");
 const whole = (x) => (known(x) ? Math.round(x).toLocaleString("en") : "–");
@@ -21,7 +21,7 @@ const duration = (s) => {
 const bytes = (b) => (!b ? "–" : b < 1e9 ? `${Math.round(b / 1e6)} MB` : `${(b / 1e9).toFixed(1)} GB`);
 const address = (path) => path.split("/").map(encodeURIComponent).join("/");
 
-// A divider over two pictures that lie on each other; the second has the class "over".
+// A slider between two overlaid pictures; the second has the class "over".
 const slider = (frame) => {
   let divide = 50;
   const slide = (percent) => {
@@ -52,7 +52,7 @@ const slider = (frame) => {
   slide(50);
 };
 
-// Apart in hue and in lightness; what is beyond the eighth is lighter.
+// Distinct in hue and in lightness; from the ninth on lighter.
 const HUES = [18, 198, 75, 275, 145, 330, 235, 45];
 const color = (i) => `hsl(${HUES[i % HUES.length]} 62% ${i < HUES.length ? 46 : 66}%)`;
 
@@ -68,7 +68,7 @@ const short = (x) => {
   if (size >= 1e4) return `${+(x / 1e3).toFixed(1)}k`;
   return String(+x.toPrecision(3));
 };
-// Round numbers that part low..high into as many parts or fewer.
+// Round numbers that divide low..high into at most as many parts.
 const ticks = (low, high, parts = 4) => {
   const rough = (high - low) / parts, power = 10 ** Math.floor(Math.log10(rough));
   const step = [1, 2, 5, 10].map((m) => m * power).find((s) => s >= rough);
@@ -100,7 +100,7 @@ const chart = (title, lines, { smooth = false, zero = false, digits = 0, unit = 
   const [x0, x1] = span(xs);
   const place = log ? (y) => Math.log10(y) : (y) => y;
   let [y0, y1] = span(ys.map(place));
-  // One wild first value must not flatten the rest.
+  // One extreme first value must not flatten the rest.
   if (smooth) y1 = Math.min(y1, [...ys].sort((a, b) => a - b)[Math.floor(0.99 * (ys.length - 1))] * 1.25);
   if (zero) y0 = 0;
   if (y1 <= y0) y1 = y0 + (Math.abs(y0) || 1);
@@ -139,7 +139,7 @@ const chart = (title, lines, { smooth = false, zero = false, digits = 0, unit = 
     const frame = picture.getBoundingClientRect();
     const x = ((event.clientX - frame.left) / frame.width) * width;
     const y = ((event.clientY - frame.top) / frame.height) * height;
-    // Where there is one line its height does not matter.
+    // With a single line the height does not matter.
     const far = (p) => Math.abs(px(p.x) - x) + (lines.length > 1 ? Math.abs(py(p.y) - y) : 0);
     const near = all.reduce((a, b) => (far(b) < far(a) ? b : a));
     cursor.setAttribute("x1", px(near.x));

@@ -1,83 +1,83 @@
-//! Everything that depends on time. [`plan`] is pure: what one step does. [`Clock::tick`] moves on by one step.
+//! Everything that depends on time. [`plan`] is pure: the plan of one step. [`Clock::tick`] advances by one step.
 
+mod convergence;
 mod outline;
 #[cfg(test)]
 mod published;
-mod watch;
 
-pub use outline::{Ahead, Moment, ahead, outline};
-pub use watch::Watch;
+pub use convergence::ConvergenceMonitor;
+pub use outline::{OutlinePoint, UpcomingStretch, outline, upcoming};
 
-use crate::recipe::{Density, Exit, Knob, MergeKnobs, Param, Recipe, Shape, Values};
+use crate::recipe::{DensityControl, Exit, Knob, MergeKnobs, Param, Recipe, Shape, Values};
+use convergence::MEASURE_EVERY;
 use irradia_scene::Rng;
 use irradia_splat::regularize::Regularizers;
 use irradia_splat::{Rates, Statistics};
-use watch::MEASURE_EVERY;
 
-/// Where a run stands.
+/// Position of a run in its schedule.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Clock {
-    /// Steps made.
+    /// Steps completed.
     pub step: u64,
-    /// Recipe steps gone by; runs faster than `step` when a run is shorter than its recipe, and jumps over what is left of
-    /// a stage that ends early.
+    /// Recipe steps completed; advances faster than `step` when a run is shorter than its recipe, and skips the rest of a stage
+    /// that ends early.
     pub time: f64,
-    /// Where knobs over the whole run stand, in recipe steps: like `time`, but what was jumped over is spread over what is
-    /// left, so that nothing jumps.
+    /// Position of run-wide parameters, in recipe steps: like `time`, but skipped time is spread over the rest of the run, so that
+    /// no parameter jumps.
     pub progress: f64,
-    /// Recipe steps of `progress` in one of `time`.
+    /// Recipe steps of `progress` per recipe step of `time`.
     pub stretch: f64,
-    /// The stage.
+    /// Index of the current stage.
     pub stage: usize,
-    /// `time` when it was entered.
+    /// `time` at the start of the stage.
     pub stage_time: f64,
-    /// `step` when it was entered.
+    /// `step` at the start of the stage.
     pub stage_step: u64,
-    /// The values in force when it was entered: a ramp without `from` goes on from them.
+    /// The values in effect at the start of the stage: a ramp without `from` continues from them.
     pub carried: Values,
-    /// Whether opacities were reset before.
+    /// Whether opacities have been reset.
     pub was_reset: bool,
-    /// The training error in this stage.
-    pub watch: Watch,
+    /// Monitors the training error in this stage.
+    pub monitor: ConvergenceMonitor,
 }
 
-/// What a step tells the schedule.
+/// The metrics of a step.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Signal {
+pub struct StepMetrics {
     /// L1 error of the step's view.
     pub error: f64,
-    /// Mean L1 error over (a subset of) the training views, where the plan asked for it.
+    /// Mean L1 error over (a subset of) the training views, if the plan requested it.
     pub measured: Option<f64>,
-    /// Training views.
+    /// Number of training views.
     pub views: u64,
 }
 
-/// What one step does.
+/// The plan of one step.
 #[derive(Clone, Debug, PartialEq)]
 pub struct StepPlan {
     /// Size of the training image relative to the data's.
     pub image_scale: f32,
     /// SH bands in use.
     pub sh_degree: u32,
-    /// Every parameter; [`StepPlan::value`] has them as a step uses them.
+    /// Values of all parameters; [`StepPlan::value`] gives those in effect.
     pub values: Values,
     /// Density statistics to gather.
     pub gathers: Option<Statistics>,
-    /// Share of the photograph's edges in the error that is gathered.
+    /// Weight of the photograph's edges in the gathered error.
     pub edge_share: f32,
-    /// A round of density control, after the step.
+    /// A round of density control after the step.
     pub densify: Option<Round>,
-    /// Adjacent splats are merged, after the step.
+    /// Merge adjacent splats after the step.
     pub merge: Option<MergeKnobs>,
-    /// Opacities are lowered to this, after the step.
+    /// Reset opacities to this after the step.
     pub reset_opacity: Option<f32>,
-    /// The smoothing filter is worked out anew, before the step.
+    /// Recompute the smoothing filter before the step.
     pub refilter: bool,
-    /// The occupancy grid of a field is updated, after the step.
+    /// Update a field's occupancy grid after the step.
     pub update_occupancy: bool,
-    /// The error is measured over training views, after the step.
+    /// Measure the error over training views after the step.
     pub measure: bool,
-    /// Held-out views are evaluated, after the step.
+    /// Evaluate held-out views after the step.
     pub evaluate: bool,
     /// A checkpoint is written, after the step.
     pub checkpoint: bool,
@@ -87,19 +87,19 @@ pub struct StepPlan {
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Round {
     /// The strategy.
-    pub density: Density,
+    pub density: DensityControl,
     /// Whether oversized splats go too.
     pub prune_large: bool,
     /// Which round of the stage it is, from 1.
     pub number: u64,
-    /// Splats there may be, as a share of the cap.
+    /// Maximum number of splats, as a fraction of the cap.
     pub count_share: f64,
-    /// How much of the stage lies behind, now and at the round before.
-    pub share: [f64; 2],
+    /// Fraction of the stage completed, now and at the previous round.
+    pub completed: [f64; 2],
 }
 
 impl StepPlan {
-    /// A parameter as the step uses it ([`Values::in_effect`]).
+    /// A parameter's value in effect ([`Values::in_effect`]).
     pub fn value(&self, param: Param) -> f32 {
         self.values.in_effect(param) as f32
     }
@@ -109,12 +109,12 @@ impl StepPlan {
         self.values[switch] >= 0.5
     }
 
-    /// Whether frames are compared by depth, and so rendered with it.
+    /// Whether a depth loss is active, which requires depth to be rendered.
     pub fn compares_depth(&self) -> bool {
         self.value(Param::DepthWeight) > 0.0 || self.value(Param::SmoothWeight) > 0.0
     }
 
-    /// Losses of the splats themselves.
+    /// Weights of the regularisers.
     pub fn regularizers(&self) -> Regularizers {
         Regularizers {
             opacity: self.value(Param::OpacityReg),
@@ -150,45 +150,45 @@ impl Clock {
             stage_step: 0,
             carried: Values::default_values(),
             was_reset: false,
-            watch: Watch::default(),
+            monitor: ConvergenceMonitor::default(),
         };
         clock.carried = values(recipe, &clock);
         clock
     }
 
-    /// Whether the recipe is over.
+    /// Whether the recipe is complete.
     pub fn finished(&self, recipe: &Recipe) -> bool {
         self.stage >= recipe.stage.len()
     }
 
-    /// Moves on by one step that took `pace` recipe steps; true where a stage ended.
-    pub fn tick(&mut self, recipe: &Recipe, pace: f64, signal: Signal) -> bool {
+    /// Advances by one step that took `pace` recipe steps; true if a stage ended.
+    pub fn tick(&mut self, recipe: &Recipe, pace: f64, metrics: StepMetrics) -> bool {
         let before = values(recipe, self);
         self.was_reset |= plan(recipe, self).reset_opacity.is_some();
         self.step += 1;
         self.time += pace;
         self.progress += pace * self.stretch;
         let in_stage = self.time - self.stage_time;
-        self.watch
-            .observe(signal.error, signal.measured, signal.views, in_stage);
+        self.monitor
+            .observe(metrics.error, metrics.measured, metrics.views, in_stage);
         let exit = recipe.stage.get(self.stage).and_then(|stage| stage.exit.as_ref());
-        if exit.is_some_and(|exit| self.watch.ends(exit, signal.views, in_stage)) {
+        if exit.is_some_and(|exit| self.monitor.ends(exit, metrics.views, in_stage)) {
             self.leave_early(recipe);
         }
         self.enter_stages(recipe, before)
     }
 
-    /// Lets `time` pass without a step.
-    fn pass(&mut self, recipe: &Recipe, time: f64) {
+    /// Advances `time` without a step.
+    fn advance(&mut self, recipe: &Recipe, time: f64) {
         let before = values(recipe, self);
         self.time += time;
         self.progress += time * self.stretch;
         self.enter_stages(recipe, before);
     }
 
-    /// Enters the stage that `time` is in; true where it is another. `before` are the values that were in force.
+    /// Enters the stage at `time`; true if it differs from the current one. `before` are the values in effect until then.
     fn enter_stages(&mut self, recipe: &Recipe, before: Values) -> bool {
-        // Half a thousandth of a step forgives the rounding of a sum of fractions.
+        // Half a thousandth of a step tolerates the rounding of a sum of fractions.
         let mut ended = false;
         while self.stage < recipe.stage.len()
             && self.time - self.stage_time >= recipe.stage[self.stage].steps as f64 - 5e-4
@@ -197,7 +197,7 @@ impl Clock {
             self.stage += 1;
             self.stage_step = self.step;
             self.carried = before;
-            self.watch = Watch::default();
+            self.monitor = ConvergenceMonitor::default();
             ended = true;
         }
         ended
@@ -212,7 +212,7 @@ impl Clock {
     }
 }
 
-/// The value of every knob.
+/// The values of all parameters.
 fn values(recipe: &Recipe, clock: &Clock) -> Values {
     let Some(stage) = recipe.stage.get(clock.stage) else {
         return clock.carried;
@@ -254,20 +254,20 @@ fn value(knob: &Knob, time: f64, length: f64, carried: f64) -> f64 {
     }
 }
 
-/// Whether the step that `clock` stands before is one of every `every`.
+/// Whether the step at `clock` completes a multiple of `every` steps.
 pub fn is_due(clock: &Clock, every: u64) -> bool {
     (clock.step + 1).is_multiple_of(every)
 }
 
-/// What the step that `clock` stands before does. After the recipe's end it is what the last step did, at rest.
+/// The plan of the step at `clock`. After the recipe's end, that of the last step, with nothing due.
 pub fn plan(recipe: &Recipe, clock: &Clock) -> StepPlan {
     let values = values(recipe, clock);
     let stage = &recipe.stage[clock.stage.min(recipe.stage.len() - 1)];
-    // Counted as people do: after the step that makes it the n-th.
+    // Counted from 1: the step after whose completion the stage has n steps.
     let in_stage = clock.step + 1 - clock.stage_step;
     let density = stage.density;
     let next = recipe.stage.get(clock.stage + 1).and_then(|stage| stage.density);
-    let gathers = density.or(next.filter(Density::gathers_ahead));
+    let gathers = density.or(next.filter(DensityControl::gathers_early));
     let measured = matches!(stage.exit, Some(Exit::Threshold { .. } | Exit::Relative { .. }));
     StepPlan {
         image_scale: values[Param::ImageScale] as f32,
@@ -278,15 +278,15 @@ pub fn plan(recipe: &Recipe, clock: &Clock) -> StepPlan {
         densify: density
             .filter(|density| in_stage.is_multiple_of(density.every()))
             .map(|density| {
-                let share = ((clock.time - clock.stage_time) / stage.steps as f64).clamp(0.0, 1.0);
-                // Steps and time run in proportion within a stage, nearly: a budget's pace drifts.
-                let before = share * (in_stage - density.every()) as f64 / in_stage as f64;
+                let completed = ((clock.time - clock.stage_time) / stage.steps as f64).clamp(0.0, 1.0);
+                // Steps and time are nearly proportional within a stage: a budget's pace drifts.
+                let before = completed * (in_stage - density.every()) as f64 / in_stage as f64;
                 Round {
                     density,
                     prune_large: clock.was_reset,
                     number: in_stage / density.every(),
                     count_share: values[Param::CountShare],
-                    share: [share, before],
+                    completed: [completed, before],
                 }
             }),
         merge: stage.merge.filter(|merge| in_stage.is_multiple_of(merge.every)),
@@ -307,12 +307,12 @@ const REFILTER_EVERY: u64 = 100;
 /// Steps between updates of a field's occupancy grid (Instant-NGP).
 const OCCUPANCY_EVERY: u64 = 16;
 
-/// The stream of the run's seed that orders the views.
+/// Random stream of the view order, derived from the run's seed.
 const STREAM_VIEWS: u64 = 3;
 
-/// The training views from this step on, each once: shuffled anew in each pass over them. A function of the seed and the
-/// step alone, so that a resumed run sees what the first would have.
-pub fn coming_views(train: &[usize], seed: u64, clock: &Clock) -> Vec<usize> {
+/// The training views from this step on, each once: shuffled anew in each pass over them. A pure function of seed and step, so
+/// that a resumed run sees the same views.
+pub fn upcoming_views(train: &[usize], seed: u64, clock: &Clock) -> Vec<usize> {
     let n = train.len() as u64;
     let pass = |number: u64| {
         let mut order = train.to_vec();
@@ -320,23 +320,23 @@ pub fn coming_views(train: &[usize], seed: u64, clock: &Clock) -> Vec<usize> {
         order
     };
     let (number, at) = (clock.step / n, (clock.step % n) as usize);
-    let mut coming = pass(number)[at..].to_vec();
-    // What was seen in this pass comes again in the next.
-    let mut seen: Vec<usize> = coming.clone();
+    let mut upcoming = pass(number)[at..].to_vec();
+    // Views already seen in this pass come in the next.
+    let mut seen: Vec<usize> = upcoming.clone();
     seen.sort_unstable();
-    coming.extend(
+    upcoming.extend(
         pass(number + 1)
             .into_iter()
             .filter(|view| seen.binary_search(view).is_err()),
     );
-    coming
+    upcoming
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    const QUIET: Signal = Signal {
+    const QUIET: StepMetrics = StepMetrics {
         error: 0.1,
         measured: None,
         views: 4,
@@ -387,25 +387,25 @@ mod tests {
     }
 
     #[test]
-    fn knobs_follow_their_curves_and_go_on_over_stages() {
+    fn parameters_follow_their_curves_and_continue_over_stages() {
         let p = plans(&recipe(), 1.0);
         assert_eq!(p.len(), 20);
         assert!(
             (p[10].value(Param::RateMeans) - 0.1).abs() < 1e-6,
-            "half way in the logarithm"
+            "half-way in the logarithm"
         );
         assert_eq!(
             [p[3].sh_degree, p[4].sh_degree, p[11].sh_degree, p[12].sh_degree],
             [0, 1, 1, 3]
         );
         assert!((p[5].value(Param::RateQuats) - 0.5).abs() < 1e-6);
-        // The second stage's ramp has no `from`: it goes on from the last value in force, without a jump.
+        // The second stage's ramp has no `from`: it continues from the last value in effect, without a jump.
         assert!((p[10].value(Param::RateQuats) - p[9].value(Param::RateQuats)).abs() < 1e-6);
         assert!((p[15].value(Param::RateQuats) - 0.5 * p[9].value(Param::RateQuats)).abs() < 1e-6);
         assert_eq!(
             (p[3].value(Param::SsimWeight), p[15].value(Param::SsimWeight)),
             (0.2, 0.2),
-            "a knob that a stage does not name is carried"
+            "a parameter that a stage does not set is carried over"
         );
         assert!((p[15].value(Param::RateOpacities) - 1.5).abs() < 1e-6);
     }
@@ -433,7 +433,7 @@ mod tests {
     }
 
     #[test]
-    fn a_shorter_run_passes_through_the_whole_recipe() {
+    fn a_shorter_run_covers_the_whole_recipe() {
         let recipe = recipe();
         for steps in [7u64, 13, 40] {
             let p = plans(&recipe, 20.0 / steps as f64);
@@ -453,11 +453,11 @@ mod tests {
         let mut seen = Vec::new();
         for step in 0..15 {
             clock.step = step;
-            let coming = coming_views(&train, 7, &clock);
-            let mut all = coming.clone();
+            let upcoming = upcoming_views(&train, 7, &clock);
+            let mut all = upcoming.clone();
             all.sort_unstable();
-            assert_eq!(all, train, "what comes names each view once");
-            seen.push(coming[0]);
+            assert_eq!(all, train, "the upcoming views contain each view once");
+            seen.push(upcoming[0]);
         }
         for pass in seen.chunks(5) {
             let mut sorted = pass.to_vec();
@@ -468,7 +468,7 @@ mod tests {
     }
 
     #[test]
-    fn a_stage_shorter_than_a_step_is_passed_over() {
+    fn a_stage_shorter_than_a_step_is_skipped() {
         let mut recipe = recipe();
         recipe.stage[0].steps = 1;
         let mut clock = Clock::new(&recipe);
@@ -477,8 +477,8 @@ mod tests {
         assert!(clock.tick(&recipe, 100.0, QUIET) && clock.finished(&recipe));
     }
 
-    /// Ticks until the recipe is over with errors made up by `error(step)`; the steps after which a stage ended, and plans.
-    fn ends(recipe: &Recipe, error: impl Fn(u64) -> Signal) -> (Vec<u64>, Vec<StepPlan>) {
+    /// Ticks until the recipe is complete with the errors of `error(step)`; returns the steps after which a stage ended, and plans.
+    fn ends(recipe: &Recipe, error: impl Fn(u64) -> StepMetrics) -> (Vec<u64>, Vec<StepPlan>) {
         let mut clock = Clock::new(recipe);
         let (mut ends, mut plans) = (Vec::new(), Vec::new());
         while !clock.finished(recipe) {
@@ -497,19 +497,19 @@ mod tests {
         recipe
     }
 
-    fn error(value: f64) -> Signal {
-        Signal { error: value, ..QUIET }
+    fn error(value: f64) -> StepMetrics {
+        StepMetrics { error: value, ..QUIET }
     }
 
     #[test]
     fn a_stage_ends_when_its_error_is_below_the_threshold_but_not_before_every_view_was_seen() {
         let recipe = with_exit(Exit::Threshold { tau: 0.05 });
         assert_eq!(ends(&recipe, |_| error(0.01)).0[0], 4, "four views");
-        assert_eq!(ends(&recipe, |_| error(0.1)).0[0], 300, "its steps guard it");
+        assert_eq!(ends(&recipe, |_| error(0.1)).0[0], 300, "its steps limit it");
         // An exponential mean over four views of a step from 0.1 to 0.01 passes 0.05 at the third step after it.
         assert_eq!(ends(&recipe, |s| error(if s < 50 { 0.1 } else { 0.01 })).0[0], 53);
-        // What was measured counts for more than the estimate.
-        let measured = |step| Signal {
+        // A measurement takes precedence over the estimate.
+        let measured = |step| StepMetrics {
             measured: (step == 99).then_some(0.02),
             ..QUIET
         };
@@ -549,18 +549,18 @@ mod tests {
         let recipe = with_exit(Exit::Threshold { tau: 0.05 });
         let (at, p) = ends(&recipe, |s| error(if s < 50 { 0.1 } else { 0.01 }));
         assert_eq!(at, [53, 63]);
-        // Over the whole run: it goes on from where it was, and what is left of it is run through in what is left.
+        // Over the whole run: it continues from where it was, and the rest of the curve spans the rest of the run.
         let slope: Vec<f32> = p
             .windows(2)
             .map(|w| w[1].value(Param::RateMeans) / w[0].value(Param::RateMeans))
             .collect();
         assert!(
             (slope[52] / slope[51] - 1.0).abs() < 0.02,
-            "the step over the border is one of the old slope"
+            "the step across the stage boundary has the old slope"
         );
         let last = f64::from(p[62].value(Param::RateMeans)) * f64::from(slope[61]);
         assert!((last / 0.01 - 1.0).abs() < 0.01, "{last}");
-        // Over the stage: the next one's ramp goes on from the value in force.
+        // Over the stage: the next stage's ramp continues from the value in effect.
         assert!((p[53].value(Param::RateQuats) - p[52].value(Param::RateQuats)).abs() < 1e-6);
     }
 }

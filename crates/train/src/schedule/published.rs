@@ -1,12 +1,12 @@
-//! The recipes of published schedules against the rules of their authors' code, written out by hand.
+//! Tests of the recipes of published schedules against the rules of their authors' code, written out by hand.
 
-use super::{Clock, Signal, plan};
-use crate::recipe::{Density, Param, Recipe};
+use super::{Clock, StepMetrics, plan};
+use crate::recipe::{DensityControl, Param, Recipe};
 use std::ops::Range;
 
 const STEPS: u64 = 30_000;
 
-/// What happens in a step, from 1.
+/// An action of a step, from 1.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Happens {
     /// A stage begins with this step.
@@ -17,7 +17,7 @@ enum Happens {
     Gathers(bool),
     /// Noise on the means from this step on, or no longer.
     Noise(bool),
-    /// A round of density control, and whether it removes what is oversized in the world.
+    /// A round of density control, and whether it removes splats oversized in the world.
     Densify { oversized: bool },
     /// A round of relocation and growth.
     Relocate,
@@ -29,10 +29,10 @@ enum Happens {
 
 type Events = Vec<(u64, Happens)>;
 
-/// What the recipe does.
+/// The actions of the recipe.
 fn of_recipe(name: &str) -> Events {
     let recipe = Recipe::parse(name, Recipe::built_in(name).unwrap(), &[]).unwrap();
-    let signal = Signal {
+    let metrics = StepMetrics {
         error: 0.1,
         measured: None,
         views: 100,
@@ -64,7 +64,7 @@ fn of_recipe(name: &str) -> Events {
             events.push((
                 step,
                 match round.density {
-                    Density::Mcmc(_) => Happens::Relocate,
+                    DensityControl::Mcmc(_) => Happens::Relocate,
                     _ => Happens::Densify { oversized },
                 },
             ));
@@ -73,7 +73,7 @@ fn of_recipe(name: &str) -> Events {
             events.push((step, Happens::Reset));
         }
         assert!(plan.merge.is_none() && plan.image_scale == 1.0, "{name}: step {step}");
-        clock.tick(&recipe, 1.0, signal);
+        clock.tick(&recipe, 1.0, metrics);
     }
     assert_eq!(clock.step, STEPS, "{name}");
     events.push((last_round + 1, Happens::LastRound));
@@ -81,7 +81,7 @@ fn of_recipe(name: &str) -> Events {
     events
 }
 
-/// `train.py` of 3DGS (Kerbl et al. 2023), which Taming 3DGS keeps but for how a round chooses; a black background.
+/// `train.py` of 3DGS (Kerbl et al. 2023), which Taming 3DGS follows except in how a round selects; a black background.
 fn of_3dgs() -> Events {
     let (densify_from, densify_until, interval, reset_interval) = (500, 15_000, 100, 3000);
     let mut events = vec![(1, Happens::Stage), (1, Happens::Gathers(true))];
@@ -102,7 +102,7 @@ fn of_3dgs() -> Events {
         }
         if iteration < densify_until {
             if iteration > densify_from && iteration.is_multiple_of(interval) {
-                // `size_threshold`; its part on screen compares sizes that were zeroed.
+                // `size_threshold`; its screen-size criterion compares zeroed sizes.
                 let oversized = iteration > reset_interval;
                 events.push((iteration, Happens::Densify { oversized }));
             }
@@ -116,7 +116,7 @@ fn of_3dgs() -> Events {
     events
 }
 
-/// `train.py` of 3DGS-MCMC (Kheradmand et al. 2024), but for the last step, in which its optimiser rests.
+/// `train.py` of 3DGS-MCMC (Kheradmand et al. 2024), except for the last step, in which its optimiser is skipped.
 fn of_mcmc() -> Events {
     let (densify_from, densify_until, interval) = (500, 25_000, 100);
     let mut events = vec![(1, Happens::Stage), (1, Happens::Noise(true))];
@@ -150,7 +150,7 @@ fn count(events: &Events, what: impl Fn(&Happens) -> bool) -> usize {
 }
 
 #[test]
-fn what_happens_in_30000_steps_is_what_the_published_code_does() {
+fn actions_in_30000_steps_match_the_published_code() {
     let published = of_3dgs();
     let resets: Vec<u64> = published
         .iter()
@@ -163,7 +163,7 @@ fn what_happens_in_30000_steps_is_what_the_published_code_does() {
     for name in ["classic", "absgrad", "taming"] {
         compare(name, &of_recipe(name), &published);
     }
-    // Relocation needs no statistics, which cost next to nothing.
+    // Relocation needs no statistics, but gathering them costs hardly anything.
     let mut mcmc = of_recipe("mcmc");
     mcmc.retain(|(_, happens)| !matches!(happens, Happens::Gathers(_)));
     assert_eq!(
@@ -210,7 +210,7 @@ fn rates_are_the_published_ones() {
     }
 }
 
-/// `get_count_array` of Taming 3DGS: round i of 145 ends with a parabola's value at i, which has its vertex at the last.
+/// `get_count_array` of Taming 3DGS: round i of 145 ends with the value at i of a parabola with its vertex at the last round.
 #[test]
 fn taming_adds_along_the_published_parabola() {
     let recipe = Recipe::parse("taming", Recipe::built_in("taming").unwrap(), &[]).unwrap();
@@ -232,10 +232,10 @@ fn taming_adds_along_the_published_parabola() {
             stage_step: 500,
             ..Clock::new(&recipe)
         };
-        let share = plan(&recipe, &clock).densify.expect("a round").share;
-        count = irradia_splat::densify::taming::next_count(count, budget as usize, share);
+        let completed = plan(&recipe, &clock).densify.expect("a round").completed;
+        count = irradia_splat::densify::taming::next_count(count, budget as usize, completed);
         let relative = count as f64 / published(round) - 1.0;
-        // Rounds lie a step of 100 to either side of the published points.
+        // Rounds are one step of 100 to either side of the published points.
         assert!(
             relative.abs() < 0.01,
             "round {round}: {count}, published {}",
@@ -245,10 +245,10 @@ fn taming_adds_along_the_published_parabola() {
     assert_eq!(prune_rounds(&recipe), 1..28);
 }
 
-/// The rounds that remove splats: `iter_num < 27`, from 0.
+/// The rounds that prune: `iter_num < 27`, from 0.
 fn prune_rounds(recipe: &Recipe) -> Range<u64> {
     match recipe.stage[1].density {
-        Some(Density::Taming(knobs)) => 1..knobs.prune_rounds + 1,
+        Some(DensityControl::Taming(knobs)) => 1..knobs.prune_rounds + 1,
         _ => 0..0,
     }
 }

@@ -1,8 +1,7 @@
-//! After blending: an affine map of colours for each photograph.
+//! After blending: an affine colour map per photograph.
 //!
-//! What a camera's automatic exposure and white balance did to a photograph (Kerbl et al., "Hierarchical 3D Gaussians",
-//! 2024, train the same 3 x 4 matrix): `y = A x + b` in the photograph's own, sRGB-encoded colours. Above 1 a photograph is
-//! white, and so is `y`.
+//! It models a camera's automatic exposure and white balance (Kerbl et al., "Hierarchical 3D Gaussians", 2024, train the same
+//! 3 x 4 matrix): `y = A x + b` in the photograph's own, sRGB-encoded colours. Photographs saturate at 1, and so does `y`.
 
 use super::Occupant;
 use super::per_view::PerViewAdam;
@@ -10,25 +9,25 @@ use crate::tensor_file::{NamedTensor, TensorSource, to_bytes};
 use irradia_measure::Affine;
 use rayon::prelude::*;
 
-/// Numbers of a view: A row by row, then b.
+/// Parameters of a view: A row by row, then b.
 const N: usize = 12;
 const IDENTITY: [f32; N] = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0];
-/// Pixels whose gradients are added up together: a fixed number, so that threads change no bit of the sum.
+/// Pixels whose gradients are summed together: a fixed number, so that the sum does not depend on threads.
 const PIECE: usize = 4096;
 
-/// An affine map of colours for each view, the identity at first. The mean over the training views stays the identity: a
-/// change that all photographs share belongs to the scene, which would otherwise drift into a light that none of them has.
+/// An affine colour map per view, initially the identity. The mean over the training views stays the identity: a change common
+/// to all photographs belongs to the scene, which would otherwise drift to an exposure of no photograph.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Exposure {
     /// `[views][N]`.
     maps: Vec<[f32; N]>,
-    /// The views that are trained on.
+    /// The training views.
     train: Vec<usize>,
     adam: PerViewAdam<N>,
 }
 
 impl Exposure {
-    /// For `views` views, of which those in `train` are trained on.
+    /// For `views` views, of which `train` are the training views.
     pub fn new(views: usize, train: &[usize]) -> Self {
         Self {
             maps: vec![IDENTITY; views],
@@ -46,7 +45,7 @@ impl Exposure {
         }
     }
 
-    /// `color` `[3, H, W]` as the photograph of `view` shows it, at most 1.
+    /// `color` `[3, H, W]` as in the photograph of `view`, at most 1.
     pub fn develop(&self, view: usize, color: &[f32], to: &mut Vec<f32>) {
         let (m, pixels) = (&self.maps[view], color.len() / 3);
         to.resize(color.len(), 0.0);
@@ -60,7 +59,7 @@ impl Exposure {
     }
 
     /// The vector-Jacobian product of [`Self::develop`]: `v` `[3, H, W]` becomes the gradient of `color`; returns that of the
-    /// view's numbers. Where the photograph is white at most, only what makes it darker passes.
+    /// view's parameters. Where the output is saturated, only gradients that darken it pass.
     pub fn vjp(&self, view: usize, color: &[f32], v: &mut [f32]) -> [f32; N] {
         let (m, pixels) = (&self.maps[view], color.len() / 3);
         let (red, rest) = v.split_at_mut(pixels);
@@ -102,17 +101,17 @@ impl Exposure {
         total.map(|v| v as f32)
     }
 
-    /// [`Self::vjp`] and a step of Adam on `view` at `rate`, drawn to the identity by `weight` times the mean squared difference.
+    /// [`Self::vjp`] and a step of Adam on `view` at `rate`, regularised to the identity by `weight` times the mean squared difference.
     pub fn step(&mut self, view: usize, color: &[f32], v: &mut [f32], rate: f32, weight: f32) {
         let mut gradient = self.vjp(view, color, v);
         for ((g, value), identity) in gradient.iter_mut().zip(self.maps[view]).zip(IDENTITY) {
             *g += weight * 2.0 / N as f32 * (value - identity);
         }
         let change = self.adam.step(view, gradient, [rate; N]);
-        let shared = change.map(|change| change / self.train.len() as f32);
+        let common = change.map(|change| change / self.train.len() as f32);
         for other in &self.train {
-            for (value, shared) in self.maps[*other].iter_mut().zip(shared) {
-                *value -= shared;
+            for (value, common) in self.maps[*other].iter_mut().zip(common) {
+                *value -= common;
             }
         }
         for (value, change) in self.maps[view].iter_mut().zip(change) {
@@ -171,7 +170,7 @@ mod tests {
     }
 
     #[test]
-    fn a_view_that_nothing_was_learnt_of_stays_as_it_is() {
+    fn an_untrained_view_is_unchanged() {
         let (exposure, color, _) = example();
         let mut y = Vec::new();
         exposure.develop(0, &color, &mut y);
@@ -183,7 +182,7 @@ mod tests {
         let (exposure, color, weights) = example();
         let mut v = weights.clone();
         let of_map = exposure.vjp(1, &color, &mut v);
-        // Colours stay below 1, so that the map is linear and a wide step costs nothing but rounding.
+        // Colours stay below 1, so that the map is linear and a large step costs only rounding.
         let h = 1e-2f32;
         for i in 0..N {
             let at = |sign: f32| {
@@ -210,7 +209,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_white_is_only_made_darker() {
+    fn saturated_pixels_are_only_darkened() {
         let exposure = Exposure::new(1, &[0]);
         let color = [1.5, 1.5, 0.5];
         let mut y = Vec::new();
@@ -222,7 +221,7 @@ mod tests {
     }
 
     #[test]
-    fn steps_find_how_gains_differ_and_leave_their_mean() {
+    fn steps_recover_relative_gains_and_preserve_their_mean() {
         let mut rng = Rng::new(4, 4);
         let color: Vec<f32> = (0..3 * PIXELS).map(|_| rng.range(0.0, 0.6)).collect();
         let mut exposure = Exposure::new(3, &[0, 2]);

@@ -1,13 +1,13 @@
-//! Where something trained can sit in a step on splats.
+//! Sockets: the places in a splat step for further trained components.
 //!
-//! | socket | gives | gets back |
+//! | socket | provides | receives |
 //! |---|---|---|
-//! | before projection | a [`Placement`]: the camera, and the splats where they move | gradients of the camera and of the moved splats |
+//! | before projection | a [`Placement`]: the camera, and the splats if they move | gradients of the camera and of the moved splats |
 //! | at colour | a colour to add to each splat in view, by its [`irradia_splat::Surface`] | the gradients of these colours |
-//! | after blending | the frame as the photograph shows it | the gradient of that frame, which it turns into that of the scene's |
+//! | after blending | the frame as the photograph shows it | the gradient of that frame, which it converts to that of the scene's frame |
 //!
-//! Each occupant has its forward pass, the vector-Jacobian product beside it, its own Adam, and named tensors. What keeps a
-//! run (checkpoints, resume, files beside the scene) sees occupants through [`Occupant`] alone, and what renders asks
+//! Each occupant has its forward pass, the vector-Jacobian product beside it, its own Adam, and named tensors. Code that saves
+//! runs (checkpoints, resume, files beside the scene) accesses occupants through [`Occupant`] alone, and rendering goes through
 //! [`Sockets`]: a new one is a file here, a field of [`Sockets`] and an arm in the method of its socket.
 
 mod exposure;
@@ -18,7 +18,7 @@ mod residual;
 pub use exposure::Exposure;
 pub(crate) use per_view::PerViewAdam;
 pub use poses::PoseRefinement;
-pub(crate) use poses::{tangent_gradient, turned};
+pub(crate) use poses::{corrected, tangent_gradient};
 pub use residual::{Residual, added_colors};
 
 use crate::recipe::{Param, Recipe};
@@ -29,28 +29,28 @@ use irradia_field::Space;
 use irradia_scene::{Camera, Dataset};
 use irradia_splat::{Engine, Placement, RenderOptions};
 
-/// Names of the files that occupants may leave beside a scene.
+/// Names of the files that occupants may write beside a scene.
 pub const FILES: [&str; 3] = ["poses.safetensors", "residual.safetensors", "exposure.safetensors"];
 
-/// What keeps a run sees of whatever sits in a socket.
+/// The part of a socket's occupant that is saved with a run.
 pub trait Occupant {
-    /// What its tensors' names begin with in a checkpoint, and what its file beside the scene is called.
+    /// Prefix of its tensors' names in a checkpoint, and name of its file beside the scene.
     fn name(&self) -> &'static str;
 
     /// Parameters, moments and counts.
     fn tensors(&self) -> Vec<NamedTensor>;
 
-    /// Takes over what [`Self::tensors`] gave.
+    /// Restores the result of [`Self::tensors`].
     ///
     /// # Errors
     /// One line, when a tensor is missing or has another shape.
     fn restore(&mut self, tensors: TensorSource) -> Result<(), String>;
 
-    /// A safetensors file for beside the scene; `None` where nothing was learnt.
+    /// A safetensors file to write beside the scene; `None` if untrained.
     fn export(&self) -> Option<Vec<u8>>;
 }
 
-/// What is trained beside the splats, by socket.
+/// The occupants, by socket.
 #[derive(Default)]
 pub struct Sockets {
     /// Before projection: the cameras' poses.
@@ -64,10 +64,10 @@ pub struct Sockets {
 }
 
 impl Sockets {
-    /// What `recipe` asks for, nothing learnt yet. `transparent`: photographs have alpha.
+    /// The occupants that `recipe` requests, untrained. `transparent`: photographs have alpha.
     ///
     /// # Errors
-    /// When a residual field finds no space that the cameras share.
+    /// When the cameras determine no space for a residual field.
     pub fn new(recipe: &Recipe, dataset: &Dataset, transparent: bool, seed: u64) -> Result<Self, TrainError> {
         let residual = match &recipe.residual {
             Some(knobs) => {
@@ -87,7 +87,7 @@ impl Sockets {
         })
     }
 
-    /// Everything that is trained, to be kept and restored.
+    /// All occupants, for saving.
     pub fn occupants(&self) -> Vec<&dyn Occupant> {
         let poses = self.poses.as_ref().map(|o| o as &dyn Occupant);
         let residual = self.residual.as_ref().map(|o| o as &dyn Occupant);
@@ -95,7 +95,7 @@ impl Sockets {
         [poses, residual, exposure].into_iter().flatten().collect()
     }
 
-    /// Likewise, to be written.
+    /// All occupants, for restoring.
     pub fn occupants_mut(&mut self) -> Vec<&mut dyn Occupant> {
         let poses = self.poses.as_mut().map(|o| o as &mut dyn Occupant);
         let residual = self.residual.as_mut().map(|o| o as &mut dyn Occupant);
@@ -103,13 +103,13 @@ impl Sockets {
         [poses, residual, exposure].into_iter().flatten().collect()
     }
 
-    /// The files for beside the scene: name and bytes.
+    /// The files to write beside the scene: name and bytes.
     pub fn files(&self) -> Vec<(String, Vec<u8>)> {
         let file = |occupant: &dyn Occupant| Some((format!("{}.safetensors", occupant.name()), occupant.export()?));
         self.occupants().into_iter().filter_map(file).collect()
     }
 
-    /// Before projection: the splats and the camera of `view` at its time, as they have been learnt to be.
+    /// Before projection: the splats and the camera of `view` at its time, with refinements.
     pub fn place(&self, view: usize, camera: &Camera) -> Placement {
         match &self.poses {
             Some(poses) => poses.refined(view, camera).into(),
@@ -117,8 +117,7 @@ impl Sockets {
         }
     }
 
-    /// Renders what `placement` shows, with what is added at colour and done after blending; [`Self::frame_color`] is the
-    /// outcome.
+    /// Renders `placement`, with colours added at colour and the map applied after blending; [`Self::frame_color`] is the result.
     pub fn render(
         &mut self,
         engine: &mut Engine,
@@ -153,7 +152,7 @@ impl Sockets {
         self.poses.is_some()
     }
 
-    /// One step of what sits after blending: `v_color` is the gradient of [`Self::frame_color`], and becomes that of the
+    /// One step of the occupants after blending: `v_color` is the gradient of [`Self::frame_color`], and becomes that of the
     /// scene's own colours.
     pub fn step_after_blending(&mut self, engine: &Engine, view: usize, v_color: &mut [f32], plan: &StepPlan) {
         if let Some(exposure) = &mut self.exposure {
@@ -162,8 +161,8 @@ impl Sockets {
         }
     }
 
-    /// One step of what sits before and at projection, after the frame's backward pass. `camera` is the one that was rendered,
-    /// `extent` the scene's size in world units.
+    /// One step of the occupants before projection and at colour, after the frame's backward pass. `camera` is the rendered camera,
+    /// `extent` the scene's extent in world units.
     pub fn step_before_blending(
         &mut self,
         engine: &mut Engine,

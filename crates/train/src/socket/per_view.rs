@@ -1,4 +1,4 @@
-//! Adam for a few numbers of each view: a view's numbers move only in the steps that show it.
+//! Adam for per-view parameters: a view's parameters are updated only in the steps that show it.
 
 use crate::tensor_file::{NamedTensor, TensorSource};
 use irradia_compute::adam::{Active, AdamStep, adam};
@@ -8,17 +8,17 @@ use irradia_compute::{Level, Planes};
 const BETAS: [f32; 2] = [0.9, 0.999];
 const EPSILON: f32 = 1e-15;
 
-/// Moments and step counts of `N` numbers a view.
+/// Moments and step counts of `N` parameters per view.
 #[derive(Clone, Debug, PartialEq)]
 pub struct PerViewAdam<const N: usize> {
     /// First and second moments, `[N, views]`.
     moments: [Planes; 2],
-    /// Steps that each view has had.
+    /// Number of steps of each view.
     steps: Vec<u64>,
 }
 
 impl<const N: usize> PerViewAdam<N> {
-    /// For `views` views that have had no step.
+    /// For `views` views without steps.
     pub fn new(views: usize) -> Self {
         Self {
             moments: [Planes::zeros(N, views), Planes::zeros(N, views)],
@@ -26,12 +26,12 @@ impl<const N: usize> PerViewAdam<N> {
         }
     }
 
-    /// How many views.
+    /// Number of views.
     pub fn views(&self) -> usize {
         self.steps.len()
     }
 
-    /// What one step with `gradient` adds to the numbers of `view`.
+    /// The change of the parameters of `view` in one step with `gradient`.
     pub fn step(&mut self, view: usize, gradient: [f32; N], rates: [f32; N]) -> [f32; N] {
         if gradient.iter().any(|g| !g.is_finite()) {
             return [0.0; N];
@@ -75,7 +75,7 @@ impl<const N: usize> PerViewAdam<N> {
         ]
     }
 
-    /// Takes over what [`Self::tensors`] gave.
+    /// Restores the result of [`Self::tensors`].
     ///
     /// # Errors
     /// One line, when a tensor is missing or has another shape.
@@ -95,7 +95,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_first_step_of_each_view_is_a_full_one_however_late_it_comes() {
+    fn the_first_step_of_each_view_is_a_full_one_however_late() {
         let mut adam = PerViewAdam::<2>::new(3);
         for _ in 0..5 {
             adam.step(0, [1.0, -2.0], [0.1, 0.1]);

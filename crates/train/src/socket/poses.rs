@@ -1,8 +1,8 @@
-//! Before projection: each camera's pose, which the photographs themselves put right.
+//! Before projection: refinement of each camera's pose by the photometric loss.
 //!
-//! A correction lies between the camera that the dataset gives and the one that took the photograph:
-//! `x_refined = exp(omega) (R x + t) + tau`. Steps are taken in the tangent space at the correction as it stands (Lin et al.
-//! 2021, "BARF", section 3.1), so that its derivative is exact however large it has become.
+//! A correction maps from the camera space of the dataset's pose to that of the true pose:
+//! `x_refined = exp(omega) (R x + t) + tau`. Steps are taken in the tangent space at the current correction (Lin et al. 2021,
+//! "BARF", section 3.1), so that the derivative is exact for corrections of any size.
 
 use super::Occupant;
 use super::per_view::PerViewAdam;
@@ -15,15 +15,15 @@ use irradia_splat::CameraGradient;
 const NUMBERS: usize = 7;
 const IDENTITY: [f32; NUMBERS] = [1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0];
 
-/// A correction of each view's pose, none at first. A motion that all training views share is the scene's and is taken out
-/// of them: held-out cameras, which are not refined, stay where they are in the scene.
+/// A correction of each view's pose, initially the identity. The motion common to all training views is removed from them,
+/// since it belongs to the scene: held-out cameras, which are not refined, keep their place in the scene.
 #[derive(Clone, Debug, PartialEq)]
 pub struct PoseRefinement {
     /// `[views][NUMBERS]`.
     corrections: Vec<[f32; NUMBERS]>,
-    /// The views that are trained on, with their cameras in the dataset.
+    /// The training views, with their cameras in the dataset.
     train: Vec<(usize, Camera)>,
-    /// Of the tangent: rotation in radians, translation in world units.
+    /// Adam on the tangent: rotation in radians, translation in world units.
     adam: PerViewAdam<6>,
 }
 
@@ -38,25 +38,25 @@ impl PoseRefinement {
         }
     }
 
-    /// The camera of `view` with its correction.
+    /// The corrected camera of `view`.
     pub fn refined(&self, view: usize, camera: &Camera) -> Camera {
         let (rotation, translation) = parts(&self.corrections[view]);
         moved(camera, rotation, translation)
     }
 
-    /// One step of Adam on `view`. `camera` is the refined camera that was rendered, `gradient` its gradient; `rate` is in
+    /// One step of Adam on `view`. `camera` is the corrected camera that was rendered, `gradient` its gradient; `rate` is in
     /// radians, and in units of `extent` for the translation.
     pub fn step(&mut self, view: usize, camera: &Camera, gradient: &CameraGradient, rate: f32, extent: f32) {
         let v = tangent_gradient(camera, gradient);
         let shift = rate * extent;
         let step = self.adam.step(view, v, [rate, rate, rate, shift, shift, shift]);
-        let shared = Twist::from(step)
+        let common = Twist::from(step)
             .to_world(&camera.pose)
             .scaled(-1.0 / self.train.len() as f32);
         for at in 0..self.train.len() {
             let (other, base) = self.train[at];
             let camera = self.refined(other, &base);
-            self.move_by(other, shared.to_camera(&camera.pose));
+            self.move_by(other, common.to_camera(&camera.pose));
         }
         self.move_by(view, Twist::from(step));
     }
@@ -95,7 +95,7 @@ impl Twist {
         }
     }
 
-    /// The same motion of a point in the world, for one in the space of a camera at `pose`.
+    /// Converts a motion in the space of a camera at `pose` to the same motion of world points.
     fn to_world(self, pose: &Pose) -> Self {
         let omega = pose.rotation * self.omega;
         Self {
@@ -127,7 +127,7 @@ fn moved(camera: &Camera, rotation: Quat, translation: Vec3) -> Camera {
 }
 
 /// `camera` after `x_new = exp(omega) x + tau`; `tangent` is omega in radians, then tau in world units.
-pub(crate) fn turned(camera: &Camera, tangent: [f32; 6]) -> Camera {
+pub(crate) fn corrected(camera: &Camera, tangent: [f32; 6]) -> Camera {
     let Twist { omega, tau } = tangent.into();
     moved(camera, Quat::from_scaled_axis(omega), tau)
 }
@@ -137,7 +137,7 @@ fn parts(correction: &[f32; NUMBERS]) -> (Quat, Vec3) {
     (Quat::from_xyzw(x, y, z, w), Vec3::new(tx, ty, tz))
 }
 
-/// The gradient with regard to `(omega, tau)` of `exp(omega) (R x + t) + tau` at zero, from that of R and t: with
+/// The gradient with respect to `(omega, tau)` of `exp(omega) (R x + t) + tau` at zero, from that of R and t: with
 /// `dR = [omega]x R` and `dt = [omega]x t + tau`, it is the axial vector of `v_R R^T + v_t t^T`, and `v_t`.
 pub(crate) fn tangent_gradient(camera: &Camera, gradient: &CameraGradient) -> [f32; 6] {
     let (r, t) = camera.pose.camera_from_world_parts();
@@ -193,13 +193,13 @@ mod tests {
         let tangent = [0.1, -0.2, 0.05, 0.3, 0.1, -0.4];
         let before = camera.pose.camera_from_world(x);
         let want = Quat::from_scaled_axis(Vec3::new(0.1, -0.2, 0.05)) * before + Vec3::new(0.3, 0.1, -0.4);
-        let got = turned(&camera, tangent).pose.camera_from_world(x);
+        let got = corrected(&camera, tangent).pose.camera_from_world(x);
         assert!((got - want).length() < 1e-5, "{got} and {want}");
-        assert!((turned(&camera, [0.0; 6]).pose.position - camera.pose.position).length() < 1e-6);
+        assert!((corrected(&camera, [0.0; 6]).pose.position - camera.pose.position).length() < 1e-6);
     }
 
     #[test]
-    fn a_motion_that_all_views_share_is_not_theirs() {
+    fn a_motion_common_to_all_views_is_removed() {
         let view = |x: f32| View {
             name: String::new(),
             camera: Camera::new(
@@ -231,7 +231,7 @@ mod tests {
             let camera = poses.refined(view, &dataset.views[view].camera);
             poses.step(view, &camera, &gradient, 1e-3, 1.0);
         }
-        // Each correction as a motion of the world, of which the first order is enough.
+        // Each correction as a motion of the world, to first order.
         let motion = |view: usize| {
             let [_, x, y, z, tau @ ..] = poses.corrections[view];
             let (omega, tau) = (2.0 * Vec3::new(x, y, z), Vec3::from_array(tau));
@@ -263,7 +263,7 @@ mod tests {
         let mut engine = Engine::new(SplatState::new(splats));
         let (camera, options) = (camera(), RenderOptions::default());
         let pixels = 3 * 48 * 40;
-        // Smooth over the image, as losses are over what moves little.
+        // Smooth over the image, like the losses of small motions.
         let weights: Vec<f32> = (0..pixels)
             .map(|i| (0.1 * (i % 48) as f32).sin() * (0.08 * (i / 48) as f32).cos())
             .collect();
@@ -278,7 +278,7 @@ mod tests {
                 let mut at = |sign: f32| {
                     let mut tangent = [0.0; 6];
                     tangent[i] = sign * h;
-                    loss(turned(&camera, tangent))
+                    loss(corrected(&camera, tangent))
                 };
                 (at(1.0) - at(-1.0)) / f64::from(2.0 * h)
             })
@@ -288,10 +288,10 @@ mod tests {
             camera: true,
             ..OutputGradient::of_color(&weights)
         });
-        let got = tangent_gradient(&camera, &engine.camera_gradient().expect("asked for"));
+        let got = tangent_gradient(&camera, &engine.camera_gradient().expect("requested"));
         let size = want.iter().map(|v| v.abs()).fold(0.0, f64::max);
         for (i, (got, want)) in got.iter().zip(&want).enumerate() {
-            // Splats that enter and leave at alpha 1/255 make differences rough.
+            // Splats that enter and leave at alpha 1/255 make finite differences noisy.
             assert!((f64::from(*got) - want).abs() < 0.03 * size, "{i}: {got} and {want}");
         }
     }

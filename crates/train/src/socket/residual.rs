@@ -1,4 +1,4 @@
-//! At colour: what a small field adds to the splats' colours, by place and direction of view.
+//! At colour: a small field that adds to the splats' colours, by position and viewing direction.
 
 use super::Occupant;
 use crate::field_file;
@@ -10,7 +10,7 @@ use glam::Vec3;
 use irradia_field::{Field, FieldState, ResidualQuery, Sampler, Space, StepOptions, residual_at, train_residual};
 use irradia_splat::Surface;
 
-/// Stream of the run's seed.
+/// Random stream, derived from the run's seed.
 const STREAM_RESIDUAL: u64 = 8;
 
 /// A residual field in training.
@@ -22,11 +22,11 @@ pub struct Residual {
 
 /// The colours that `field` adds to `surfaces` seen from `center`, world.
 pub fn added_colors(field: &Field, center: Vec3, surfaces: &[Surface]) -> Vec<[f32; 3]> {
-    residual_at(field, &sights(field, center, surfaces))
+    residual_at(field, &queries(field, center, surfaces))
 }
 
-/// How `field` is asked about `surfaces` seen from `center`.
-fn sights(field: &Field, center: Vec3, surfaces: &[Surface]) -> Vec<ResidualQuery> {
+/// Queries of `field` for `surfaces` seen from `center`.
+fn queries(field: &Field, center: Vec3, surfaces: &[Surface]) -> Vec<ResidualQuery> {
     let mirrored = matches!(field.config.sampler, Sampler::Given { mirrored: true });
     let sight = |surface: &Surface| {
         let view = (Vec3::from(surface.mean) - center).normalize_or_zero();
@@ -45,7 +45,7 @@ fn sights(field: &Field, center: Vec3, surfaces: &[Surface]) -> Vec<ResidualQuer
 }
 
 impl Residual {
-    /// A field that adds nothing yet, in `space`.
+    /// A field in `space` that adds nothing yet.
     ///
     /// # Errors
     /// When the field's configuration is invalid.
@@ -57,12 +57,12 @@ impl Residual {
         })
     }
 
-    /// Whether it adds to what `plan` renders. Once it has begun it stays.
+    /// Whether it adds to the frame of `plan`. Once it has begun it stays active.
     pub fn acts(&self, plan: &StepPlan) -> bool {
         plan.is_on(Param::Residual) || self.state.step > 0
     }
 
-    /// The field, once it has learnt something.
+    /// The field, once trained.
     pub fn learnt(&self) -> Option<&Field> {
         (self.state.step > 0).then_some(&self.state.field)
     }
@@ -72,7 +72,7 @@ impl Residual {
         added_colors(&self.state.field, center, surfaces)
     }
 
-    /// The vector-Jacobian product of [`Self::colors`] and a step of Adam, for the gradients of the colours.
+    /// The vector-Jacobian product of [`Self::colors`] and a step of Adam, given the gradients of the colours.
     pub fn step(&mut self, center: Vec3, surfaces: &[Surface], v_colors: &[[f32; 3]], plan: &StepPlan) {
         let options = StepOptions {
             table_rate: plan.value(Param::RateTables),
@@ -80,8 +80,8 @@ impl Residual {
             beta2: self.beta2,
             ..StepOptions::default()
         };
-        let sights = sights(&self.state.field, center, surfaces);
-        train_residual(&mut self.state, &sights, v_colors, &options);
+        let queries = queries(&self.state.field, center, surfaces);
+        train_residual(&mut self.state, &queries, v_colors, &options);
     }
 }
 

@@ -1,29 +1,29 @@
-//! The training error as stages are left by it: S, the mean L1 over the training views (CurriculumGS).
+//! Convergence of the training error, by which stages end: S, the mean L1 over the training views (CurriculumGS).
 
 use crate::recipe::Exit;
 
-/// A running estimate of S since the stage began.
+/// A running estimate of S since the start of the stage.
 #[derive(Clone, Copy, Debug, PartialEq, Default)]
-pub struct Watch {
-    /// Its value.
+pub struct ConvergenceMonitor {
+    /// The estimate.
     pub mean: f64,
-    /// Steps it has seen.
+    /// Steps observed.
     pub steps: u64,
-    /// Its value when every view had been seen once.
+    /// The estimate when every view had been seen once.
     pub start: f64,
-    /// The least that it was at a time that counted.
+    /// Reference of the plateau rule: the estimate at its last sufficient drop.
     pub best: f64,
-    /// Recipe steps into the stage when it was.
+    /// Recipe steps into the stage at that drop.
     pub best_time: f64,
 }
 
-/// Views beyond which the estimate forgets: as many steps as it averages over at most.
+/// Window of the estimate for many views: the maximum number of steps to average over.
 const LONGEST: u64 = 100;
-/// Steps between measurements of S where a stage may end by its value.
+/// Steps between measurements of S if a stage may end by its value.
 pub const MEASURE_EVERY: u64 = 100;
 
-impl Watch {
-    /// Takes in a step's error, and S itself where it was measured; `time` is in recipe steps since the stage began.
+impl ConvergenceMonitor {
+    /// Records a step's error, and S if it was measured; `time` is in recipe steps since the start of the stage.
     pub fn observe(&mut self, error: f64, measured: Option<f64>, views: u64, time: f64) {
         self.steps += 1;
         let window = views.clamp(1, LONGEST);
@@ -37,7 +37,7 @@ impl Watch {
         }
     }
 
-    /// Whether `exit` lets the stage end. Never before every view (or a hundred) has been seen.
+    /// Whether the stage may end by `exit`. Never before every view (or a hundred) has been seen.
     pub fn ends(&mut self, exit: &Exit, views: u64, time: f64) -> bool {
         if self.steps < views.clamp(1, LONGEST) {
             return false;

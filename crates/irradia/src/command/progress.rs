@@ -68,7 +68,7 @@ impl Progress {
         let message = format!(
             "loss {:.4} psnr {:.2} dB{held_out} {} {rate:.1} steps/s {}",
             report.loss,
-            (-10.0 * mse.log10()).min(MAX_PSNR),
+            (-10.0 * mse.log10()).clamp(f64::NEG_INFINITY, MAX_PSNR),
             size_in_words(report.splats as u64, report.parameters.map(|n| n as u64)),
             self.stage
         );

@@ -1,6 +1,6 @@
 //! Observers: stop, save and pause.
 
-use crate::{begin, dataset, folder, input, scene, unwatched};
+use crate::{begin, dataset, folder, scene, unwatched};
 use irradia_runs::prelude::*;
 use std::fs;
 use std::time::{Duration, Instant};
@@ -223,7 +223,7 @@ fn a_partial_evaluation_is_not_reported() {
     let folder = folder();
     let asked = TrainInput {
         set: vec!["eval_every=2".into()],
-        ..input(folder.path(), "run", 5)
+        ..crate::input(folder.path(), "run", 5)
     };
     let mut run = Run::begin_on(asked.check().expect("a request"), dataset()).expect("a run");
     let mut observer = Impatient(Vec::new());

@@ -4,8 +4,8 @@ use std::io::{self, BufWriter, Write};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
 
-/// Writes a file so that nobody ever sees half of it: under a temporary name in the same folder, synced to the disk,
-/// then renamed over `path`. When anything fails, or the process is killed, what was under `path` stays as it was.
+/// Writes a file atomically: under a temporary name in the same folder, synced to the disk, then renamed to `path`. If
+/// anything fails, or the process is killed, the previous content of `path` is unchanged.
 ///
 /// # Errors
 /// [`FormatError::Write`] with the system's reason, such as a full disk; the temporary file is removed.
@@ -26,14 +26,14 @@ fn write_beside(path: &Path, write: impl FnOnce(&mut dyn Write) -> io::Result<()
     temporary.become_file(path)
 }
 
-/// A file that is removed unless it gets its final name; also when the writing code panics.
+/// A file that is removed unless it gets its final name, even if the writing code panics.
 struct Temporary {
     path: Option<PathBuf>,
 }
 
 impl Temporary {
     fn beside(target: &Path) -> io::Result<(Self, File)> {
-        // Two threads, or a process that was killed earlier under the same id, must not meet in one name.
+        // Two threads, or a killed process with the same id, must not use the same name.
         static COUNTER: AtomicU64 = AtomicU64::new(0);
         let name = target
             .file_name()
@@ -62,7 +62,7 @@ impl Temporary {
 impl Drop for Temporary {
     fn drop(&mut self) {
         if let Some(path) = &self.path {
-            // The first error is the one worth telling; this one would hide it.
+            // The first error is the one to report; this one would hide it.
             let _ = fs::remove_file(path);
         }
     }

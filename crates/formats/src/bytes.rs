@@ -1,6 +1,6 @@
 use crate::Malformed;
 
-/// Little-endian values from a byte slice; running out is an error that says where.
+/// Reads little-endian values from a byte slice; reading past its end is an error that names the position.
 pub(crate) struct Bytes<'a> {
     rest: &'a [u8],
     total: usize,
@@ -58,7 +58,7 @@ impl<'a> Bytes<'a> {
         Ok(values)
     }
 
-    /// Bytes up to a zero, which is taken too; invalid UTF-8 is replaced.
+    /// Bytes up to and including a zero; invalid UTF-8 is replaced.
     pub fn text(&mut self) -> Result<String, Malformed> {
         let length = self.rest.iter().position(|byte| *byte == 0).unwrap_or(self.rest.len());
         let text = String::from_utf8_lossy(self.take(length)?).into_owned();
@@ -66,7 +66,7 @@ impl<'a> Bytes<'a> {
         Ok(text)
     }
 
-    /// Bytes up to a line feed, which is taken too; invalid UTF-8 is replaced.
+    /// Bytes up to and including a line feed; invalid UTF-8 is replaced.
     pub fn line(&mut self) -> Result<String, Malformed> {
         let length = self
             .rest
@@ -78,14 +78,14 @@ impl<'a> Bytes<'a> {
         Ok(text)
     }
 
-    /// A u64 count of records that take at least `least` bytes each, held against what is left before anyone allocates.
+    /// A u64 count of records of at least `least` bytes each, checked against the remaining bytes before any allocation.
     pub fn count(&mut self, least: usize, what: &str) -> Result<usize, Malformed> {
         let declared = self.u64()?;
         let possible = self.rest.len() / least;
         match usize::try_from(declared) {
             Ok(count) if count <= possible => Ok(count),
             _ => Err(Malformed(format!(
-                "promises {declared} {what}, but the {} bytes that follow hold at most {possible}; the file is damaged",
+                "declares {declared} {what}, but the {} bytes that follow hold at most {possible}; the file is damaged",
                 self.rest.len()
             ))),
         }

@@ -1,16 +1,16 @@
-//! Whether an image file goes on to its end. The JPEG decoder paints what is missing grey without a word, and a PNG that
-//! lacks its tail would fail only when it is decoded, in the midst of training.
+//! Detection of truncated image files. The JPEG decoder silently fills missing data with grey, and a truncated PNG would fail
+//! only when it is decoded, in the middle of training.
 
 use std::io::{self, BufRead, Seek};
 
-/// Whether a JPEG in memory has its end-of-image marker behind the start of its scan.
+/// Whether a JPEG in memory has its end-of-image marker after the start of its scan.
 ///
-/// The search begins behind the headers, as these may hold a thumbnail, which is a JPEG of its own with both markers.
+/// The search starts after the headers, which may contain a thumbnail, itself a JPEG with both markers.
 pub(crate) fn jpeg_is_complete(bytes: &[u8]) -> bool {
     let mut rest = bytes.get(2..).unwrap_or_default();
     loop {
         match rest {
-            // Any number of fill bytes may stand before a marker.
+            // Any number of fill bytes may precede a marker.
             [0xFF, 0xFF, ..] => rest = &rest[1..],
             [0xFF, 0xDA, scan @ ..] => return scan.windows(2).rev().any(|pair| pair == [0xFF, 0xD9]),
             [0xFF, _, high, low, ..] => {
@@ -22,7 +22,7 @@ pub(crate) fn jpeg_is_complete(bytes: &[u8]) -> bool {
     }
 }
 
-/// Whether a PNG's chunks lead to its `IEND`; the reader stands at the start of the file and is left anywhere.
+/// Whether a PNG's chunks lead to its `IEND`; the reader is at the start of the file, and anywhere afterwards.
 pub(crate) fn png_is_complete(reader: &mut (impl BufRead + Seek)) -> io::Result<bool> {
     let length = reader.seek(io::SeekFrom::End(0))?;
     let mut at = 8;

@@ -1,49 +1,49 @@
-//! What a file or folder is, for people.
+//! Descriptions of files and folders.
 
 use crate::error::read_and_parse;
-use crate::splats::ply::looks_like_splats;
+use crate::splats::ply::has_splats;
 use crate::{DatasetFormat, DatasetOptions, FormatError, SplatFormat, read_dataset, read_points_ply, read_splats};
 use irradia_scene::{Dataset, GaussianCloud, PointCloud};
 use std::fmt;
 use std::path::Path;
 
-/// What a path leads to.
+/// The kind of a path.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Kind {
     /// A splat scene.
     Splats(SplatFormat),
-    /// A PLY with points that are no splats.
+    /// A PLY with points that are not splats.
     Points,
     /// Posed photographs.
     Dataset(DatasetFormat),
 }
 
-/// Tells what `path` is: a folder or JSON file by what it holds, another file by extension and header.
+/// Detects the kind of `path`: a folder or JSON file by its content, another file by extension and header.
 ///
 /// # Errors
-/// When it does not exist, or is none of what is known; the error says what was looked for.
+/// When it does not exist, or is of no known kind; the error says what was expected.
 pub fn detect(path: &Path) -> Result<Kind, FormatError> {
     if let Some(format) = DatasetFormat::recognise(path) {
         return Ok(Kind::Dataset(format));
     }
     if path.is_dir() {
-        // Says what was looked for.
+        // The error lists what was expected.
         read_dataset(path, &DatasetOptions::default())?;
     }
     match SplatFormat::of(path)? {
-        SplatFormat::Ply if !read_and_parse(path, looks_like_splats)? => Ok(Kind::Points),
+        SplatFormat::Ply if !read_and_parse(path, has_splats)? => Ok(Kind::Points),
         format => Ok(Kind::Splats(format)),
     }
 }
 
-/// A summary of a file or dataset: a title and facts, printed one a line.
+/// A summary of a file or dataset: a title and facts, printed one per line.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Description {
     /// What it is.
     pub title: String,
     /// Name and value of each fact.
     pub facts: Vec<(&'static str, String)>,
-    /// What was left out or assumed when reading.
+    /// What was skipped or assumed when reading.
     pub warnings: Vec<String>,
 }
 
@@ -60,7 +60,7 @@ impl fmt::Display for Description {
     }
 }
 
-/// Reads what `path` leads to and sums it up.
+/// Reads `path` and summarises it.
 ///
 /// # Errors
 /// Those of [`detect`] and of reading it.

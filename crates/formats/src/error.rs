@@ -1,7 +1,7 @@
 use std::io;
 use std::path::{Path, PathBuf};
 
-/// Why bytes could not be understood: one line without the file's name, which the caller adds.
+/// Why bytes could not be parsed: one line without the file's name, which the caller adds.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("{0}")]
 pub struct Malformed(pub String);
@@ -9,7 +9,7 @@ pub struct Malformed(pub String);
 /// Why a file or a folder could not be read or written: one line that says what, where and what to do.
 #[derive(Debug, thiserror::Error)]
 pub enum FormatError {
-    /// The operating system refused to read.
+    /// A read error of the operating system.
     #[error("cannot read {}: {source}", path.display())]
     Read {
         /// The file or folder.
@@ -17,7 +17,7 @@ pub enum FormatError {
         /// The system's reason.
         source: io::Error,
     },
-    /// The operating system refused to write; the target is as it was before.
+    /// A write error of the operating system; the target is unchanged.
     #[error("cannot write {}: {source}; nothing was changed there", path.display())]
     Write {
         /// The file.
@@ -25,7 +25,7 @@ pub enum FormatError {
         /// The system's reason.
         source: io::Error,
     },
-    /// The file was read, but its contents make no sense or are not supported.
+    /// The file was read, but its content is invalid or not supported.
     #[error("{}: {source}", path.display())]
     Malformed {
         /// The file.
@@ -33,32 +33,32 @@ pub enum FormatError {
         /// What is wrong with it.
         source: Malformed,
     },
-    /// The extension names no splat format.
-    #[error("{}: not a splat file by its extension; known are {known}", path.display())]
+    /// The extension is of no splat format.
+    #[error("{}: not a splat file by its extension; known extensions: {known}", path.display())]
     UnknownSplatFormat {
         /// The file.
         path: PathBuf,
-        /// The extensions that would do.
+        /// The known extensions.
         known: String,
     },
-    /// The folder is no dataset, or not of the kind that was asked for.
-    #[error("{}: no dataset found there; looked for {looked_for}", path.display())]
+    /// The folder is not a dataset, or not of the requested kind.
+    #[error("{}: no dataset found there; expected {expected}", path.display())]
     NotADataset {
         /// The folder.
         path: PathBuf,
-        /// The files that would have made it one.
-        looked_for: String,
+        /// The files that a dataset would contain.
+        expected: String,
     },
-    /// Fewer views are left than a scene can be made from.
+    /// Fewer usable views than a scene requires.
     #[error("{}: {usable} usable views of {declared}, at least 3 are needed{reasons}", path.display())]
     TooFewViews {
         /// The dataset.
         path: PathBuf,
-        /// Views left.
+        /// Usable views.
         usable: usize,
-        /// Views the dataset names.
+        /// Declared views.
         declared: usize,
-        /// `; ` and what was left out, or nothing.
+        /// `; ` and the reasons, or empty.
         reasons: String,
     },
     /// All usable views are held out.
@@ -72,10 +72,10 @@ pub enum FormatError {
         path: PathBuf,
         /// Views held out.
         held_out: usize,
-        /// `; ` and what was left out, or nothing.
+        /// `; ` and the reasons, or empty.
         reasons: String,
     },
-    /// An option cannot be meant.
+    /// An invalid option.
     #[error("{0}")]
     Option(String),
 }
@@ -97,7 +97,7 @@ pub(crate) fn read_file(path: &Path) -> Result<Vec<u8>, FormatError> {
     })
 }
 
-/// Reads a whole file and parses it, adding the file's name to what the parser says.
+/// Reads a whole file and parses it, adding the file's name to the parser's error.
 pub(crate) fn read_and_parse<T>(
     path: &Path,
     parse: impl FnOnce(&[u8]) -> Result<T, Malformed>,

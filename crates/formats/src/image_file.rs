@@ -7,7 +7,7 @@ use std::fs::File;
 use std::io::{self, BufRead, BufReader, Cursor, Read, Seek};
 use std::path::Path;
 
-/// An image as 8-bit files hold it.
+/// An image with 8 bits per channel.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Pixels {
     /// Width in pixels.
@@ -20,39 +20,39 @@ pub struct Pixels {
     pub data: Vec<u8>,
 }
 
-/// What an image file says about itself before its pixels are decoded.
+/// The header of an image file, read before its pixels are decoded.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Header {
-    /// As stored, before any turning.
+    /// As stored, before orientation.
     pub width: u32,
-    /// As stored, before any turning.
+    /// As stored, before orientation.
     pub height: u32,
-    /// What EXIF says must be done to see the picture upright.
+    /// The EXIF orientation to apply to see the picture upright.
     pub orientation: Orientation,
 }
 
-/// What decoded pixels are to become.
+/// Target channels of decoded pixels.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Colour {
-    /// Three channels, or four where the file has alpha.
+    /// Three channels, or four if the file has alpha.
     Keep,
     /// One channel.
     Grey,
 }
 
-/// Reads a JPEG or PNG of any depth as 3 or (where the file has alpha) 4 channels of 8 bits, turned as EXIF says.
+/// Reads a JPEG or PNG of any depth as 3 or (if the file has alpha) 4 channels of 8 bits, with the EXIF orientation applied.
 ///
 /// # Errors
-/// When the file cannot be read, is no image, or is truncated.
+/// When the file cannot be read, is not an image, or is truncated.
 pub fn read_image(path: &Path) -> Result<Pixels, FormatError> {
     let header = read_header(path)?;
     decode(path, header.orientation, Colour::Keep)
 }
 
-/// Writes an 8-bit PNG of 1, 3 or 4 channels, whole or not at all.
+/// Writes an 8-bit PNG of 1, 3 or 4 channels, atomically.
 ///
 /// # Errors
-/// When the file cannot be written, or the sizes do not fit each other.
+/// When the file cannot be written, or the sizes do not match.
 pub fn write_png(path: &Path, width: u32, height: u32, channels: u32, data: &[u8]) -> Result<(), FormatError> {
     let color = match channels {
         1 => ExtendedColorType::L8,
@@ -78,10 +78,10 @@ pub fn write_png(path: &Path, width: u32, height: u32, channels: u32, data: &[u8
     })
 }
 
-/// Writes a 16-bit grey PNG, whole or not at all.
+/// Writes a 16-bit grey PNG, atomically.
 ///
 /// # Errors
-/// When the file cannot be written, or the sizes do not fit each other.
+/// When the file cannot be written, or the sizes do not match.
 pub fn write_png_16(path: &Path, width: u32, height: u32, data: &[u16]) -> Result<(), FormatError> {
     if width == 0 || height == 0 || data.len() as u64 != u64::from(width) * u64::from(height) {
         return Err(FormatError::Option(format!(
@@ -90,7 +90,7 @@ pub fn write_png_16(path: &Path, width: u32, height: u32, data: &[u16]) -> Resul
             data.len()
         )));
     }
-    // The codec takes 16-bit samples in the machine's byte order.
+    // The codec expects 16-bit samples in native byte order.
     let bytes: Vec<u8> = data.iter().flat_map(|v| v.to_ne_bytes()).collect();
     write_atomic(path, |out| {
         PngEncoder::new(out)
@@ -99,7 +99,7 @@ pub fn write_png_16(path: &Path, width: u32, height: u32, data: &[u16]) -> Resul
     })
 }
 
-/// Size and orientation, without decoding the pixels. The kind is told by content, not by extension.
+/// Size and orientation, without decoding the pixels. The format is detected by content, not by extension.
 pub(crate) fn read_header(path: &Path) -> Result<Header, FormatError> {
     let mut decoder = open(path)?;
     let (width, height) = decoder.dimensions();
@@ -109,7 +109,7 @@ pub(crate) fn read_header(path: &Path) -> Result<Header, FormatError> {
             format!("an image of {width}x{height} pixels"),
         ));
     }
-    // A broken EXIF block does not make a picture useless.
+    // A broken EXIF block does not make a picture unusable.
     let orientation = decoder.orientation().unwrap_or(Orientation::NoTransforms);
     Ok(Header {
         width,
@@ -118,7 +118,7 @@ pub(crate) fn read_header(path: &Path) -> Result<Header, FormatError> {
     })
 }
 
-/// The pixels, turned by `orientation`.
+/// The pixels, with `orientation` applied.
 pub(crate) fn decode(path: &Path, orientation: Orientation, colour: Colour) -> Result<Pixels, FormatError> {
     let decoder = open(path)?;
     let mut image = DynamicImage::from_decoder(decoder).map_err(|error| undecodable(path, &error))?;
@@ -137,11 +137,11 @@ pub(crate) fn decode(path: &Path, orientation: Orientation, colour: Colour) -> R
     })
 }
 
-/// What a decoder reads from: a file, or bytes that were read already.
+/// A decoder's input: a file, or bytes already read.
 trait Source: BufRead + Seek {}
 impl<T: BufRead + Seek> Source for T {}
 
-/// Opens an image that goes on to its end; the kind is told by its first bytes.
+/// Opens an image that is not truncated; the format is detected by its first bytes.
 fn open(path: &Path) -> Result<impl ImageDecoder + use<>, FormatError> {
     let (source, complete) = open_source(path).map_err(|source| FormatError::Read {
         path: path.to_owned(),
@@ -189,7 +189,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn png_round_trips_for_every_channel_count_and_bad_sizes_are_refused() {
+    fn png_round_trips_for_every_channel_count_and_bad_sizes_are_rejected() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("a.png");
         for channels in [1u32, 3, 4] {

@@ -1,8 +1,8 @@
 //! Files in, files out: datasets of posed photographs, splat scenes, point clouds, pictures, and other programs' tensors.
 //!
-//! Foreign conventions stop in this crate: whatever a file means by a pose, a pixel or a colour, what comes out follows
-//! the conventions of [`irradia_scene`]. The parsers in [`parse`] take bytes and are fuzzed; no input makes them panic,
-//! and no size that a file declares is allocated before it was held against the size the file really has.
+//! Foreign conventions stop in this crate: whatever a file means by a pose, a pixel or a colour, results follow the
+//! conventions of [`irradia_scene`]. The parsers in [`parse`] take bytes and are fuzzed; no input makes them panic, and no
+//! size that a file declares is allocated before it is compared with the size of the file.
 #![forbid(unsafe_code)]
 
 mod atomic;
@@ -21,7 +21,7 @@ mod tensors;
 mod undistort;
 
 pub use atomic::write_atomic;
-pub use dataset::{DatasetFormat, DatasetOptions, Holdout, USUAL_MAX_SIDE, read_dataset};
+pub use dataset::{DEFAULT_MAX_SIDE, DatasetFormat, DatasetOptions, Holdout, read_dataset};
 pub use describe::{Description, Kind, describe, detect};
 pub use error::{FormatError, Malformed};
 pub use image_file::{Pixels, read_image, write_png, write_png_16};

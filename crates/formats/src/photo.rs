@@ -5,20 +5,20 @@ use image::metadata::Orientation;
 use irradia_scene::{LoadError, Photo, PhotoSource, resize_area};
 use std::path::{Path, PathBuf};
 
-/// A mask's pixel counts as "train on this" from here up.
+/// Mask values from here on include the pixel in training.
 const MASK_THRESHOLD: u8 = 128;
 
-/// A photograph on disk with all that must be done to it when it is loaded.
+/// A photograph on disk with the operations to apply when it is loaded.
 #[derive(Clone, Debug)]
 pub(crate) struct PhotoFile {
     pub image: PathBuf,
     pub mask: Option<PathBuf>,
-    /// What to do first; [`Orientation::NoTransforms`] when the poses belong to the pixels as stored.
+    /// Applied first; [`Orientation::NoTransforms`] when the poses belong to the pixels as stored.
     pub orientation: Orientation,
-    /// Size after turning: what the header said when the dataset was read.
-    pub turned: (u32, u32),
+    /// Size after orientation, from the header when the dataset was read.
+    pub upright: (u32, u32),
     pub undistortion: Option<Undistortion>,
-    /// Size of the photograph that comes out.
+    /// Size of the resulting photograph.
     pub size: (u32, u32),
 }
 
@@ -31,12 +31,12 @@ impl PhotoSource for PhotoFile {
 impl PhotoFile {
     fn read(&self) -> Result<Photo, FormatError> {
         let pixels = decode(&self.image, self.orientation, Colour::Keep)?;
-        if (pixels.width, pixels.height) != self.turned {
+        if (pixels.width, pixels.height) != self.upright {
             return Err(FormatError::malformed(
                 &self.image,
                 format!(
-                    "is now {}x{} and was {}x{} when the dataset was read; start again",
-                    pixels.width, pixels.height, self.turned.0, self.turned.1
+                    "is now {}x{}, but was {}x{} when the dataset was read; start again",
+                    pixels.width, pixels.height, self.upright.0, self.upright.1
                 ),
             ));
         }
@@ -62,18 +62,18 @@ impl PhotoFile {
     }
 
     fn read_mask(&self, path: &Path) -> Result<Vec<u8>, FormatError> {
-        // Masks are made from the pixels as some tool saw them and rarely carry EXIF themselves: one whose shape is
-        // that of the stored photograph is turned with it.
+        // Masks are made from the pixels as displayed by some tool and rarely have EXIF data: one with the aspect of the stored
+        // photograph gets the same orientation.
         let header = read_header(path)?;
-        let lies_as_turned = (header.width > header.height) == (self.turned.0 > self.turned.1);
-        let orientation = if lies_as_turned {
+        let matches_upright = (header.width > header.height) == (self.upright.0 > self.upright.1);
+        let orientation = if matches_upright {
             Orientation::NoTransforms
         } else {
             self.orientation
         };
         let mut mask = decode(path, orientation, Colour::Grey)?;
-        if (mask.width, mask.height) != self.turned {
-            mask = resized(mask, self.turned);
+        if (mask.width, mask.height) != self.upright {
+            mask = resized(mask, self.upright);
         }
         let mut mask = self.bring_to_size(mask).data;
         mask.iter_mut()

@@ -3,8 +3,8 @@
 use crate::Malformed;
 use std::borrow::Cow;
 
-/// A header is a few kilobytes; a file that goes on without `end_header` is not searched to its end.
-const LONGEST_HEADER: usize = 1 << 20;
+/// A header is a few kilobytes; a file without `end_header` is not searched to its end.
+const MAX_HEADER: usize = 1 << 20;
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Scalar {
@@ -74,7 +74,7 @@ struct Element {
 }
 
 impl Element {
-    /// Bytes a binary row takes when no property is a list.
+    /// Bytes of a binary row if no property is a list.
     fn fixed_stride(&self) -> Option<usize> {
         self.properties.iter().try_fold(0, |sum, property| match property.kind {
             PropertyKind::One(scalar) => Some(sum + scalar.size()),
@@ -82,8 +82,8 @@ impl Element {
         })
     }
 
-    /// Bytes (binary) or characters (ASCII, a digit and a separator) a row takes at least.
-    fn least_row(&self, encoding: Encoding) -> u64 {
+    /// Minimum length of a row: bytes (binary) or characters (ASCII, a digit and a separator per value).
+    fn min_row(&self, encoding: Encoding) -> u64 {
         let least = |property: &Property| match (encoding, property.kind) {
             (Encoding::Ascii, _) => 2,
             (_, PropertyKind::One(scalar)) => scalar.size(),
@@ -93,7 +93,7 @@ impl Element {
     }
 }
 
-/// A parsed header with the bytes behind it.
+/// A parsed header with the bytes after it.
 pub(crate) struct Ply<'a> {
     encoding: Encoding,
     pub comments: Vec<String>,
@@ -108,7 +108,7 @@ pub(crate) struct Rows<'a> {
     columns: Vec<(String, Column)>,
 }
 
-/// Where in a row a property lies and how it is to be read.
+/// Position and type of a property in a row.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Column {
     offset: usize,
@@ -126,7 +126,7 @@ impl<'a> Ply<'a> {
         let mut comments = Vec::new();
         let mut elements: Vec<Element> = Vec::new();
         loop {
-            let Some(line) = next_line(&mut rest).filter(|_| bytes.len() - rest.len() <= LONGEST_HEADER) else {
+            let Some(line) = next_line(&mut rest).filter(|_| bytes.len() - rest.len() <= MAX_HEADER) else {
                 return Err(Malformed(
                     "the PLY header has no `end_header`; the file is damaged".into(),
                 ));
@@ -191,7 +191,7 @@ impl<'a> Ply<'a> {
         let wanted = self.find(element)?;
         let mut rest = self.body;
         let before = self.elements.iter().take_while(|e| e.name != wanted.name);
-        // Rows without properties take no room, however many are declared.
+        // Rows without properties take no space, however many are declared.
         for before in before.filter(|e| !e.properties.is_empty()) {
             self.check_size(before, rest)?;
             match (self.encoding, before.fixed_stride()) {
@@ -238,10 +238,10 @@ impl<'a> Ply<'a> {
     fn check_size(&self, element: &Element, rest: &[u8]) -> Result<(), Malformed> {
         // The last number of an ASCII file needs no separator.
         let there = rest.len() as u64 + u64::from(self.encoding == Encoding::Ascii);
-        let needed = u128::from(element.count) * u128::from(element.least_row(self.encoding));
+        let needed = u128::from(element.count) * u128::from(element.min_row(self.encoding));
         if needed > u128::from(there) {
             return Err(Malformed(format!(
-                "the PLY header promises {} rows of `{}`, which take at least {needed} bytes, and the file has {} left; \
+                "the PLY header declares {} rows of `{}`, which take at least {needed} bytes, and the file has {} left; \
                  it is truncated, copy it again",
                 element.count,
                 element.name,
@@ -301,7 +301,7 @@ impl Rows<'_> {
         self.columns.iter().find(|(n, _)| n == name).map(|(_, c)| *c)
     }
 
-    /// The columns of `names`, or an error that lists those that are missing.
+    /// The columns of `names`, or an error that lists the missing ones.
     pub fn columns<const N: usize>(&self, names: [&str; N]) -> Result<[Column; N], Malformed> {
         let missing: Vec<&str> = names.into_iter().filter(|name| self.column(name).is_none()).collect();
         if !missing.is_empty() {
@@ -315,7 +315,7 @@ impl Rows<'_> {
 }
 
 impl Column {
-    /// The value in `row`. Floats keep their bits, also those of a NaN; integers are converted, doubles rounded.
+    /// The value in `row`. Floats are preserved bit for bit, including NaNs; integers are converted, doubles rounded.
     pub fn f32(self, row: &[u8]) -> f32 {
         match self.scalar {
             Scalar::F32 => f32::from_bits(u32::from_ne_bytes(self.native(row))),
@@ -355,7 +355,7 @@ fn walk_ascii(element: &Element, rest: &mut &[u8], mut packed: Option<&mut Vec<u
             Ok("") => Err(ends_within(element)),
             Ok(word) => Ok(word),
             Err(_) => Err(Malformed(format!(
-                "the ASCII rows of `{}` hold something that is no number",
+                "the ASCII rows of `{}` contain something that is not a number",
                 element.name
             ))),
         }
@@ -371,7 +371,7 @@ fn walk_ascii(element: &Element, rest: &mut &[u8], mut packed: Option<&mut Vec<u
                 }
                 PropertyKind::List { .. } => {
                     let word = next()?;
-                    let length: u64 = word.parse().map_err(|_| no_number(word))?;
+                    let length: u64 = word.parse().map_err(|_| not_a_number(word))?;
                     for _ in 0..length {
                         next()?;
                     }
@@ -382,15 +382,15 @@ fn walk_ascii(element: &Element, rest: &mut &[u8], mut packed: Option<&mut Vec<u
     Ok(())
 }
 
-/// Appends the little-endian bytes of a number written out.
+/// Appends the little-endian bytes of a number in text form.
 fn push_number(packed: &mut Vec<u8>, scalar: Scalar, word: &str) -> Result<(), Malformed> {
     if scalar == Scalar::F32 {
-        // Not by way of f64: rounding twice may miss the nearest float.
-        let value: f32 = word.parse().map_err(|_| no_number(word))?;
+        // Not via f64: rounding twice may miss the nearest float.
+        let value: f32 = word.parse().map_err(|_| not_a_number(word))?;
         packed.extend_from_slice(&value.to_le_bytes());
         return Ok(());
     }
-    let value: f64 = word.parse().map_err(|_| no_number(word))?;
+    let value: f64 = word.parse().map_err(|_| not_a_number(word))?;
     match scalar {
         Scalar::I8 => packed.extend_from_slice(&(value as i8).to_le_bytes()),
         Scalar::U8 => packed.extend_from_slice(&(value as u8).to_le_bytes()),
@@ -404,7 +404,7 @@ fn push_number(packed: &mut Vec<u8>, scalar: Scalar, word: &str) -> Result<(), M
 }
 
 fn next_line<'a>(rest: &mut &'a [u8]) -> Option<&'a str> {
-    let end = rest.iter().take(LONGEST_HEADER).position(|byte| *byte == b'\n')?;
+    let end = rest.iter().take(MAX_HEADER).position(|byte| *byte == b'\n')?;
     let line = std::str::from_utf8(&rest[..end]).ok()?;
     *rest = &rest[end + 1..];
     Some(line.trim_end())
@@ -414,13 +414,13 @@ fn shown(text: &str) -> String {
     text.chars().take(60).filter(|c| !c.is_control()).collect()
 }
 
-fn no_number(word: &str) -> Malformed {
-    Malformed(format!("`{}` is no number", shown(word)))
+fn not_a_number(word: &str) -> Malformed {
+    Malformed(format!("`{}` is not a number", shown(word)))
 }
 
 fn ends_within(element: &Element) -> Malformed {
     Malformed(format!(
-        "ends within the {} rows of `{}` that the header promises; the file is truncated, copy it again",
+        "ends within the {} rows of `{}` that the header declares; the file is truncated, copy it again",
         element.count, element.name
     ))
 }

@@ -6,17 +6,17 @@ use irradia_scene::PointCloud;
 use std::path::Path;
 
 /// Reads a point cloud from a PLY file: ASCII or binary of either byte order; `x y z` of any type; `red green blue`
-/// (or `r g b`, `diffuse_red ..`) as bytes, or as floats in \[0, 1\] or in 0..255; white where there is no colour.
+/// (or `r g b`, `diffuse_red ..`) as bytes, or as floats in \[0, 1\] or in 0..255; white if there is no colour.
 ///
-/// Other properties and elements are skipped, points that are not finite are left out.
+/// Other properties and elements are skipped, and so are points that are not finite.
 ///
 /// # Errors
-/// When the file cannot be read, is no PLY, lacks a coordinate, or is shorter than its header promises.
+/// When the file cannot be read, is not a PLY, lacks a coordinate, or is shorter than its header declares.
 pub fn read_points_ply(path: &Path) -> Result<PointCloud, FormatError> {
     read_and_parse(path, parse_points_ply)
 }
 
-/// The bytes-level twin of [`read_points_ply`].
+/// [`read_points_ply`] on bytes.
 ///
 /// # Errors
 /// The same, without the file's name.
@@ -41,7 +41,7 @@ pub fn parse_points_ply(bytes: &[u8]) -> Result<PointCloud, Malformed> {
         let position = Vec3::new(x.f32(row), y.f32(row), z.f32(row));
         if position.is_finite() {
             points.positions.push(position);
-            // `as u8` saturates, and takes NaN to 0.
+            // `as u8` saturates, and maps NaN to 0.
             points.colors.push(color.map_or([255; 3], |columns| {
                 columns.map(|c| (c.f64(row) * color_scale).round() as u8)
             }));
@@ -50,7 +50,7 @@ pub fn parse_points_ply(bytes: &[u8]) -> Result<PointCloud, Malformed> {
     Ok(points)
 }
 
-/// Writes a binary PLY of coloured points, whole or not at all.
+/// Writes a binary PLY of coloured points, atomically.
 ///
 /// # Errors
 /// When the file cannot be written.
@@ -68,8 +68,8 @@ pub fn write_points_ply(path: &Path, points: &PointCloud) -> Result<(), FormatEr
     write_atomic(path, |out| out.write_all(&bytes))
 }
 
-/// What takes the file's colours to 0..=255. Float colours are in \[0, 1\] by custom, yet some writers keep 0..255:
-/// nothing but the values themselves tells.
+/// The factor that converts the file's colours to 0..=255. Float colours are in \[0, 1\] by convention, but some writers keep
+/// 0..255: only the values themselves tell.
 fn color_scale(rows: &Rows, columns: [Column; 3]) -> f64 {
     match columns[0].scalar {
         scalar if scalar.is_float() => {
@@ -130,18 +130,18 @@ mod tests {
             assert_eq!(points.colors, [[1, 2, 3], [4, 5, 6]]);
             let error = parse_points_ply(&bytes[..bytes.len() - 1]).unwrap_err().to_string();
             assert!(
-                error.contains("promises 2 rows") && error.contains("37 left"),
+                error.contains("declares 2 rows") && error.contains("37 left"),
                 "{error}"
             );
         }
     }
 
     #[test]
-    fn headers_that_promise_the_moon_are_refused_before_anything_is_allocated() {
+    fn headers_that_declare_absurd_sizes_are_rejected_before_any_allocation() {
         for (body, expected) in [
             (
                 "element vertex 18446744073709551615\nproperty float x\nproperty float y\nproperty float z\n",
-                "promises",
+                "declares",
             ),
             (
                 "element vertex 99999999999999999999\nproperty float x\n",

@@ -1,22 +1,22 @@
-//! Distorted photographs become pinhole ones: same focal lengths, cropped so that every pixel shows something.
+//! Undistortion of photographs to pinhole images: same focal lengths, cropped so that every pixel is valid.
 
 use crate::Pixels;
 use glam::DVec2;
 use irradia_scene::{Intrinsics, Lens};
 
-/// The lens is evaluated on a grid this coarse, in pixels, and interpolated between. The error is the second derivative
-/// of the mapping times 8, a few thousandths of a pixel for photographic lenses.
+/// Spacing of the grid on which the lens is evaluated, pixels; in between, it is interpolated. The error is the second
+/// derivative of the mapping times 8, a few thousandths of a pixel for photographic lenses.
 const GRID: u32 = 8;
-/// An undistorted image is at most this many times as wide and high as the photograph (COLMAP's `max_scale`); a fisheye's
-/// rim would otherwise stretch to infinity.
+/// Maximum size of an undistorted image relative to the photograph (COLMAP's `max_scale`); a fisheye's rim would otherwise
+/// stretch to infinity.
 const LARGEST: f64 = 2.0;
-/// A crop smaller than this on a side is no picture.
+/// Minimum side of a crop, pixels.
 const SMALLEST: i64 = 16;
 
-/// How photographs of one distorted camera are undistorted.
+/// The undistortion of the photographs of one distorted camera.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Undistortion {
-    /// The camera as it took the photograph.
+    /// The distorted camera.
     source: Intrinsics,
     /// First column of the crop, in pixels of the pinhole image that shares the source's principal point.
     left: i64,
@@ -28,10 +28,10 @@ pub(crate) struct Undistortion {
 
 impl Undistortion {
     /// The pinhole with the source's focal lengths, cropped to the largest upright rectangle in which every pixel lies
-    /// in the photograph; `None` when the lens leaves no such rectangle.
+    /// in the photograph; `None` when there is no such rectangle.
     ///
-    /// The rectangle is found by peeling: of a box that is surely too large, the side with the largest part outside is
-    /// moved in until all four sides are inside. The valid region has no holes, so what is inside the sides is valid.
+    /// The rectangle is found by peeling: of a box that is certainly too large, the side with the largest fraction outside is
+    /// moved in until all four sides are inside. The valid region has no holes, so that the interior is valid, too.
     pub fn plan(source: &Intrinsics) -> Option<Self> {
         let half = DVec2::new(f64::from(source.width), f64::from(source.height)) * (0.5 * LARGEST);
         let (cx, cy) = (f64::from(source.cx), f64::from(source.cy));
@@ -60,7 +60,7 @@ impl Undistortion {
                 return None;
             }
         }
-        // Peeling overshoots by less than a step: give back single rows and columns, looking more closely.
+        // Peeling overshoots by less than a step: add single rows and columns back, sampled more densely.
         for side in Side::ALL {
             for _ in 0..step {
                 let mut larger = crop;
@@ -135,7 +135,7 @@ impl Undistortion {
         }
     }
 
-    /// Where the centre of undistorted pixel `(x, y)` lies in the photograph, in units in which pixel centres are whole.
+    /// Position in the photograph of the centre of undistorted pixel `(x, y)`, where pixel centres are integers.
     fn source_index(&self, x: u32, y: u32) -> [f32; 2] {
         let at = distorted_pixel(
             &self.source,
@@ -201,7 +201,7 @@ impl Side {
 }
 
 impl Crop {
-    /// How many of `samples` + 1 pixel centres along a side are outside the photograph.
+    /// Number of the `samples` + 1 pixel centres along a side that are outside the photograph.
     fn outside(&self, side: Side, samples: u32, valid: impl Fn(f64, f64) -> bool) -> usize {
         let (left, top) = (self.left as f64 + 0.5, self.top as f64 + 0.5);
         let (right, bottom) = (self.right as f64 - 0.5, self.bottom as f64 - 0.5);
@@ -247,7 +247,7 @@ fn distorted_pixel(k: &Intrinsics, x: f64, y: f64) -> DVec2 {
     )
 }
 
-/// Whether an undistorted pixel lies between the centres of the photograph's outermost pixels, on this side of a fold.
+/// Whether an undistorted pixel lies between the centres of the photograph's outermost pixels, before any fold of the lens.
 fn is_valid(k: &Intrinsics, reach: f64, x: f64, y: f64) -> bool {
     if plane_point(k, x, y).length() >= reach {
         return false;
@@ -256,8 +256,8 @@ fn is_valid(k: &Intrinsics, reach: f64, x: f64, y: f64) -> bool {
     (0.5..=f64::from(k.width) - 0.5).contains(&at.x) && (0.5..=f64::from(k.height) - 0.5).contains(&at.y)
 }
 
-/// The radius on the undistorted plane, at most `largest`, up to which the lens takes larger radii to larger radii.
-/// Beyond it a polynomial folds back and would show the picture twice.
+/// The radius on the undistorted plane, at most `largest`, up to which the lens is monotonic. Beyond it a polynomial folds back
+/// and would show the picture twice.
 fn reach(lens: &Lens, largest: f64) -> f64 {
     let radial = match *lens {
         Lens::Pinhole => return f64::INFINITY,
@@ -338,7 +338,7 @@ mod tests {
         }
     }
 
-    /// The value of an image that is smooth over the *undistorted* plane, so that undistortion must give it back.
+    /// The value of an image that is smooth over the *undistorted* plane, so that undistortion must reproduce it.
     fn pattern(p: DVec2) -> [f64; 3] {
         [
             128.0 + 150.0 * p.x,
@@ -382,7 +382,7 @@ mod tests {
     }
 
     #[test]
-    fn a_fold_is_kept_out_and_a_lens_without_a_picture_is_refused() {
+    fn a_fold_is_excluded_and_a_lens_without_a_valid_crop_is_rejected() {
         let folding = camera(Lens::Opencv {
             k: [-0.9, 0.0, 0.0, 0.0, 0.0, 0.0],
             p: [0.0; 2],

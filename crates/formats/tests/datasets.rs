@@ -1,4 +1,4 @@
-//! Small datasets made here: layouts, splits, sizes, orientation, masks, and what is said about the broken ones.
+//! Small generated datasets: layouts, splits, sizes, orientation, masks, and the messages about broken ones.
 
 use glam::Vec3;
 use image::{GrayImage, Rgb, RgbImage};
@@ -20,14 +20,14 @@ fn error_of(path: &Path) -> String {
     error
 }
 
-/// Red grows to the right and green downwards, so that turned pictures are told apart.
+/// Red grows to the right and green downwards, so that orientations can be distinguished.
 fn picture(width: u32, height: u32) -> RgbImage {
     RgbImage::from_fn(width, height, |x, y| {
         Rgb([(x * 255 / width) as u8, (y * 255 / height) as u8, 0])
     })
 }
 
-/// `count` pictures `images/00.png` .. in a folder of their own.
+/// `count` pictures `images/00.png` .. in a new folder.
 fn pictures(count: usize, width: u32, height: u32) -> TempDir {
     let folder = tempfile::tempdir().unwrap();
     fs::create_dir(folder.path().join("images")).unwrap();
@@ -60,7 +60,7 @@ fn write_colmap_text(root: &Path, camera: &str, names: &[&str]) {
 }
 
 #[test]
-fn smaller_copies_are_used_and_intrinsics_follow_the_real_size() {
+fn smaller_copies_are_used_and_intrinsics_follow_the_actual_size() {
     let folder = pictures(8, 80, 60);
     let root = folder.path();
     let names: Vec<String> = (0..8).map(|i| format!("{i:02}.png")).collect();
@@ -113,13 +113,13 @@ fn smaller_copies_are_used_and_intrinsics_follow_the_real_size() {
 }
 
 #[test]
-fn exif_turns_a_picture_exactly_when_the_poses_saw_it_turned() {
+fn exif_orientation_is_applied_exactly_when_the_poses_include_it() {
     let folder = pictures(3, 60, 80);
     let root = folder.path();
     for i in 0..3 {
         let jpeg = root.join(format!("images/{i:02}.png")).with_extension("jpg");
         picture(80, 60).save(&jpeg).unwrap();
-        // Orientation 6: turn 90 degrees clockwise to see it upright.
+        // Orientation 6: rotate 90 degrees clockwise to see it upright.
         let mut exif =
             b"\xff\xe1\x00\x22Exif\0\0II\x2a\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0\x06\0\0\0\0\0\0\0".to_vec();
         assert_eq!(exif.len(), 2 + 0x22);
@@ -136,7 +136,7 @@ fn exif_turns_a_picture_exactly_when_the_poses_saw_it_turned() {
             (photo.width, photo.height),
             (view.camera.intrinsics.width, view.camera.intrinsics.height)
         );
-        // Top right corner: red as stored; turned clockwise it is what was top left, black.
+        // Top right corner: red as stored; rotated clockwise it is the former top left, black.
         let at = (photo.width as usize - 1) * 3;
         (photo.width, photo.data[at] > 128)
     };
@@ -155,7 +155,7 @@ fn exif_turns_a_picture_exactly_when_the_poses_saw_it_turned() {
         (60, false),
         "the same, of a smaller copy"
     );
-    assert_eq!(corner(r#""fl_x": 70"#), (60, false), "undeclared: as it is seen");
+    assert_eq!(corner(r#""fl_x": 70"#), (60, false), "undeclared: upright");
 }
 
 #[test]
@@ -276,7 +276,7 @@ fn blender_folders_without_a_test_file_hold_out_validation_or_every_eighth() {
 }
 
 #[test]
-fn unusable_views_are_left_out_with_one_line_a_reason() {
+fn unusable_views_are_skipped_with_one_line_per_reason() {
     let folder = pictures(8, 8, 8);
     let root = folder.path();
     fs::write(root.join("images/05.png"), b"").unwrap();
@@ -293,11 +293,11 @@ fn unusable_views_are_left_out_with_one_line_a_reason() {
     let warnings = dataset.warnings.join("\n");
     assert_eq!(dataset.warnings.len(), 3, "{warnings}");
     assert!(
-        warnings.contains("1 of 8 views have no image file and are left out: images/07.png"),
+        warnings.contains("1 of 8 views have no image file and are skipped: images/07.png"),
         "{warnings}"
     );
     assert!(
-        warnings.contains("cannot be read and are left out: images/05.png, images/06.png"),
+        warnings.contains("cannot be read and are skipped: images/05.png, images/06.png"),
         "{warnings}"
     );
     assert!(
@@ -327,7 +327,7 @@ fn a_photo_that_changes_or_breaks_after_reading_is_an_error_that_names_it() {
     for (view, expected) in dataset
         .views
         .iter()
-        .zip(["is now 9x8 and was 8x8", "not a readable", "cannot read"])
+        .zip(["is now 9x8, but was 8x8", "not a readable", "cannot read"])
     {
         let error = view.photo.load().unwrap_err().to_string();
         assert!(error.contains(expected) && error.contains(&view.name), "{error}");
@@ -380,5 +380,5 @@ fn errors_say_what_where_and_what_to_do() {
     let error = error_of(root);
     assert!(error.contains("has 4 poses and `images` has 3 images"), "{error}");
     fs::write(root.join("poses_bounds.npy"), &npy[..200]).unwrap();
-    assert!(error_of(root).contains("promises more"));
+    assert!(error_of(root).contains("declares more"));
 }

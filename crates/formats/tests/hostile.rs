@@ -1,5 +1,5 @@
-//! Broken bytes: valid seeds of every parser, cut short and mutated a few thousand times. Nothing may panic or hang, and
-//! what a header promises may not be allocated. The same entry points are fuzzed in `/fuzz`.
+//! Broken bytes: valid seeds of every parser, truncated and mutated a few thousand times. Nothing may panic or hang, and
+//! sizes in headers may not be allocated unchecked. The same entry points are fuzzed in `/fuzz`.
 
 use irradia_formats::parse;
 use irradia_scene::Rng;
@@ -155,7 +155,7 @@ fn cases() -> Vec<Case> {
     ]
 }
 
-/// Changes, inserts, removes or doubles a few bytes; often to the values that break arithmetic, and often digits.
+/// Changes, inserts, removes or doubles a few bytes; often to values that break arithmetic, and often digits.
 fn mutate(bytes: &mut Vec<u8>, rng: &mut Rng) {
     for _ in 0..=rng.below(4) {
         if bytes.is_empty() {
@@ -189,7 +189,7 @@ fn seeds_are_accepted() {
 }
 
 #[test]
-fn every_binary_seed_cut_short_is_refused_and_no_other_panics() {
+fn every_truncated_binary_seed_is_rejected_and_no_other_panics() {
     for case in cases() {
         for length in 0..case.seed.len() {
             let accepted = (case.parse)(&case.seed[..length]);

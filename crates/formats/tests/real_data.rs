@@ -1,4 +1,4 @@
-//! Real datasets and splat files made by others, read where they lie; see each test's first line for which.
+//! Real datasets and splat files made by others, read in place; each test's first line names them.
 
 use glam::{Vec2, Vec3};
 use irradia_formats::{DatasetFormat, DatasetOptions, Kind, describe, detect, read_dataset, read_splats};
@@ -6,7 +6,7 @@ use irradia_scene::{Dataset, Lens, View};
 use std::collections::HashSet;
 use std::path::{Path, PathBuf};
 
-/// A part of the shared data.
+/// A subfolder of the shared data.
 fn shared(name: &str) -> Option<PathBuf> {
     irradia_testkit::shared(&format!("data/{name}"))
 }
@@ -52,8 +52,8 @@ fn check_invariants(dataset: &Dataset) {
     assert_eq!(photo.data.len() as u32, photo.width * photo.height * photo.channels);
 }
 
-/// The point nearest, in the sense of least squares, to all optical axes.
-fn point_of_attention(dataset: &Dataset) -> Vec3 {
+/// The point nearest to all optical axes, in the least-squares sense.
+fn focus(dataset: &Dataset) -> Vec3 {
     let mut a = glam::Mat3::ZERO;
     let mut b = Vec3::ZERO;
     for view in &dataset.views {
@@ -69,9 +69,9 @@ fn in_front(view: &View, point: Vec3) -> bool {
     view.camera.pose.camera_from_world(point).z > 0.0
 }
 
-/// Whether points land where they were seen, told by colour: the mean absolute difference, in 8-bit steps, between a
-/// point's colour and the pixel it projects to, over the points that every fifth view sees. Shifting everything by 1
-/// pixel doubles it.
+/// Whether points project to their observations, judged by colour: the mean absolute difference, in 8-bit steps, between a
+/// point's colour and the pixel it projects to, over the points visible in every fifth view. A shift by 1 pixel doubles
+/// it.
 fn colour_error(dataset: &Dataset) -> f64 {
     let points = dataset.points.as_ref().expect("points");
     let (mut sum, mut count) = (0.0, 0u32);
@@ -96,7 +96,7 @@ fn colour_error(dataset: &Dataset) -> f64 {
 }
 
 #[test]
-fn fox_is_undistorted_and_its_missing_images_are_told_once() {
+fn fox_is_undistorted_and_its_missing_images_are_reported_once() {
     let Some(path) = shared("fox") else { return };
     assert_eq!(detect(&path).unwrap(), Kind::Dataset(DatasetFormat::Nerfstudio));
     let dataset = read(&path);
@@ -113,10 +113,10 @@ fn fox_is_undistorted_and_its_missing_images_are_told_once() {
     );
     let k = dataset.views[0].camera.intrinsics;
     assert!((k.fx - 687.76).abs() < 1e-3 && (k.fy - 687.245).abs() < 1e-3);
-    // k1 > 0 pulls the corners in: the crop is a little smaller than 540x960, the principal point moves with it.
+    // k1 > 0 pulls the corners in: the crop is slightly smaller than 540x960, and the principal point moves with it.
     assert!((500..540).contains(&k.width) && (900..960).contains(&k.height), "{k:?}");
     assert_eq!(sizes(&dataset).len(), 1, "one camera, one crop");
-    let centre = point_of_attention(&dataset);
+    let centre = focus(&dataset);
     assert!(dataset.views.iter().all(|view| in_front(view, centre)));
     let small = with(&path, 1.0, Some(200));
     assert_eq!(
@@ -127,7 +127,7 @@ fn fox_is_undistorted_and_its_missing_images_are_told_once() {
 }
 
 #[test]
-fn fox_colmap_splits_by_its_list_and_its_points_land_on_their_colours() {
+fn fox_colmap_splits_by_its_list_and_its_points_project_to_their_colours() {
     let Some(path) = shared("fox_colmap") else { return };
     let dataset = read(&path);
     check_invariants(&dataset);
@@ -139,7 +139,7 @@ fn fox_colmap_splits_by_its_list_and_its_points_land_on_their_colours() {
     assert_eq!(dataset.train.len(), 43);
     assert!(dataset.points.as_ref().unwrap().len() > 10_000);
     assert!(dataset.views.iter().all(|view| view.points_seen.len() > 100));
-    // Seen: 10.6; 21 when shifted by a pixel, 49 by twenty.
+    // Measured: 10.6; 21 when shifted by a pixel, 49 by twenty.
     let error = colour_error(&dataset);
     assert!(error < 13.0, "{error}");
     assert!(dataset.warnings.is_empty(), "{:?}", dataset.warnings);
@@ -156,12 +156,12 @@ fn lund_door_text_model_is_undistorted_onto_its_points() {
     );
     assert_eq!(dataset.points.as_ref().unwrap().len(), 11_384);
     let k = dataset.views[0].camera.intrinsics;
-    // k1 < 0 pushes the corners out: undistorted, the picture bulges beyond the photograph's frame.
+    // k1 < 0 pushes the corners out: undistorted, the image extends beyond the photograph's frame.
     assert!(
         k.width >= 640 && k.height >= 960 && (k.fx - 1217.69).abs() < 1e-2,
         "{k:?}"
     );
-    // Seen: 5.6; 13 when shifted by a pixel.
+    // Measured: 5.6; 13 when shifted by a pixel.
     let error = colour_error(&dataset);
     assert!(error < 8.0, "{error}");
     assert!(colour_error(&with(&path, 2.0, None)) < 16.0);
@@ -186,7 +186,7 @@ fn chair_keeps_alpha_and_its_own_split() {
     let k = dataset.views[0].camera.intrinsics;
     let expected = 200.0 / (0.5f32 * 0.691_111_2).tan();
     assert!((k.fx - expected).abs() < 1e-2 && k.fx == k.fy && (k.cx, k.cy) == (200.0, 200.0));
-    // The chair stands in the middle of the world, which all cameras look at: it shows there in nearly all of them.
+    // The chair is at the world's origin, on which all cameras focus: it is visible there in nearly all of them.
     let mut shows = 0;
     for view in &dataset.views {
         let photo = view.photo.load().unwrap();
@@ -205,7 +205,7 @@ fn chair_keeps_alpha_and_its_own_split() {
 }
 
 #[test]
-fn fern_takes_the_images_there_are() {
+fn fern_uses_the_images_that_exist() {
     let Some(path) = shared("fern") else { return };
     assert_eq!(
         detect(&path).unwrap(),
@@ -222,7 +222,7 @@ fn fern_takes_the_images_there_are() {
     assert!(dataset.points.is_none());
     let [near, far] = dataset.views[0].depth_bounds.expect("LLFF has them");
     assert!((near - 17.74709).abs() < 1e-4 && (far - 78.25749).abs() < 1e-4);
-    // Forward-facing: all look the same way, and what they look at is in front of all.
+    // Forward-facing: all cameras have the same direction, and their focus is in front of all.
     let forward = dataset.views[0].camera.pose.rotation * Vec3::Z;
     let up = dataset.views[0].camera.pose.rotation * Vec3::NEG_Y;
     for view in &dataset.views {
@@ -247,7 +247,7 @@ fn mary_rose_has_masks_that_keep_the_tankard() {
         (69, HashSet::from([(864, 864)]))
     );
     assert!(dataset.warnings.is_empty(), "{:?}", dataset.warnings);
-    let centre = point_of_attention(&dataset);
+    let centre = focus(&dataset);
     for view in dataset.views.iter().step_by(7) {
         let photo = view.photo.load().unwrap();
         let mask = photo.mask.expect("a mask");
@@ -257,7 +257,7 @@ fn mary_rose_has_masks_that_keep_the_tankard() {
         assert_eq!(
             at(pixel.x, pixel.y),
             255,
-            "{}: the cameras turn about the tankard",
+            "{}: the cameras orbit the tankard",
             view.name
         );
         let kept = mask.iter().filter(|v| **v == 255).count() as f64 / mask.len() as f64;
@@ -266,7 +266,7 @@ fn mary_rose_has_masks_that_keep_the_tankard() {
 }
 
 #[test]
-fn a_folder_without_poses_says_what_was_looked_for() {
+fn a_folder_without_poses_gets_the_list_of_known_layouts() {
     let Some(path) = shared("lund_street_unposed") else {
         return;
     };

@@ -1,4 +1,4 @@
-//! State dicts of PyTorch and safetensors files: the same tensors from each, and hostile ones refused in one line.
+//! State dicts of PyTorch and safetensors files: the same tensors from each, and hostile ones rejected in one line.
 
 use irradia_formats::{parse, read_tensors};
 use irradia_testkit::torch::{NamedTensor, archive, stream, zip};
@@ -60,7 +60,7 @@ fn with_pickle(pickle: &[u8]) -> Vec<u8> {
     ])
 }
 
-/// A state dict of one tensor whose storage, offset, shape and strides these opcodes make.
+/// A state dict of one tensor whose storage, offset, shape and strides are made by these opcodes.
 fn with_tensor(kind: &str, offset: &str, shape: &str, strides: &str) -> Vec<u8> {
     let pickle = format!(
         "\u{2}ccollections\nOrderedDict\n)R(U\u{1}actorch._utils\n_rebuild_tensor_v2\n((U\u{7}storagectorch\n{kind}Storage\n\
@@ -70,7 +70,7 @@ fn with_tensor(kind: &str, offset: &str, shape: &str, strides: &str) -> Vec<u8> 
 }
 
 #[test]
-fn hostile_files_are_refused_in_one_line() {
+fn hostile_files_are_rejected_in_one_line() {
     let refused = |bytes: &[u8], part: &str| {
         let error = parse::tensors(bytes).expect_err(part).to_string();
         assert!(error.contains(part) && !error.contains('\n'), "{error}, and not {part}");
@@ -79,53 +79,53 @@ fn hostile_files_are_refused_in_one_line() {
         parse::tensors(&with_tensor("Float", "K\u{2}", "K\u{2}K\u{7}", "K\u{7}K\u{1}")).unwrap()["a"].values,
         [0.0; 14]
     );
-    // Sizes that lie, in the tensor and in the storage.
+    // Wrong sizes, in the tensor and in the storage.
     refused(
         &with_tensor("Float", "K\u{3}", "K\u{2}K\u{7}", "K\u{7}K\u{1}"),
-        "larger than what is stored",
+        "larger than its storage",
     );
     refused(
         &with_tensor("Float", "J\u{7f}\u{7f}\u{7f}\u{7f}", "K\u{1}", "K\u{1}"),
-        "larger than what is stored",
+        "larger than its storage",
     );
     let huge = "J\u{7f}\u{7f}\u{7f}\u{7f}".repeat(3);
     refused(
         &with_tensor("Float", "K\u{0}", &huge, "K\u{1}K\u{1}K\u{1}"),
-        "row by row",
+        "not contiguous",
     );
     refused(
         &with_tensor("Float", "K\u{0}", &"K\u{1}".repeat(40), &"K\u{1}".repeat(40)),
-        "kind that is not read",
+        "unsupported kind",
     );
     refused(
         &with_tensor("Float", "K\u{0}", "K\u{2}K\u{7}", "K\u{1}K\u{2}"),
-        "row by row",
+        "not contiguous",
     );
     refused(
         &with_tensor("Double", "K\u{0}", "K\u{1}", "K\u{1}"),
         "only 32-bit floats",
     );
-    // What would run a program when Python reads it is a call that makes no tensor.
+    // A call that would run a program in Python is a call that makes no tensor.
     refused(&with_pickle(b"\x80\x02cos\nsystem\n(U\x02lstR."), "state_dict()");
-    // Pickles that never end, take what is not there, nest, or call themselves.
+    // Pickles that never end, pop from an empty stack, nest, or call themselves.
     refused(&with_pickle(b"\x80\x02}"), "ends too early");
     refused(&with_pickle(b"\x80\x02X\xff\xff\xff\xff"), "ends too early");
     refused(&with_pickle(b"\x80\x02u"), "no mark");
-    refused(&with_pickle(b"\x80\x02\x87"), "more than it has");
+    refused(&with_pickle(b"\x80\x02\x87"), "empty stack");
     refused(&with_pickle(b"\x80\x02h\x07"), "recalls");
     refused(&with_pickle(b"\x80\x04."), "protocol 4");
     refused(&with_pickle(b"\x80\x02\x93"), "opcode 0x93");
     refused(&with_pickle(&b"(".repeat(3 << 20)), "too many");
     refused(&with_pickle(&b"]".repeat(3 << 20)), "too many");
     let circle = with_pickle(b"\x80\x02}q\x00(U\x01ah\x00u.");
-    refused(&circle, "kind that is not read");
-    // A list that is made a dict a million times over.
+    refused(&circle, "unsupported kind");
+    // A list that is converted to a dict a million times.
     let mut bomb = b"\x80\x02ccollections\nOrderedDict\nq\x00](".to_vec();
     bomb.extend(b"NN\x86".repeat(50_000));
     bomb.extend(b"e\x85q\x01");
     bomb.extend(b"h\x00h\x01R".repeat(50_000));
     refused(&with_pickle(&bomb), "too many");
-    // The same storage a thousand times is more than the file has.
+    // The same storage a thousand times is larger than the file.
     let name = |i: usize| format!("t{i}");
     let names: Vec<String> = (0..1000).map(name).collect();
     let many: Vec<NamedTensor> = names.iter().map(|n| (&n[..], &[4usize][..], &[0.0; 4][..])).collect();
@@ -140,7 +140,7 @@ fn hostile_files_are_refused_in_one_line() {
         ("n/data.pkl".to_owned(), stretched),
         ("n/data/0".to_owned(), vec![0; 1 << 16]),
     ];
-    refused(&zip(&files), "more than the file holds");
+    refused(&zip(&files), "larger than the file");
     // Archives.
     let whole = archive(&TENSORS);
     refused(&whole[..whole.len() - 5], "its end is missing");
@@ -153,7 +153,7 @@ fn hostile_files_are_refused_in_one_line() {
     refused(&elsewhere, "not where the directory says");
     refused(&zip(&[("readme".to_owned(), vec![1])]), "no data.pkl");
     let legacy = stream(&TENSORS);
-    refused(&legacy[..legacy.len() - 3], "promises");
+    refused(&legacy[..legacy.len() - 3], "declares");
     refused(b"\x80\x02}.", "does not begin");
     refused(b"", "neither");
 }

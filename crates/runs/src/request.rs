@@ -1,7 +1,7 @@
 //! Training requests: raw input, and the validated request.
 
 use crate::{Background, RunError, RunFolder};
-use irradia_formats::{DatasetFormat, DatasetOptions, Holdout, USUAL_MAX_SIDE, read_dataset};
+use irradia_formats::{DEFAULT_MAX_SIDE, DatasetFormat, DatasetOptions, Holdout, read_dataset};
 use irradia_scene::Dataset;
 use irradia_train::Recipe;
 use irradia_train::paces::Paces;
@@ -38,12 +38,12 @@ pub struct Reading {
 }
 
 impl Default for Reading {
-    /// Any format, the dataset's own split, at most [`USUAL_MAX_SIDE`] pixels per side.
+    /// Any format, the dataset's own split, at most [`DEFAULT_MAX_SIDE`] pixels per side.
     fn default() -> Self {
         Self {
             format: None,
             downscale: 1.0,
-            max_side: Some(USUAL_MAX_SIDE),
+            max_side: Some(DEFAULT_MAX_SIDE),
             holdout: None,
         }
     }
@@ -71,7 +71,7 @@ impl Reading {
         // An explicit downscale replaces the default limit.
         let max_side = self
             .max_side
-            .filter(|side| self.downscale == 1.0 || *side != USUAL_MAX_SIDE);
+            .filter(|side| self.downscale == 1.0 || *side != DEFAULT_MAX_SIDE);
         if let Some(side) = max_side.filter(|_| self.downscale != 1.0) {
             return Err(RunError::setting("max_side", side, "cannot be combined with downscale"));
         }

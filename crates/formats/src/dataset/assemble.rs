@@ -1,9 +1,9 @@
-//! From what the files declare to a dataset: image headers are read, unusable views dropped, cameras brought to the real
-//! image sizes, undistorted and made smaller.
+//! From declarations to a dataset: reads image headers, skips unusable views, adapts cameras to the actual image sizes,
+//! undistorts and downscales them.
 
 use super::declared::{Declared, DeclaredView};
 use super::split;
-use super::{DatasetOptions, USUAL_MAX_SIDE};
+use super::{DEFAULT_MAX_SIDE, DatasetOptions};
 use crate::FormatError;
 use crate::image_file::{Header, read_header};
 use crate::photo::PhotoFile;
@@ -13,46 +13,44 @@ use irradia_scene::{Camera, Dataset, Intrinsics, Lens, View};
 use rayon::prelude::*;
 use std::sync::Arc;
 
-/// Fewer views than this make no scene.
-const FEWEST_VIEWS: usize = 3;
-/// Names that a warning lists.
-const NAMES_TOLD: usize = 20;
+/// Minimum number of views of a scene.
+const MIN_VIEWS: usize = 3;
+/// Maximum number of names in a warning.
+const MAX_NAMES: usize = 20;
 
-/// Why a view was left out; each is one warning.
+/// Why a view was skipped; each reason is one warning.
 #[derive(Clone, Copy, PartialEq, Eq)]
-enum LeftOut {
+enum Skipped {
     MissingImage,
     UnreadableImage,
     NoPose,
     NoCamera,
 }
 
-impl LeftOut {
+impl Skipped {
     const ALL: [Self; 4] = [Self::MissingImage, Self::UnreadableImage, Self::NoPose, Self::NoCamera];
 
     fn because(self) -> &'static str {
         match self {
             Self::MissingImage => "have no image file",
             Self::UnreadableImage => "have an image file that cannot be read",
-            Self::NoPose => "have a pose that is not finite or no rotation",
-            Self::NoCamera => {
-                "have intrinsics that are not finite, not positive or leave no picture after undistortion"
-            }
+            Self::NoPose => "have a pose that is not finite or not a rotation",
+            Self::NoCamera => "have intrinsics that are not finite, not positive or leave no image after undistortion",
         }
     }
 }
 
-/// A view whose image file is there and readable.
+/// A view with a readable image file.
 struct Probed {
     orientation: Orientation,
-    /// At the real size of the turned image, lens included.
+    /// At the actual size of the upright image, lens included.
     source: Intrinsics,
     /// Set for distorted cameras by [`plan_undistortion`].
     undistortion: Option<Undistortion>,
 }
 
 impl Probed {
-    /// The camera of the photograph as it is trained on, at its real size.
+    /// The undistorted camera of the photograph, at its actual size.
     fn undistorted(&self) -> Intrinsics {
         self.undistortion.map_or(self.source, |plan| plan.pinhole())
     }
@@ -71,15 +69,15 @@ pub(super) fn assemble(declared: Declared, options: &DatasetOptions) -> Result<D
     views.sort_by(|a, b| a.name.cmp(&b.name));
     let named = views.len();
 
-    let mut probed: Vec<Result<Probed, LeftOut>> = views.par_iter().map(|view| probe(view, ignores_exif)).collect();
+    let mut probed: Vec<Result<Probed, Skipped>> = views.par_iter().map(|view| probe(view, ignores_exif)).collect();
     plan_undistortion(&mut probed);
-    let reasons = tell_left_out(&views, &probed);
+    let reasons = skipped_warnings(&views, &probed);
     let usable: Vec<(DeclaredView, Probed)> = views
         .into_iter()
         .zip(probed)
         .filter_map(|(view, probed)| Some((view, probed.ok()?)))
         .collect();
-    if usable.len() < FEWEST_VIEWS {
+    if usable.len() < MIN_VIEWS {
         return Err(FormatError::TooFewViews {
             path: root,
             usable: usable.len(),
@@ -100,8 +98,8 @@ pub(super) fn assemble(declared: Declared, options: &DatasetOptions) -> Result<D
     warnings.extend(reasons);
     warnings.extend(indices.warning);
     let max_side = options.max_side;
-    if max_side == Some(USUAL_MAX_SIDE) {
-        warnings.extend(tell_scaled(&usable));
+    if max_side == Some(DEFAULT_MAX_SIDE) {
+        warnings.extend(scaled_warning(&usable));
     }
 
     let views = usable
@@ -118,17 +116,17 @@ pub(super) fn assemble(declared: Declared, options: &DatasetOptions) -> Result<D
     })
 }
 
-fn probe(view: &DeclaredView, ignores_exif: bool) -> Result<Probed, LeftOut> {
-    let image = view.image.as_deref().ok_or(LeftOut::MissingImage)?;
+fn probe(view: &DeclaredView, ignores_exif: bool) -> Result<Probed, Skipped> {
+    let image = view.image.as_deref().ok_or(Skipped::MissingImage)?;
     if view.pose.is_none() {
-        return Err(LeftOut::NoPose);
+        return Err(Skipped::NoPose);
     }
-    let header = read_header(image).map_err(|_| LeftOut::UnreadableImage)?;
+    let header = read_header(image).map_err(|_| Skipped::UnreadableImage)?;
     let orientation = orientation_to_apply(&header, view.camera.size, ignores_exif);
-    let (width, height) = turned(&header, orientation);
+    let (width, height) = oriented_size(&header, orientation);
     let source = view.camera.at_size(width, height);
     if !source.is_valid() || !lens_is_finite(&source.lens) {
-        return Err(LeftOut::NoCamera);
+        return Err(Skipped::NoCamera);
     }
     Ok(Probed {
         orientation,
@@ -145,8 +143,8 @@ fn lens_is_finite(lens: &Lens) -> bool {
     }
 }
 
-/// Plans the undistortion of every distinct distorted camera once, for all the views that share it.
-fn plan_undistortion(probed: &mut [Result<Probed, LeftOut>]) {
+/// Plans the undistortion of every distinct distorted camera once, for all views that share it.
+fn plan_undistortion(probed: &mut [Result<Probed, Skipped>]) {
     let mut distinct: Vec<Intrinsics> = Vec::new();
     for view in probed.iter().flatten() {
         if view.source.lens != Lens::Pinhole && !distinct.contains(&view.source) {
@@ -159,26 +157,26 @@ fn plan_undistortion(probed: &mut [Result<Probed, LeftOut>]) {
         if let Some(camera) = distinct.iter().position(|source| *source == known.source) {
             match plans[camera] {
                 Some(plan) => known.undistortion = Some(plan),
-                None => *view = Err(LeftOut::NoCamera),
+                None => *view = Err(Skipped::NoCamera),
             }
         }
     }
 }
 
-/// Bounds that say something: finite, in front of the camera, and in order.
+/// Valid bounds: finite, in front of the camera, and in order.
 fn usable_bounds([near, far]: [f64; 2]) -> Option<[f32; 2]> {
     let bounds = [near as f32, far as f32];
     (bounds[0] > 0.0 && bounds[1] > bounds[0] && bounds[1].is_finite()).then_some(bounds)
 }
 
-/// What is scaled though nobody may have asked for it.
-fn tell_scaled(usable: &[(DeclaredView, Probed)]) -> Option<String> {
+/// The warning about photographs downscaled by default.
+fn scaled_warning(usable: &[(DeclaredView, Probed)]) -> Option<String> {
     let sizes = usable.iter().map(|(_, probed)| probed.undistorted());
-    let large: Vec<Intrinsics> = sizes.filter(|k| k.width.max(k.height) > USUAL_MAX_SIDE).collect();
+    let large: Vec<Intrinsics> = sizes.filter(|k| k.width.max(k.height) > DEFAULT_MAX_SIDE).collect();
     let largest = large.iter().max_by_key(|k| u64::from(k.width) * u64::from(k.height))?;
     Some(format!(
-        "{} of {} photographs, of up to {}x{} pixels, are scaled to {USUAL_MAX_SIDE} on the longer side, as 3DGS does; ask \
-         for the full size or another one where that is not wanted",
+        "{} of {} photographs, of up to {}x{} pixels, are scaled to {DEFAULT_MAX_SIDE} on the longer side, as 3DGS does; request \
+         the full size or another one to change that",
         large.len(),
         usable.len(),
         largest.width,
@@ -195,7 +193,7 @@ fn finish(view: DeclaredView, probed: &Probed, downscale: f32, max_side: Option<
         image: view.image?,
         mask: view.mask,
         orientation: probed.orientation,
-        turned: (probed.source.width, probed.source.height),
+        upright: (probed.source.width, probed.source.height),
         undistortion: probed.undistortion,
         size: (intrinsics.width, intrinsics.height),
     };
@@ -211,12 +209,12 @@ fn finish(view: DeclaredView, probed: &Probed, downscale: f32, max_side: Option<
 
 /// See [`super::read_dataset`] for the rule.
 fn orientation_to_apply(header: &Header, declared: Option<[f64; 2]>, ignores_exif: bool) -> Orientation {
-    let upright = turned(header, header.orientation);
+    let upright = oriented_size(header, header.orientation);
     let stored = (header.width, header.height);
-    // Shapes, not sizes: the images may be a smaller copy of those that the poses were made from.
-    let misfit = |(w, h): (u32, u32), [dw, dh]: [f64; 2]| (f64::from(w) / f64::from(h)).ln() - (dw / dh).ln();
+    // Aspects, not sizes: the images may be smaller copies of those from which the poses were made.
+    let mismatch = |(w, h): (u32, u32), [dw, dh]: [f64; 2]| (f64::from(w) / f64::from(h)).ln() - (dw / dh).ln();
     let turn = match declared {
-        Some(size) if upright != stored => misfit(upright, size).abs() <= misfit(stored, size).abs(),
+        Some(size) if upright != stored => mismatch(upright, size).abs() <= mismatch(stored, size).abs(),
         _ => !ignores_exif,
     };
     if turn {
@@ -226,7 +224,7 @@ fn orientation_to_apply(header: &Header, declared: Option<[f64; 2]>, ignores_exi
     }
 }
 
-fn turned(header: &Header, orientation: Orientation) -> (u32, u32) {
+fn oriented_size(header: &Header, orientation: Orientation) -> (u32, u32) {
     use Orientation::{Rotate90, Rotate90FlipH, Rotate270, Rotate270FlipH};
     match orientation {
         Rotate90 | Rotate90FlipH | Rotate270 | Rotate270FlipH => (header.height, header.width),
@@ -234,27 +232,27 @@ fn turned(header: &Header, orientation: Orientation) -> (u32, u32) {
     }
 }
 
-/// One line a reason, with the count and the first names.
-fn tell_left_out(views: &[DeclaredView], probed: &[Result<Probed, LeftOut>]) -> Vec<String> {
-    let line = |reason: LeftOut| {
+/// One line per reason, with the count and the first names.
+fn skipped_warnings(views: &[DeclaredView], probed: &[Result<Probed, Skipped>]) -> Vec<String> {
+    let line = |reason: Skipped| {
         let pairs = views.iter().zip(probed);
         let names: Vec<&str> = pairs
             .filter(|(_, p)| p.as_ref().err() == Some(&reason))
             .map(|(view, _)| view.name.as_str())
             .collect();
-        let told = names.iter().take(NAMES_TOLD).copied().collect::<Vec<_>>().join(", ");
-        let more = match names.len().saturating_sub(NAMES_TOLD) {
+        let listed = names.iter().take(MAX_NAMES).copied().collect::<Vec<_>>().join(", ");
+        let more = match names.len().saturating_sub(MAX_NAMES) {
             0 => String::new(),
             more => format!(" and {more} more"),
         };
         (!names.is_empty()).then(|| {
             format!(
-                "{} of {} views {} and are left out: {told}{more}",
+                "{} of {} views {} and are skipped: {listed}{more}",
                 names.len(),
                 views.len(),
                 reason.because()
             )
         })
     };
-    LeftOut::ALL.into_iter().filter_map(line).collect()
+    Skipped::ALL.into_iter().filter_map(line).collect()
 }

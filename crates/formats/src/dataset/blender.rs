@@ -1,4 +1,4 @@
-//! Folders with one transforms file for each split, as NeRF's synthetic scenes have them (Mildenhall et al. 2020).
+//! Folders with one transforms file per split, like NeRF's synthetic scenes (Mildenhall et al. 2020).
 
 use super::declared::{Declared, Split};
 use super::nerfstudio::declared_views;
@@ -7,8 +7,8 @@ use crate::error::read_and_parse;
 use crate::{FormatError, read_points_ply};
 use std::path::Path;
 
-/// Train from the train file; held out are the frames of the test file, or of the validation file where there is no
-/// test file.
+/// Training views are those of the train file; held out are the frames of the test file, or of the validation file if there
+/// is no test file.
 pub(super) fn read(root: &Path, downscale: f32) -> Result<Declared, FormatError> {
     let train = "transforms_train.json";
     let held_out = ["transforms_test.json", "transforms_val.json"]

@@ -1,19 +1,19 @@
-//! What a dataset's files declare, before any image was looked at: the one form that all layouts are read into.
+//! What a dataset's files declare, before any image is opened: the common form into which all layouts are read.
 
 use glam::{DMat3, DQuat, DVec3};
 use irradia_scene::{Intrinsics, Lens, PointCloud, Pose};
 use std::path::PathBuf;
 
 pub(super) struct Declared {
-    /// For people: `COLMAP (binary)`.
+    /// Display name: `COLMAP (binary)`.
     pub kind: &'static str,
     /// The dataset's folder.
     pub root: PathBuf,
     pub views: Vec<DeclaredView>,
     pub points: Option<PointCloud>,
-    /// Made by a tool that sees images as they are stored.
+    /// Whether the tool that made it ignores EXIF orientation.
     pub ignores_exif: bool,
-    /// How many times the images must still be made smaller.
+    /// Factor by which the images must still be downscaled.
     pub downscale: f32,
     pub warnings: Vec<String>,
 }
@@ -24,15 +24,15 @@ pub(super) struct DeclaredView {
     /// `None` when no such file exists.
     pub image: Option<PathBuf>,
     pub mask: Option<PathBuf>,
-    /// `None` when the numbers are no pose.
+    /// `None` when the numbers do not form a pose.
     pub pose: Option<Pose>,
     pub camera: DeclaredCamera,
-    /// Nearest and farthest depth along +Z, world units, as the file has them.
+    /// Nearest and farthest depth along +Z, world units, as in the file.
     pub depth_bounds: Option<[f64; 2]>,
     /// In the source's own unit.
     pub time: Option<f32>,
     pub points_seen: Vec<u32>,
-    /// `None` when the dataset does not say.
+    /// `None` when the dataset does not declare it.
     pub split: Option<Split>,
 }
 
@@ -44,13 +44,13 @@ pub(super) enum Split {
     Left,
 }
 
-/// Intrinsics as declared: sizes and the principal point may be left to the image file.
+/// Intrinsics as declared: size and principal point may be taken from the image file.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct DeclaredCamera {
-    /// The size, in pixels, that the other numbers refer to; the image file's where `None`.
+    /// The size, in pixels, to which the other numbers refer; the image file's if `None`.
     pub size: Option<[f64; 2]>,
     pub focal: Focal,
-    /// The middle where `None`.
+    /// The image's centre if `None`.
     pub center: Option<[f64; 2]>,
     pub lens: Lens,
 }
@@ -59,7 +59,7 @@ pub(super) struct DeclaredCamera {
 pub(super) enum Focal {
     /// `fx, fy`.
     Pixels([f64; 2]),
-    /// Field of view across and down, radians; square pixels where one is `None`.
+    /// Horizontal and vertical field of view, radians; square pixels if one is `None`.
     Angles([Option<f64>; 2]),
 }
 
@@ -94,7 +94,7 @@ pub(super) fn lens_or_pinhole(lens: Lens) -> Lens {
     let bends = match lens {
         Lens::Pinhole => false,
         Lens::Opencv { k, p } => k.iter().chain(&p).any(|v| *v != 0.0),
-        // The fisheye model bends straight lines also with zeros.
+        // The fisheye model distorts even with zeros.
         Lens::Fisheye { .. } => true,
     };
     if bends { lens } else { Lens::Pinhole }
@@ -107,7 +107,7 @@ pub(super) fn pose_from_axes(right: DVec3, down: DVec3, forward: DVec3, position
     let [Some(x), Some(y), Some(z)] = axes else {
         return None;
     };
-    // Files keep few digits; more than this (3 degrees) is not rounding.
+    // Files have few digits; more than this (3 degrees) is not rounding.
     let skew = x.dot(y).abs().max(y.dot(z).abs()).max(z.dot(x).abs());
     if !(skew < 0.05 && x.cross(y).dot(z) > 0.0) {
         return None;

@@ -1,11 +1,11 @@
-//! Finding image files: by the names datasets use, in the folders they keep smaller copies in.
+//! Finding image files: by the names that datasets use, in their folders of full-size and smaller images.
 
 use crate::FormatError;
 use std::path::{Component, Path, PathBuf};
 
 const EXTENSIONS: [&str; 6] = ["png", "jpg", "jpeg", "PNG", "JPG", "JPEG"];
 
-/// The image that a dataset calls `path`: that file, or that name with an extension added or exchanged.
+/// The image file for a dataset's `path`: that file, or that name with an extension added or replaced.
 pub(super) fn find_image(path: &Path) -> Option<PathBuf> {
     if path.is_file() {
         return Some(path.to_owned());
@@ -31,13 +31,13 @@ pub(super) fn relative_name(root: &Path, path: &Path) -> String {
     parts.join("/")
 }
 
-/// Whether a file's name says that it is an image.
+/// Whether a file's name is that of an image.
 pub(super) fn is_image_name(path: &Path) -> bool {
     let extension = path.extension().map(|e| e.to_string_lossy().to_lowercase());
     extension.is_some_and(|e| EXTENSIONS.contains(&e.as_str()))
 }
 
-/// The images in a folder itself, sorted by name.
+/// The images directly in a folder, sorted by name.
 pub(super) fn list_images(folder: &Path) -> Result<Vec<PathBuf>, FormatError> {
     let read_error = |source| FormatError::Read {
         path: folder.to_owned(),
@@ -57,17 +57,17 @@ pub(super) fn list_images(folder: &Path) -> Result<Vec<PathBuf>, FormatError> {
     Ok(images)
 }
 
-/// The folder that the photographs are taken from.
+/// The folder of the photographs.
 pub(super) struct ImageFolder {
     /// `images`, `images_4`, ..
     pub name: String,
-    /// How many times its images must still be made smaller.
+    /// Factor by which its images must still be downscaled.
     pub downscale: f32,
-    /// What the user should know about the choice.
+    /// A warning about the choice.
     pub warning: Option<String>,
 }
 
-/// `images_N` when the downscale is N and it exists; else the largest there is: `images`, then `images_2`, ..
+/// `images_N` if the downscale is N and it exists; else the largest there is: `images`, then `images_2`, ..
 pub(super) fn choose_image_folder(root: &Path, downscale: f32) -> Option<ImageFolder> {
     if downscale > 1.0 && downscale.fract() == 0.0 {
         let name = format!("images_{downscale}");
@@ -93,7 +93,7 @@ pub(super) fn choose_image_folder(root: &Path, downscale: f32) -> Option<ImageFo
     });
     let name = format!("images_{}", factors.min()?);
     let warning = format!(
-        "there is no folder `images`; the photographs are taken from `{name}`, and any downscale counts from it"
+        "there is no folder `images`; the photographs are taken from `{name}`, and any downscale is relative to it"
     );
     Some(ImageFolder {
         name,

@@ -1,4 +1,4 @@
-//! LLFF's `poses_bounds.npy` (Mildenhall et al. 2019): a row of 17 numbers for each image, in the order of the images'
+//! LLFF's `poses_bounds.npy` (Mildenhall et al. 2019): a row of 17 numbers per image, in the order of the images'
 //! names. Fifteen are a 3x5 matrix whose columns are the camera's axes *down, right, backwards* in the world, its centre,
 //! and height, width and focal length in pixels of the original images; two are the nearest and farthest depth.
 
@@ -32,7 +32,7 @@ pub struct LlffPose {
 /// Parses a `poses_bounds.npy`.
 ///
 /// # Errors
-/// When it is no `.npy` file, is truncated, or does not have 17 columns.
+/// When it is not an `.npy` file, is truncated, or does not have 17 columns.
 pub fn parse_poses_bounds(bytes: &[u8]) -> Result<Vec<LlffPose>, Malformed> {
     let table = parse_table(bytes)?;
     if table.columns != 17 {
@@ -61,7 +61,7 @@ pub(super) fn read(root: &Path, downscale: f32) -> Result<Declared, FormatError>
     let Some(folder) = choose_image_folder(root, downscale) else {
         return Err(FormatError::NotADataset {
             path: root.to_owned(),
-            looked_for: "a folder `images`, or `images_N` with smaller ones, beside poses_bounds.npy".into(),
+            expected: "a folder `images`, or `images_N` with smaller ones, beside poses_bounds.npy".into(),
         });
     };
     let images = list_images(&root.join(&folder.name))?;

@@ -2,10 +2,10 @@ use super::files::{is_image_name, relative_name};
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 
-/// Folders below this depth are not searched; a link back to a parent would not end.
-const DEEPEST: u32 = 6;
+/// Maximum depth of the search; a link back to a parent would not end.
+const MAX_DEPTH: u32 = 6;
 
-/// The masks that lie in a folder of their own, by the image they belong to.
+/// The masks in a separate folder, by the image to which they belong.
 pub(super) struct Masks {
     folder: String,
     /// By path below the folder, lower case, without extension.
@@ -13,19 +13,19 @@ pub(super) struct Masks {
 }
 
 impl Masks {
-    /// The masks for the images in `root/images`: in `masks` with what follows `images` in its name (`masks_4` for
-    /// `images_4`), else in `masks`.
+    /// The masks of the images in `root/images`: in `masks` with the suffix of `images` in its name (`masks_4` for `images_4`),
+    /// else in `masks`.
     pub fn beside(root: &Path, images: &str) -> Option<Self> {
         let suffix = images.strip_prefix("images").unwrap_or("");
         let names = [format!("masks{suffix}"), "masks".to_owned()];
         let folder = names.into_iter().find(|name| root.join(name).is_dir())?;
         let mut by_stem = HashMap::new();
-        collect(&root.join(&folder), &root.join(&folder), DEEPEST, &mut by_stem);
+        collect(&root.join(&folder), &root.join(&folder), MAX_DEPTH, &mut by_stem);
         Some(Self { folder, by_stem })
     }
 
-    /// The mask of the image with this path below its folder: the same name, `NAME_mask`, or the full file name with
-    /// another extension behind it (COLMAP's `0001.jpg.png`).
+    /// The mask of the image with this path below its folder: the same name, `NAME_mask`, or the full file name with another
+    /// extension appended (COLMAP's `0001.jpg.png`).
     pub fn of(&self, image: &str) -> Option<PathBuf> {
         let image = image.to_lowercase();
         let stem = without_extension(&image);
@@ -33,11 +33,11 @@ impl Masks {
         keys.into_iter().find_map(|key| self.by_stem.get(key)).cloned()
     }
 
-    /// What to tell when some images have no mask.
+    /// The warning if some images have no mask.
     pub fn warning(&self, images: usize, masked: usize) -> Option<String> {
         (masked < images).then(|| {
             format!(
-                "{} of {images} images have no mask in `{}`; they are used whole",
+                "{} of {images} images have no mask in `{}`; they are used unmasked",
                 images - masked,
                 self.folder
             )
@@ -46,7 +46,7 @@ impl Masks {
 }
 
 fn collect(top: &Path, folder: &Path, depth: u32, by_stem: &mut HashMap<String, PathBuf>) {
-    // An unreadable folder of masks is as good as none; the warning about missing masks tells.
+    // An unreadable folder of masks is treated as empty; the warning about missing masks reports it.
     for path in std::fs::read_dir(folder)
         .into_iter()
         .flatten()
@@ -74,7 +74,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn masks_are_found_by_each_custom() {
+    fn masks_are_found_by_each_convention() {
         let root = tempfile::tempdir().unwrap();
         std::fs::create_dir_all(root.path().join("masks_2/sub")).unwrap();
         for name in ["A.png", "b_mask.JPG", "c.jpg.png", "sub/d.png"] {

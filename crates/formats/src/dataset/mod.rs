@@ -1,7 +1,7 @@
 //! Datasets of posed photographs. A new layout is one file here and one arm in each `match` below.
 //!
-//! A layout's reader says what the files declare ([`declared::Declared`]); [`assemble`] then looks at the image files,
-//! drops what cannot be used, and makes the [`Dataset`] with undistorted cameras at the size that was asked for.
+//! A layout's reader returns what the files declare ([`declared::Declared`]); [`assemble`] then reads the image headers, skips
+//! unusable views, and creates the [`Dataset`] with undistorted cameras at the requested size.
 
 mod assemble;
 mod blender;
@@ -30,17 +30,17 @@ pub enum DatasetFormat {
     Colmap,
     /// nerfstudio's and instant-ngp's `transforms.json`.
     Nerfstudio,
-    /// `transforms_train.json` and `transforms_test.json`, as NeRF's synthetic scenes have them.
+    /// `transforms_train.json` and `transforms_test.json`, like NeRF's synthetic scenes.
     Blender,
     /// `poses_bounds.npy`.
     Llff,
 }
 
 impl DatasetFormat {
-    /// All of them, in the order in which a folder is asked.
+    /// All of them, in the order in which a folder is tested.
     ///
-    /// Who prepared a folder last knows best: `transforms.json` is made from a COLMAP model that may lie beside it, and
-    /// `poses_bounds.npy` keeps less than the COLMAP model it is made from.
+    /// Later preparation takes precedence: `transforms.json` is made from a COLMAP model that may be beside it, and
+    /// `poses_bounds.npy` contains less than the COLMAP model it is made from.
     pub const ALL: [Self; 4] = [Self::Blender, Self::Nerfstudio, Self::Colmap, Self::Llff];
 
     /// The name used on the command line.
@@ -53,7 +53,7 @@ impl DatasetFormat {
         }
     }
 
-    fn looked_for(self) -> &'static str {
+    fn expected(self) -> &'static str {
         match self {
             Self::Colmap => "{cameras,images}.{bin,txt} in sparse/0, sparse or the folder (COLMAP)",
             Self::Nerfstudio => "transforms.json (nerfstudio, instant-ngp)",
@@ -92,28 +92,28 @@ impl FromStr for DatasetFormat {
             .find(|format| format.name().eq_ignore_ascii_case(text));
         found.ok_or_else(|| {
             let known = Self::ALL.map(Self::name).join(", ");
-            FormatError::Option(format!("`{text}` is no dataset format; known are {known}"))
+            FormatError::Option(format!("`{text}` is not a dataset format; known formats: {known}"))
         })
     }
 }
 
-/// How a dataset is to be read.
+/// How to read a dataset.
 #[derive(Clone, Debug, PartialEq)]
 pub struct DatasetOptions {
-    /// The layout; recognised from the files when `None`.
+    /// The layout; detected from the files when `None`.
     pub format: Option<DatasetFormat>,
-    /// Photographs are made this many times smaller, at least 1. A folder of smaller images that matches (`images_4` for
-    /// 4) is used as it is; where only such folders exist, other factors count from the largest of them.
+    /// Factor by which photographs are downscaled, at least 1. A matching folder of smaller images (`images_4` for 4) is used
+    /// directly; if only such folders exist, other factors are relative to the largest of them.
     pub downscale: f32,
-    /// Photographs are made smaller until the longer side has at most this many pixels.
+    /// Photographs are downscaled until the longer side has at most this many pixels.
     pub max_side: Option<u32>,
     /// Which views are held out.
     pub holdout: Holdout,
 }
 
-/// The longer side, in pixels, to which larger photographs are scaled where the user does not choose a size, as the authors'
-/// code of 3DGS does with its default `--resolution -1` (Kerbl et al. 2023).
-pub const USUAL_MAX_SIDE: u32 = 1600;
+/// The default limit on the longer side, in pixels, to which larger photographs are downscaled, as by the authors' code of 3DGS
+/// with its default `--resolution -1` (Kerbl et al. 2023).
+pub const DEFAULT_MAX_SIDE: u32 = 1600;
 
 impl Default for DatasetOptions {
     fn default() -> Self {
@@ -128,31 +128,31 @@ impl Default for DatasetOptions {
 
 /// Reads a dataset: poses, cameras, points and the headers of the images. Pixels are loaded later, view by view.
 ///
-/// Views are sorted by name and split by [`DatasetOptions::holdout`]. What had to be left out (missing images, poses that are
-/// none) is told in [`Dataset::warnings`].
+/// Views are sorted by name and split by [`DatasetOptions::holdout`]. Skipped views (missing images, invalid poses) are listed in
+/// [`Dataset::warnings`].
 ///
-/// EXIF orientation: poses belong to the pixels as the tool that made them saw them. Where the declared size has the
-/// shape of the stored image alone, nothing is turned; where it has the shape of the upright image, it is turned; where
-/// both fit (half turns, square images) it is turned, except for COLMAP, which ignores EXIF orientation.
+/// EXIF orientation: poses belong to the pixels as the tool that made them saw them. If the declared size has the aspect of the
+/// stored image only, no orientation is applied; if it has the aspect of the upright image, it is applied; if both match (half
+/// turns, square images) it is applied, except for COLMAP, which ignores EXIF orientation.
 ///
 /// # Errors
-/// When the folder is no dataset (the error says what was looked for), a file is unreadable or malformed, cameras have no
+/// When the folder is not a dataset (the error says what was expected), a file is unreadable or malformed, cameras have no
 /// intrinsics or an unknown model, fewer than 3 views are usable, or none of them is left to train on.
 pub fn read_dataset(path: &Path, options: &DatasetOptions) -> Result<Dataset, FormatError> {
     if !(options.downscale >= 1.0 && options.downscale.is_finite()) {
         return Err(FormatError::Option(format!(
-            "downscale is {}; give 1 or more",
+            "downscale is {}; must be 1 or more",
             options.downscale
         )));
     }
     if options.holdout == Holdout::Every(0) || options.holdout == Holdout::Every(1) {
         return Err(FormatError::Option(
-            "every view is held out; hold out every 2nd or fewer".into(),
+            "every view would be held out; hold out every 2nd or fewer".into(),
         ));
     }
     if options.max_side == Some(0) {
         return Err(FormatError::Option(
-            "the longest side is 0 pixels; give 1 or more".into(),
+            "the longest side is 0 pixels; must be 1 or more".into(),
         ));
     }
     let format = match options.format {
@@ -161,7 +161,7 @@ pub fn read_dataset(path: &Path, options: &DatasetOptions) -> Result<Dataset, Fo
         None => DatasetFormat::recognise(path),
     };
     let Some(format) = format else {
-        // A folder that is not there at all gets the system's word for it.
+        // For a missing folder, report the system's error.
         std::fs::metadata(path).map_err(|source| FormatError::Read {
             path: path.to_owned(),
             source,
@@ -171,9 +171,9 @@ pub fn read_dataset(path: &Path, options: &DatasetOptions) -> Result<Dataset, Fo
             .map_or(DatasetFormat::ALL.to_vec(), |format| vec![format]);
         return Err(FormatError::NotADataset {
             path: path.to_owned(),
-            looked_for: asked
+            expected: asked
                 .into_iter()
-                .map(DatasetFormat::looked_for)
+                .map(DatasetFormat::expected)
                 .collect::<Vec<_>>()
                 .join("; "),
         });

@@ -1,4 +1,4 @@
-//! A folder with one `transforms.json`, as nerfstudio and instant-ngp make them.
+//! A folder with one `transforms.json`, as written by nerfstudio and instant-ngp.
 
 use super::declared::{Declared, DeclaredView, Split};
 use super::files::{find_image, relative_name};
@@ -24,7 +24,7 @@ pub(super) fn find(path: &Path) -> Option<PathBuf> {
 
 pub(super) fn read(path: &Path, downscale: f32) -> Result<Declared, FormatError> {
     let Some(file) = find(path) else {
-        return Err(FormatError::malformed(path, "holds no transforms.json"));
+        return Err(FormatError::malformed(path, "contains no transforms.json"));
     };
     let transforms = read_and_parse(&file, parse_transforms)?;
     let root = match file.parent() {
@@ -68,7 +68,7 @@ pub(super) fn declared_views(
     let set =
         |names: &Option<Vec<String>>| -> HashSet<String> { names.iter().flatten().map(|n| n.to_owned()).collect() };
     let train = set(&transforms.train_filenames);
-    // A dataset that keeps validation frames alone holds those out.
+    // If a dataset lists only validation frames, those are held out.
     let (test, validation) = (set(&transforms.test_filenames), set(&transforms.val_filenames));
     let (test, left) = if test.is_empty() {
         (validation, HashSet::new())

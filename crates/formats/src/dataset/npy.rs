@@ -51,7 +51,7 @@ pub(super) fn parse_table(bytes: &[u8]) -> Result<Table, Malformed> {
     let needed = rows.checked_mul(columns).and_then(|count| count.checked_mul(size));
     if needed.is_none_or(|needed| needed > data.len()) {
         return Err(wrong(&format!(
-            "its shape {shape} promises more than the {} bytes that follow",
+            "its shape {shape} declares more than the {} bytes that follow",
             data.len()
         )));
     }
@@ -131,7 +131,7 @@ mod tests {
     }
 
     #[test]
-    fn promises_are_held_against_the_file() {
+    fn declared_sizes_are_checked_against_the_file() {
         for shape in [
             "(9, 17)",
             "(18446744073709551615, 17)",

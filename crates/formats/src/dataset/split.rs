@@ -1,4 +1,4 @@
-//! Which views are held out.
+//! Selection of held-out views.
 
 use super::declared::Split;
 use crate::FormatError;
@@ -6,29 +6,29 @@ use irradia_scene::every_eighth;
 use std::collections::HashSet;
 use std::path::{Path, PathBuf};
 
-/// Files that list the held-out and the training images, one name a line.
+/// Files that list the held-out and the training images, one name per line.
 const TEST_LISTS: [&str; 2] = ["test_images.txt", "test.txt"];
 const TRAIN_LISTS: [&str; 2] = ["train_images.txt", "train.txt"];
-/// Beside the images, or where the Inria code keeps them.
+/// Beside the images, or at the Inria code's location.
 const FOLDERS: [&str; 2] = ["", "sparse/0"];
 
-/// Which views are held out of training.
+/// Selects the views held out of training.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub enum Holdout {
-    /// Those that the dataset itself holds out; every 8th view where it does not say.
+    /// The dataset's own split; every 8th view if it has none.
     #[default]
     AsDeclared,
-    /// Every n-th view in the order of names, the first one included; 2 or more. The dataset's own split does not count.
+    /// Every n-th view in the order of names, including the first; 2 or more. The dataset's own split is ignored.
     Every(usize),
-    /// None: all views are trained on.
+    /// None: all views are training views.
     Nothing,
-    /// Those that this file names, one a line, with or without folder and extension; all others are trained on.
+    /// The views listed in this file, one per line, with or without folder and extension; all others are training views.
     Listed(PathBuf),
 }
 
 /// A list of image names.
 struct List {
-    /// Where it was read.
+    /// The file it was read from.
     file: String,
     names: HashSet<String>,
 }
@@ -58,10 +58,10 @@ pub(super) struct Indices {
     pub warning: Option<String>,
 }
 
-/// The split of the usable views `names`, of which the dataset in `root` declares `splits`.
+/// The split of the usable views `names`; the dataset in `root` declares `splits`.
 ///
 /// # Errors
-/// One line, when the file of [`Holdout::Listed`] fits nothing or cannot be read.
+/// One line, when the file of [`Holdout::Listed`] matches nothing or cannot be read.
 pub(super) fn split(
     holdout: &Holdout,
     root: &Path,
@@ -102,7 +102,8 @@ pub(super) fn split(
             }
             let missing = list.names.len().saturating_sub(listed.test.len());
             Indices {
-                warning: (missing > 0).then(|| format!("{missing} names in {} are no views of the dataset", list.file)),
+                warning: (missing > 0)
+                    .then(|| format!("{missing} names in {} are not views of the dataset", list.file)),
                 ..listed
             }
         }
@@ -114,7 +115,7 @@ pub(super) fn split(
     Ok(indices)
 }
 
-/// Sets the split of views that have none from lists beside the dataset. Returns a warning when a list fits nothing.
+/// Sets the split of views without one from lists beside the dataset. Returns a warning when a list matches nothing.
 fn apply_lists(root: &Path, names: &[String], splits: &mut [Option<Split>]) -> Option<String> {
     if splits.iter().any(Option::is_some) {
         return None;
@@ -148,7 +149,7 @@ fn apply_lists(root: &Path, names: &[String], splits: &mut [Option<Split>]) -> O
     None
 }
 
-/// The dataset's own split; every 8th view is held out where it has none.
+/// The dataset's own split; every 8th view is held out if it has none.
 fn declared(splits: &[Option<Split>]) -> Indices {
     if splits.iter().all(Option::is_none) {
         let (train, test) = every_eighth(splits.len());
@@ -170,8 +171,8 @@ fn declared(splits: &[Option<Split>]) -> Indices {
     }
 }
 
-/// A view's name as lists may write it: whole or below the folder of images, each with and without the extension, or its last
-/// part alone without it.
+/// The forms in which lists may give a view's name: complete or below the folder of images, each with and without the extension,
+/// or its last part without the extension.
 fn names_of(name: &str) -> impl Iterator<Item = &str> {
     let below = name.split_once('/').map_or(name, |(_, below)| below);
     let stem = |name| Path::new(name).file_stem().and_then(|s| s.to_str()).unwrap_or(name);
@@ -218,7 +219,7 @@ mod tests {
     }
 
     #[test]
-    fn a_list_of_strangers_is_ignored_and_said_or_refused_where_it_was_asked_for() {
+    fn an_unmatched_list_is_ignored_with_a_warning_or_rejected_if_requested() {
         let root = tempfile::tempdir().unwrap();
         std::fs::write(root.path().join("test.txt"), "x.png\n").unwrap();
         let indices = split(&Holdout::AsDeclared, root.path(), &names(), vec![None; 4]).unwrap();
@@ -232,7 +233,7 @@ mod tests {
     }
 
     #[test]
-    fn both_lists_leave_out_who_is_in_neither() {
+    fn with_both_lists_views_in_neither_are_skipped() {
         let root = tempfile::tempdir().unwrap();
         std::fs::write(root.path().join("test.txt"), "0").unwrap();
         std::fs::write(root.path().join("train.txt"), "1\n3").unwrap();
@@ -240,7 +241,7 @@ mod tests {
     }
 
     #[test]
-    fn what_was_asked_for_counts_before_what_is_declared() {
+    fn a_requested_split_overrides_the_declared_one() {
         let root = tempfile::tempdir().unwrap();
         let declared = vec![Some(Split::Train), Some(Split::Test), Some(Split::Left), None];
         let of = |holdout: Holdout| split(&holdout, root.path(), &names(), declared.clone()).unwrap();

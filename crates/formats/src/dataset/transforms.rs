@@ -1,4 +1,4 @@
-//! `transforms*.json`: cameras and frames as NeRF's Blender scenes, instant-ngp and nerfstudio write them.
+//! `transforms*.json`: cameras and frames of NeRF's Blender scenes, instant-ngp and nerfstudio.
 
 use super::declared::{DeclaredCamera, Focal, lens_or_pinhole, pose_from_axes};
 use crate::Malformed;
@@ -9,18 +9,18 @@ use serde::Deserialize;
 /// A `transforms.json`.
 #[derive(Clone, Debug, Deserialize)]
 pub struct Transforms {
-    /// Intrinsics for all frames that have none of their own.
+    /// Intrinsics of all frames without their own.
     #[serde(flatten)]
     pub camera: CameraKeys,
     /// The photographs.
     pub frames: Vec<Frame>,
     /// A point cloud in the same world, relative to the file.
     pub ply_file_path: Option<String>,
-    /// `file_path` of the frames to train on.
+    /// `file_path` of the training frames.
     pub train_filenames: Option<Vec<String>>,
     /// `file_path` of the frames for validation.
     pub val_filenames: Option<Vec<String>>,
-    /// `file_path` of the frames that are held out.
+    /// `file_path` of the held-out frames.
     pub test_filenames: Option<Vec<String>>,
 }
 
@@ -29,18 +29,18 @@ pub struct Transforms {
 pub struct Frame {
     /// The image, relative to the file, with or without extension.
     pub file_path: String,
-    /// Camera-to-world with OpenGL axes, 3x4 or 4x4, row by row; numbers that are not finite are `None`.
+    /// Camera-to-world with OpenGL axes, 3x4 or 4x4, row-major; numbers that are not finite are `None`.
     pub transform_matrix: Vec<Vec<Option<f64>>>,
     /// The mask, relative to the file; white is kept.
     pub mask_path: Option<String>,
-    /// When it was taken (D-NeRF: 0 to 1 over the capture).
+    /// Time of capture (D-NeRF: 0 to 1 over the capture).
     pub time: Option<f64>,
-    /// Intrinsics of this frame alone.
+    /// Intrinsics of this frame only.
     #[serde(flatten)]
     pub camera: CameraKeys,
 }
 
-/// The keys that say what a camera projects with; global or in a frame.
+/// The keys of a camera's intrinsics; global or in a frame.
 #[derive(Clone, Debug, Default, PartialEq, Deserialize)]
 #[allow(missing_docs)] // The format's own names.
 pub struct CameraKeys {
@@ -62,10 +62,10 @@ pub struct CameraKeys {
     pub p2: Option<f64>,
 }
 
-/// Parses a `transforms.json`. `NaN` and `Infinity`, which are no JSON but which Python writes, are read as `None`.
+/// Parses a `transforms.json`. `NaN` and `Infinity`, which are not JSON but written by Python, are read as `None`.
 ///
 /// # Errors
-/// When it is no JSON, or lacks `frames`, a `file_path` or a `transform_matrix`; with line and column.
+/// When it is not JSON, or lacks `frames`, a `file_path` or a `transform_matrix`; with line and column.
 pub fn parse_transforms(bytes: &[u8]) -> Result<Transforms, Malformed> {
     let bytes = bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes);
     serde_json::from_slice(bytes).or_else(|error| {
@@ -106,9 +106,9 @@ fn nulls_for_python_numbers(bytes: &[u8]) -> Vec<u8> {
 }
 
 impl CameraKeys {
-    /// These keys, and `others` where these say nothing.
+    /// These keys, and `others` for missing ones.
     ///
-    /// A frame's focal length given in one way is not mixed with a global one given in another.
+    /// Focal lengths of a frame and global ones of another kind are not mixed.
     pub(super) fn or(&self, others: &Self) -> Self {
         let own_focal = self
             .fl_x
@@ -137,10 +137,10 @@ impl CameraKeys {
         }
     }
 
-    /// The camera. Focal lengths in pixels count before angles; a principal point that is not given is in the middle.
+    /// The camera. Focal lengths in pixels take precedence over angles; a missing principal point is at the image's centre.
     ///
     /// Coefficients: `k1 k2 p1 p2` are OpenCV's, `k3` is its third radial one. A `k4` belongs to the fisheye model; with
-    /// others nerfstudio's files carry it as a fourth radial coefficient that its own undistortion refuses unless it is
+    /// others, nerfstudio's files have it as a fourth radial coefficient that nerfstudio's undistortion rejects unless it is
     /// zero, and so does this.
     pub(super) fn camera(&self) -> Result<DeclaredCamera, Malformed> {
         let focal = match (self.fl_x, self.fl_y) {
@@ -151,7 +151,7 @@ impl CameraKeys {
             }
             (None, None) => {
                 return Err(Malformed(
-                    "names no intrinsics; give fl_x (and fl_y, cx, cy, w, h) in pixels or camera_angle_x in radians, for \
+                    "has no intrinsics; set fl_x (and fl_y, cx, cy, w, h) in pixels or camera_angle_x in radians, for \
                      all frames or in each"
                         .into(),
                 ));
@@ -180,7 +180,7 @@ impl CameraKeys {
             }
             other => {
                 return Err(Malformed(format!(
-                    "the camera model {other} is not supported; PINHOLE, OPENCV and OPENCV_FISHEYE are"
+                    "the camera model {other} is not supported; use PINHOLE, OPENCV or OPENCV_FISHEYE"
                 )));
             }
         };
@@ -188,7 +188,7 @@ impl CameraKeys {
             (Some(w), Some(h)) if w >= 1.0 && h >= 1.0 => Some([w, h]),
             _ => None,
         };
-        // Half a principal point is as good as none.
+        // An incomplete principal point is treated as missing.
         let center = self.cx.zip(self.cy).map(|(x, y)| [x, y]);
         Ok(DeclaredCamera {
             size,
@@ -240,7 +240,7 @@ mod tests {
     }
 
     #[test]
-    fn what_a_camera_lacks_or_cannot_be_is_named() {
+    fn missing_and_unsupported_intrinsics_are_named() {
         let error = CameraKeys::default().camera().unwrap_err().to_string();
         assert!(error.contains("fl_x") && error.contains("camera_angle_x"), "{error}");
         let keys = CameraKeys {
@@ -272,7 +272,7 @@ mod tests {
     }
 
     #[test]
-    fn sheared_mirrored_and_flat_matrices_are_no_poses() {
+    fn sheared_mirrored_and_flat_matrices_are_rejected() {
         let frame = |rows: [[f64; 4]; 3]| Frame {
             file_path: String::new(),
             transform_matrix: rows.map(|row| row.map(Some).to_vec()).to_vec(),
@@ -281,7 +281,7 @@ mod tests {
             camera: CameraKeys::default(),
         };
         let good = [[2.0, 0.0, 0.0, 0.0], [0.0, 2.0, 0.0, 0.0], [0.0, 0.0, 2.0, 0.0]];
-        assert!(frame(good).pose().is_some(), "a scale is taken off");
+        assert!(frame(good).pose().is_some(), "a scale is removed");
         let mut bad = good;
         bad[0][0] = -2.0;
         assert_eq!(frame(bad).pose(), None);

@@ -8,7 +8,7 @@ use irradia_scene::GaussianCloud;
 use std::fmt;
 use std::path::Path;
 
-/// The splat file formats, told apart by extension.
+/// The splat file formats, identified by extension.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum SplatFormat {
     /// `.ply` in the layout of the Inria 3DGS code.
@@ -26,7 +26,7 @@ impl SplatFormat {
         }
     }
 
-    /// The format that `path`'s extension names, in any case of letters.
+    /// The format for `path`'s extension, ignoring case.
     ///
     /// # Errors
     /// [`FormatError::UnknownSplatFormat`], which lists the known ones.
@@ -50,23 +50,23 @@ impl fmt::Display for SplatFormat {
     }
 }
 
-/// Reads a splat scene; the format is taken from the extension.
+/// Reads a splat scene; the extension selects the format.
 ///
 /// # Errors
-/// When the extension is unknown, or the file cannot be read, lacks a property or is shorter than it promises.
+/// When the extension is unknown, or the file cannot be read, lacks a property or is shorter than its header declares.
 pub fn read_splats(path: &Path) -> Result<GaussianCloud, FormatError> {
     match SplatFormat::of(path)? {
         SplatFormat::Ply => read_and_parse(path, ply::parse_splat_ply),
     }
 }
 
-/// Writes a splat scene, whole or not at all; the format is taken from the extension.
+/// Writes a splat scene, atomically; the extension selects the format.
 ///
 /// # Errors
 /// When the extension is unknown or the file cannot be written.
 ///
 /// # Panics
-/// When the cloud's columns have unequal lengths: that is a bug of the caller.
+/// When the cloud's columns have unequal lengths: a bug in the caller.
 pub fn write_splats(path: &Path, cloud: &GaussianCloud) -> Result<(), FormatError> {
     assert!(cloud.is_consistent(), "the columns of the cloud have unequal lengths");
     match SplatFormat::of(path)? {

@@ -8,11 +8,11 @@ use irradia_scene::{GaussianCloud, sh};
 use rayon::prelude::*;
 use std::io::{self, Write};
 
-/// Rows that one task converts.
+/// Rows converted per task.
 const CHUNK: usize = 16_384;
-/// The comment that carries [`GaussianCloud::antialiased`], which the layout has no place for.
+/// The comment that stores [`GaussianCloud::antialiased`], for which the layout has no property.
 const ANTIALIASED: &str = "antialiased 1";
-/// Highest degree that is read.
+/// Highest degree supported.
 const MAX_DEGREE: u32 = 4;
 
 /// The properties of a splat file that every splat needs.
@@ -21,12 +21,12 @@ const DC: [&str; 3] = ["f_dc_0", "f_dc_1", "f_dc_2"];
 const SCALE: [&str; 3] = ["scale_0", "scale_1", "scale_2"];
 const ROTATION: [&str; 4] = ["rot_0", "rot_1", "rot_2", "rot_3"];
 
-/// Parses a splat PLY: any encoding, any order of properties, SH degree 0 to 4 by the number of `f_rest`; what else
-/// the file holds is skipped. Floats keep their bits.
+/// Parses a splat PLY: any encoding, any order of properties, SH degree 0 to 4 by the number of `f_rest`; other content of
+/// the file is skipped. Floats are preserved bit for bit.
 ///
 /// # Errors
-/// One line when the header is not understood, properties are missing (all are named), or the file is shorter than
-/// the header promises.
+/// One line when the header is invalid, properties are missing (all are named), or the file is shorter than the header
+/// declares.
 pub fn parse_splat_ply(bytes: &[u8]) -> Result<GaussianCloud, Malformed> {
     let ply = Ply::parse(bytes)?;
     let sh_degree = check_properties(&ply)?;
@@ -69,8 +69,8 @@ pub fn parse_splat_ply(bytes: &[u8]) -> Result<GaussianCloud, Malformed> {
     Ok(cloud)
 }
 
-/// Whether a PLY holds splats rather than a point cloud, by the names of its properties.
-pub(crate) fn looks_like_splats(bytes: &[u8]) -> Result<bool, Malformed> {
+/// Whether a PLY contains splats rather than a point cloud, by the names of its properties.
+pub(crate) fn has_splats(bytes: &[u8]) -> Result<bool, Malformed> {
     let ply = Ply::parse(bytes)?;
     Ok(ply
         .property_names("vertex")?
@@ -106,7 +106,7 @@ impl Columns {
     }
 }
 
-/// Names everything that is missing at once, before a byte of the body is looked at; returns the SH degree.
+/// Names all missing properties at once, before reading the body; returns the SH degree.
 fn check_properties(ply: &Ply) -> Result<u32, Malformed> {
     let names: Vec<&str> = ply.property_names("vertex")?.collect();
     if names.iter().any(|name| name.starts_with("packed_")) {
@@ -138,7 +138,7 @@ fn check_properties(ply: &Ply) -> Result<u32, Malformed> {
         .find(|degree| 3 * (sh::coefficients(*degree) - 1) == rest)
         .ok_or_else(|| {
             Malformed(format!(
-                "{rest} f_rest properties belong to no spherical-harmonics degree; 0, 9, 24, 45 and 72 do"
+                "{rest} f_rest properties match no spherical-harmonics degree; expected 0, 9, 24, 45 or 72"
             ))
         })
 }
@@ -185,7 +185,7 @@ pub(crate) fn write_splat_ply(out: &mut dyn Write, cloud: &GaussianCloud) -> io:
         }
         bytes
     };
-    // A few chunks a thread at a time: parallel, without the whole file in memory.
+    // A few chunks per thread at a time: parallel, without the whole file in memory.
     let chunks = cloud.len().div_ceil(CHUNK);
     let batch = 2 * rayon::current_num_threads();
     for first in (0..chunks).step_by(batch) {
@@ -229,7 +229,7 @@ mod tests {
     }
 
     #[test]
-    fn every_bit_comes_back_also_of_nans_for_every_degree() {
+    fn every_bit_round_trips_including_nans_for_every_degree() {
         for degree in 0..=4 {
             for count in [0, 1, 3, CHUNK + 7] {
                 let cloud = random_cloud(count, degree, degree % 2 == 0);
@@ -307,7 +307,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_missing_is_named() {
+    fn missing_properties_are_named() {
         let header = |properties: &str| {
             let lines: String = properties.split(' ').map(|p| format!("property float {p}\n")).collect();
             format!("ply\nformat binary_little_endian 1.0\nelement vertex 0\n{lines}end_header\n")

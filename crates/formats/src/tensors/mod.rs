@@ -16,18 +16,18 @@ use std::path::Path;
 pub struct Tensor {
     /// Sizes, outermost first.
     pub shape: Vec<usize>,
-    /// Row by row.
+    /// Row-major.
     pub values: Vec<f32>,
 }
 
-/// Larger files are refused; torchvision's VGG16, with its classifier, has 528 MB.
+/// Larger files are rejected; torchvision's VGG16, with its classifier, has 528 MB.
 const MAX_BYTES: u64 = 1 << 30;
 
-/// The tensors of `path` whose names are `wanted`: a safetensors file, or what `torch.save(model.state_dict())` writes, as a
-/// zip archive or in the format before that. Nothing in the file is executed; other objects in it are left out.
+/// The tensors of `path` whose names are `wanted`, from a safetensors file or the output of `torch.save(model.state_dict())`, as a
+/// zip archive or in the older format. Nothing in the file is executed; other objects in it are ignored.
 ///
 /// # Errors
-/// When the file cannot be read, is neither, or has a wanted tensor that is not whole and in 32-bit floats.
+/// When the file cannot be read, is neither, or has a wanted tensor that is truncated or not in 32-bit floats.
 pub fn read_tensors(path: &Path, wanted: impl Fn(&str) -> bool) -> Result<BTreeMap<String, Tensor>, FormatError> {
     let unreadable = |source| FormatError::Read {
         path: path.to_owned(),
@@ -59,7 +59,7 @@ pub(crate) fn parse(bytes: &[u8], wanted: &dyn Fn(&str) -> bool) -> Result<BTree
 fn from_safetensors(bytes: &[u8], wanted: &dyn Fn(&str) -> bool) -> Result<BTreeMap<String, Tensor>, Malformed> {
     let unknown = |error| {
         Malformed(format!(
-            "neither a PyTorch state dict nor a whole safetensors file ({error})"
+            "neither a PyTorch state dict nor a complete safetensors file ({error})"
         ))
     };
     let file = SafeTensors::deserialize(bytes).map_err(unknown)?;
@@ -67,7 +67,7 @@ fn from_safetensors(bytes: &[u8], wanted: &dyn Fn(&str) -> bool) -> Result<BTree
     for (name, tensor) in file.iter().filter(|(name, _)| wanted(name)) {
         if tensor.dtype() != Dtype::F32 {
             return Err(Malformed(format!(
-                "tensor {name} is {:?}; only F32 is read",
+                "tensor {name} is {:?}; only F32 is supported",
                 tensor.dtype()
             )));
         }

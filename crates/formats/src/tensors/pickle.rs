@@ -1,14 +1,14 @@
-//! The part of Python's pickle protocol 2 that state dicts need, as plain data: a name that a pickle would import stays a
-//! name, and calls are recorded, never made. Opcodes are those of CPython's `pickletools.py`.
+//! The subset of Python's pickle protocol 2 that state dicts need, parsed to plain data: imports remain names, and calls are
+//! recorded, never executed. Opcodes are those of CPython's `pickletools.py`.
 
 use crate::Malformed;
 use crate::bytes::Bytes;
 use std::collections::HashMap;
 
-/// Index of an object. Objects refer to one another by it, so that neither cycles nor depth cost anything.
+/// Index of an object. Objects refer to one another by index, so that cycles and deep nesting are cheap.
 pub(super) type Id = usize;
 
-/// What a pickle holds.
+/// The content of a pickle.
 #[derive(Clone, Debug)]
 pub(super) enum Object {
     /// None, true, false, and integers of more than 8 bytes.
@@ -20,7 +20,7 @@ pub(super) enum Object {
     Dict(Vec<(Id, Id)>),
     /// `module.name`.
     Global(String),
-    /// An object kept outside of the pickle, by what identifies it.
+    /// An object stored outside the pickle, with its identifier.
     Persistent(Id),
     /// A call with its arguments.
     Call(Id, Id),
@@ -30,12 +30,12 @@ pub(super) enum Object {
 #[derive(Default)]
 pub(super) struct Pickle {
     objects: Vec<Object>,
-    /// What the pickle is of.
+    /// The pickled object.
     pub(super) top: Id,
 }
 
-/// What a pickle may make in all; VGG16's state dict makes some hundred objects.
-const MOST: usize = 1 << 20;
+/// Maximum number of objects of a pickle; VGG16's state dict has some hundred.
+const MAX_OBJECTS: usize = 1 << 20;
 
 impl Pickle {
     pub(super) fn object(&self, id: Id) -> &Object {
@@ -63,7 +63,7 @@ impl Pickle {
         }
     }
 
-    /// A list's or a tuple's.
+    /// The items of a list or a tuple.
     pub(super) fn items(&self, id: Id) -> Option<&[Id]> {
         match self.object(id) {
             Object::List(items) => Some(items),
@@ -83,7 +83,7 @@ impl Pickle {
     }
 }
 
-/// Reads one pickle, up to its end.
+/// Reads one pickle, to its end.
 pub(super) fn read(bytes: &mut Bytes) -> Result<Pickle, Malformed> {
     let mut machine = Machine::default();
     while !machine.step(bytes)? {}
@@ -94,10 +94,10 @@ pub(super) fn read(bytes: &mut Bytes) -> Result<Pickle, Malformed> {
 struct Machine {
     pickle: Pickle,
     stack: Vec<Id>,
-    /// Heights of the stack.
+    /// Heights of the stack at its marks.
     marks: Vec<usize>,
     memo: HashMap<u32, Id>,
-    /// Objects, marks, recollections and copies made so far.
+    /// Objects, marks, recalls and copies so far.
     grown: usize,
 }
 
@@ -106,14 +106,14 @@ fn wrong(what: impl std::fmt::Display) -> Malformed {
 }
 
 impl Machine {
-    /// One opcode; whether it was the last.
+    /// Executes one opcode; returns whether it was the last.
     fn step(&mut self, bytes: &mut Bytes) -> Result<bool, Malformed> {
         let code = bytes.u8()?;
         match code {
             0x80 => {
                 let protocol = bytes.u8()?;
                 if protocol != 2 {
-                    return Err(wrong(format_args!("pickle protocol {protocol} and not 2")));
+                    return Err(wrong(format_args!("pickle protocol {protocol}, not 2")));
                 }
             }
             b'N' | 0x88 | 0x89 => self.push(Object::Other)?,
@@ -153,7 +153,7 @@ impl Machine {
                 let at = self.stack.len().checked_sub(count);
                 let items = self
                     .stack
-                    .split_off(at.ok_or_else(|| wrong("it takes more than it has"))?);
+                    .split_off(at.ok_or_else(|| wrong("it pops from an empty stack"))?);
                 self.push(Object::Tuple(items))?;
             }
             b'a' => {
@@ -191,7 +191,7 @@ impl Machine {
                 let made = self.call(function, arguments)?;
                 self.push(made)?;
             }
-            // Attributes given to an object, such as the versions of a state dict's modules: not needed.
+            // Attributes of an object, such as the versions of a state dict's modules: not needed.
             b'b' => drop(self.pop()?),
             b'.' => {
                 self.pickle.top = self.pop()?;
@@ -199,14 +199,14 @@ impl Machine {
             }
             _ => {
                 return Err(wrong(format_args!(
-                    "it has pickle opcode {code:#04x}, which state dicts do not need"
+                    "it has pickle opcode {code:#04x}, which state dicts do not use"
                 )));
             }
         }
         Ok(false)
     }
 
-    /// What a call makes: ordered dicts, as Python 2 (with a list of pairs) and 3 (empty) build them, become dicts.
+    /// The result of a call: ordered dicts, as Python 2 (with a list of pairs) and 3 (empty) build them, become dicts.
     fn call(&mut self, function: Id, arguments: Id) -> Result<Object, Malformed> {
         let call = Object::Call(function, arguments);
         if self.pickle.global(function) != Some("collections.OrderedDict") {
@@ -228,10 +228,10 @@ impl Machine {
         }
     }
 
-    /// Holds what `count` more cost against [`MOST`].
+    /// Checks `count` more against [`MAX_OBJECTS`].
     fn grow(&mut self, count: usize) -> Result<(), Malformed> {
         self.grown += count;
-        if self.grown > MOST {
+        if self.grown > MAX_OBJECTS {
             return Err(wrong("it makes too many objects"));
         }
         Ok(())
@@ -255,7 +255,7 @@ impl Machine {
     fn pop(&mut self) -> Result<Id, Malformed> {
         let low = self.marks.last().copied().unwrap_or(0);
         let popped = if self.stack.len() > low { self.stack.pop() } else { None };
-        popped.ok_or_else(|| wrong("it takes more than it has"))
+        popped.ok_or_else(|| wrong("it pops from an empty stack"))
     }
 
     fn since_mark(&mut self) -> Result<Vec<Id>, Malformed> {
@@ -269,7 +269,7 @@ impl Machine {
     fn append(&mut self, items: &[Id]) -> Result<(), Malformed> {
         match self.stack.last().map(|top| &mut self.pickle.objects[*top]) {
             Some(Object::List(list)) => list.extend(items),
-            _ => return Err(wrong("it appends to what is no list")),
+            _ => return Err(wrong("it appends to an object that is not a list")),
         }
         Ok(())
     }
@@ -277,13 +277,13 @@ impl Machine {
     fn set(&mut self, items: &[Id]) -> Result<(), Malformed> {
         match self.stack.last().map(|top| &mut self.pickle.objects[*top]) {
             Some(Object::Dict(dict)) => dict.extend(items.as_chunks().0.iter().map(|[key, value]| (*key, *value))),
-            _ => return Err(wrong("it sets keys of what is no dict")),
+            _ => return Err(wrong("it sets keys of an object that is not a dict")),
         }
         Ok(())
     }
 
     fn remember(&mut self, key: u32) -> Result<(), Malformed> {
-        let top = *self.stack.last().ok_or_else(|| wrong("it remembers nothing"))?;
+        let top = *self.stack.last().ok_or_else(|| wrong("it memoises an empty stack"))?;
         self.grow(1)?;
         self.memo.insert(key, top);
         Ok(())
@@ -291,10 +291,7 @@ impl Machine {
 
     fn recall(&mut self, key: u32) -> Result<(), Malformed> {
         self.grow(1)?;
-        let id = self
-            .memo
-            .get(&key)
-            .ok_or_else(|| wrong("it recalls what it never had"))?;
+        let id = self.memo.get(&key).ok_or_else(|| wrong("it recalls an unknown memo"))?;
         self.stack.push(*id);
         Ok(())
     }

@@ -1,5 +1,5 @@
 //! State dicts as `torch.save` writes them: since PyTorch 1.6 a zip archive with a pickle of names and shapes and one file of
-//! values a storage; before, a stream of pickles with the storages behind them (`torch/serialization.py`).
+//! values per storage; before that, a stream of pickles followed by the storages (`torch/serialization.py`).
 
 use super::pickle::{self, Id, Object, Pickle};
 use super::{Tensor, archive, floats};
@@ -17,7 +17,7 @@ fn wrong(what: impl std::fmt::Display) -> Malformed {
 pub(super) fn from_archive(bytes: &[u8], wanted: Wanted) -> Result<BTreeMap<String, Tensor>, Malformed> {
     let files = archive::files(bytes)?;
     let folder = files.keys().find_map(|name| name.strip_suffix("data.pkl"));
-    let folder = folder.ok_or_else(|| wrong("the archive holds no data.pkl"))?;
+    let folder = folder.ok_or_else(|| wrong("the archive contains no data.pkl"))?;
     let order = files.get(&format!("{folder}byteorder"));
     if order.is_some_and(|order| *order != b"little") {
         return Err(wrong("its values are not little-endian"));
@@ -27,12 +27,12 @@ pub(super) fn from_archive(bytes: &[u8], wanted: Wanted) -> Result<BTreeMap<Stri
     tensors(&pickle, bytes.len(), wanted, &storage)
 }
 
-/// From the stream of pickles: a magic number, a version, the system it was written on, the state dict, the storages' keys.
+/// From the stream of pickles: a magic number, a version, the system that wrote it, the state dict, the storages' keys.
 pub(super) fn from_stream(bytes: &[u8], wanted: Wanted) -> Result<BTreeMap<String, Tensor>, Malformed> {
     const MAGIC: &[u8] = b"\x80\x02\x8a\x0a\x6c\xfc\x9c\x46\xf9\x20\x6a\xa8\x50\x19.";
     let total = bytes.len();
     let stream = bytes.strip_prefix(MAGIC);
-    let mut bytes = Bytes::new(stream.ok_or_else(|| wrong("it does not begin as PyTorch's files do"))?);
+    let mut bytes = Bytes::new(stream.ok_or_else(|| wrong("it does not begin like a PyTorch file"))?);
     let version = pickle::read(&mut bytes)?;
     if version.size(version.top) != Some(1001) {
         return Err(wrong("its version is not 1001"));
@@ -60,7 +60,7 @@ pub(super) fn from_stream(bytes: &[u8], wanted: Wanted) -> Result<BTreeMap<Strin
     tensors(&pickle, total, wanted, &storage)
 }
 
-/// Bytes of a value in a storage.
+/// Bytes per value in a storage.
 fn value_size(kind: &str) -> Option<usize> {
     Some(match kind.strip_prefix("torch.")?.strip_suffix("Storage")? {
         "Double" | "Long" => 8,
@@ -71,7 +71,7 @@ fn value_size(kind: &str) -> Option<usize> {
     })
 }
 
-/// What identifies a storage: `("storage", type, key, device, number of values, ..)`.
+/// The identifier of a storage: `("storage", type, key, device, number of values, ..)`.
 struct Storage<'a> {
     kind: &'a str,
     key: &'a str,
@@ -90,10 +90,10 @@ impl<'a> Storage<'a> {
     }
 }
 
-/// Dimensions of a tensor.
-const MOST_SIZES: usize = 8;
+/// Maximum number of dimensions of a tensor.
+const MAX_DIMENSIONS: usize = 8;
 
-/// A tensor as the pickle says how to rebuild it.
+/// A tensor as the pickle rebuilds it.
 struct Rebuilt<'a> {
     storage: Storage<'a>,
     offset: usize,
@@ -102,7 +102,7 @@ struct Rebuilt<'a> {
 }
 
 impl<'a> Rebuilt<'a> {
-    /// `None` for what is no tensor.
+    /// `None` if the object is not a tensor.
     fn of(pickle: &'a Pickle, id: Id) -> Option<Self> {
         let call = |id: Id| match pickle.object(id) {
             Object::Call(function, arguments) => Some((pickle.global(*function)?, pickle.tuple(*arguments)?)),
@@ -118,7 +118,7 @@ impl<'a> Rebuilt<'a> {
             return None;
         };
         let sizes = |id: &Id| {
-            let sizes = pickle.tuple(*id).filter(|sizes| sizes.len() <= MOST_SIZES)?;
+            let sizes = pickle.tuple(*id).filter(|sizes| sizes.len() <= MAX_DIMENSIONS)?;
             sizes.iter().map(|id| pickle.size(*id)).collect::<Option<Vec<_>>>()
         };
         Some(Self {
@@ -129,7 +129,7 @@ impl<'a> Rebuilt<'a> {
         })
     }
 
-    /// Number of values, where they lie row by row.
+    /// Number of values, if stored contiguously, row-major.
     fn count(&self) -> Option<usize> {
         let mut count = 1usize;
         for (size, stride) in self.shape.iter().zip(&self.strides).rev() {
@@ -142,7 +142,7 @@ impl<'a> Rebuilt<'a> {
     }
 }
 
-/// The wanted tensors of the state dict; all together they have no more values than the file of `total` bytes.
+/// The wanted tensors of the state dict; in total they have no more values than the file of `total` bytes.
 fn tensors<'a>(
     pickle: &Pickle,
     total: usize,
@@ -150,7 +150,7 @@ fn tensors<'a>(
     storage: &dyn Fn(&str) -> Option<&'a [u8]>,
 ) -> Result<BTreeMap<String, Tensor>, Malformed> {
     let Object::Dict(entries) = pickle.object(pickle.top) else {
-        return Err(wrong("it is of something else; save the model's state_dict()"));
+        return Err(wrong("it contains another object; save the model's state_dict()"));
     };
     let mut room = total / size_of::<f32>();
     let mut tensors = BTreeMap::new();
@@ -159,23 +159,23 @@ fn tensors<'a>(
             continue;
         };
         let of = |what: &str| wrong(format_args!("tensor {name} {what}"));
-        let tensor = Rebuilt::of(pickle, *value).ok_or_else(|| of("is of a kind that is not read"))?;
+        let tensor = Rebuilt::of(pickle, *value).ok_or_else(|| of("is of an unsupported kind"))?;
         if tensor.storage.kind != "torch.FloatStorage" {
             return Err(of(&format!(
-                "is in a {}; only 32-bit floats are read",
+                "is in a {}; only 32-bit floats are supported",
                 tensor.storage.kind
             )));
         }
-        let count = tensor.count().ok_or_else(|| of("does not lie row by row"))?;
+        let count = tensor.count().ok_or_else(|| of("is not contiguous"))?;
         let (values, _) = storage(tensor.storage.key)
             .ok_or_else(|| of("has no values"))?
             .as_chunks::<4>();
         let end = tensor.offset.checked_add(count);
         let values = end.and_then(|end| values.get(tensor.offset..end));
-        let values = values.ok_or_else(|| of("is larger than what is stored of it; the file is truncated"))?;
+        let values = values.ok_or_else(|| of("is larger than its storage; the file is truncated"))?;
         room = room
             .checked_sub(count)
-            .ok_or_else(|| wrong("its tensors are more than the file holds"))?;
+            .ok_or_else(|| wrong("its tensors are larger than the file"))?;
         let tensor = Tensor {
             shape: tensor.shape,
             values: floats(values.as_flattened()),

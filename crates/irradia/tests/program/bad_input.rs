@@ -233,7 +233,7 @@ fn a_ply_shorter_than_its_header_promises_is_rejected() {
         irradia(folder.path(), &format!("render {name} --orbit 2 --out out")).refused(1, &[name]);
         irradia(folder.path(), &format!("eval {name} --data data")).refused(1, &[name]);
     }
-    irradia(folder.path(), "convert boast.ply out.ply").refused(1, &["promises", "999999999999", "truncated"]);
+    irradia(folder.path(), "convert boast.ply out.ply").refused(1, &["declares", "999999999999", "truncated"]);
     irradia(folder.path(), "eval data/points.ply --data data").refused(1, &["points.ply", "point cloud"]);
     assert!(!folder.path().join("out.ply").exists() && !folder.path().join("out").exists());
 }

@@ -4,13 +4,13 @@ use super::{ColmapCamera, ColmapImage, ColmapPoint, MODELS};
 use crate::Malformed;
 use crate::bytes::Bytes;
 
-/// The number of "no point".
+/// The id that means "no point".
 const NO_POINT: u64 = u64::MAX;
 
 /// Parses `cameras.bin`.
 ///
 /// # Errors
-/// When it is truncated, or a model's number is unknown: then its length is unknown too.
+/// When it is truncated, or a model's number is unknown, and with it its length.
 pub fn parse_cameras(bytes: &[u8]) -> Result<Vec<ColmapCamera>, Malformed> {
     let mut bytes = Bytes::new(bytes);
     let count = bytes.count(24, "cameras")?;

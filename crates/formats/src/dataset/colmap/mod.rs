@@ -17,7 +17,7 @@ use std::path::{Path, PathBuf};
 /// A row of `cameras`.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ColmapCamera {
-    /// Its number.
+    /// Its id.
     pub id: u32,
     /// COLMAP's name of the model: `PINHOLE`, `OPENCV`, ..
     pub model: String,
@@ -25,7 +25,7 @@ pub struct ColmapCamera {
     pub width: u64,
     /// Height in pixels.
     pub height: u64,
-    /// As many as the model has, in COLMAP's order.
+    /// The model's parameters, in COLMAP's order.
     pub params: Vec<f64>,
 }
 
@@ -47,7 +47,7 @@ pub struct ColmapImage {
 /// A row of `points3D`.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ColmapPoint {
-    /// Its number.
+    /// Its id.
     pub id: u64,
     /// World.
     pub position: [f64; 3],
@@ -55,7 +55,7 @@ pub struct ColmapPoint {
     pub color: [u8; 3],
 }
 
-/// The models by COLMAP's number, with their names and how many parameters they have (`models.h` of COLMAP).
+/// The models by COLMAP's number, with their names and numbers of parameters (`models.h` of COLMAP).
 const MODELS: [(&str, usize); 11] = [
     ("SIMPLE_PINHOLE", 3),
     ("PINHOLE", 4),
@@ -70,7 +70,7 @@ const MODELS: [(&str, usize); 11] = [
     ("THIN_PRISM_FISHEYE", 12),
 ];
 
-/// Where a model lies and in which of its two forms.
+/// The folder of a model and its format.
 pub(super) struct ModelFiles {
     folder: PathBuf,
     binary: bool,
@@ -108,7 +108,7 @@ impl ModelFiles {
 
 pub(super) fn read(root: &Path, downscale: f32) -> Result<Declared, FormatError> {
     let Some(files) = find_model(root) else {
-        return Err(FormatError::malformed(root, "holds no COLMAP model"));
+        return Err(FormatError::malformed(root, "contains no COLMAP model"));
     };
     let mut cameras = HashMap::new();
     for camera in files.read("cameras", binary::parse_cameras, text::parse_cameras)? {
@@ -271,7 +271,7 @@ mod tests {
     }
 
     #[test]
-    fn each_model_puts_its_parameters_where_they_belong() {
+    fn each_model_assigns_its_parameters() {
         let numbers: Vec<f64> = (1..=12).map(f64::from).collect();
         let full = camera("FULL_OPENCV", &numbers).unwrap();
         assert_eq!(

@@ -7,7 +7,7 @@ use std::str::{FromStr, SplitAsciiWhitespace};
 /// Parses `cameras.txt`: `CAMERA_ID MODEL WIDTH HEIGHT PARAMS..`.
 ///
 /// # Errors
-/// When a line is not understood; it is named by number.
+/// When a line is invalid; it is named by number.
 pub fn parse_cameras(bytes: &[u8]) -> Result<Vec<ColmapCamera>, Malformed> {
     let text = utf8(bytes)?;
     content_lines(&text)
@@ -25,10 +25,10 @@ pub fn parse_cameras(bytes: &[u8]) -> Result<Vec<ColmapCamera>, Malformed> {
 }
 
 /// Parses `images.txt`: a line `IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME`, then a line of `X Y POINT3D_ID` triples,
-/// which may be empty; some tools leave it out.
+/// which may be empty; some tools omit it.
 ///
 /// # Errors
-/// When a line is not understood; it is named by number.
+/// When a line is invalid; it is named by number.
 pub fn parse_images(bytes: &[u8]) -> Result<Vec<ColmapImage>, Malformed> {
     let text = utf8(bytes)?;
     let mut lines = text.lines().enumerate().peekable();
@@ -51,7 +51,7 @@ pub fn parse_images(bytes: &[u8]) -> Result<Vec<ColmapImage>, Malformed> {
             while let Some(x) = words.next_if_any() {
                 let _: f64 = words.parse(x, "X")?;
                 words.next::<f64>("Y")?;
-                // -1 where the observation belongs to no point.
+                // -1 if the observation belongs to no point.
                 image
                     .points
                     .extend(u64::try_from(words.next::<i64>("POINT3D_ID")?).ok());
@@ -65,7 +65,7 @@ pub fn parse_images(bytes: &[u8]) -> Result<Vec<ColmapImage>, Malformed> {
 /// Parses `points3D.txt`: `POINT3D_ID X Y Z R G B ERROR TRACK..`.
 ///
 /// # Errors
-/// When a line is not understood; it is named by number.
+/// When a line is invalid; it is named by number.
 pub fn parse_points(bytes: &[u8]) -> Result<Vec<ColmapPoint>, Malformed> {
     let text = utf8(bytes)?;
     content_lines(&text)
@@ -80,7 +80,7 @@ pub fn parse_points(bytes: &[u8]) -> Result<Vec<ColmapPoint>, Malformed> {
         .collect()
 }
 
-/// Everything behind the ninth word: names may hold spaces.
+/// Everything after the ninth word: names may contain spaces.
 fn name_of(line: &str) -> Option<&str> {
     let mut rest = line.trim();
     for _ in 0..9 {
@@ -89,7 +89,7 @@ fn name_of(line: &str) -> Option<&str> {
     (!rest.is_empty()).then_some(rest)
 }
 
-/// Whether a line behind an image holds its observations rather than the next image: an image's tenth word is a name.
+/// Whether a line after an image contains its observations rather than the next image: an image's tenth word is a name.
 fn is_observations(line: &str) -> bool {
     !line.trim_start().starts_with('#')
         && line
@@ -106,13 +106,13 @@ fn content_lines(text: &str) -> impl Iterator<Item = (usize, &str)> {
 fn utf8(bytes: &[u8]) -> Result<std::borrow::Cow<'_, str>, Malformed> {
     if bytes.contains(&0) {
         return Err(Malformed(
-            "holds zero bytes, so it is no text; is it a binary model under a .txt name?".into(),
+            "contains zero bytes, so it is not text; is it a binary model under a .txt name?".into(),
         ));
     }
     Ok(String::from_utf8_lossy(bytes))
 }
 
-/// The words of one line, for errors that say where.
+/// The words of one line, for errors with its number.
 struct Words<'a> {
     line: usize,
     words: SplitAsciiWhitespace<'a>,

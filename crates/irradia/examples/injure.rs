@@ -28,17 +28,25 @@ struct Args {
     #[arg(long, default_value_t = 1.0)]
     downscale: f32,
     /// A factor per photograph on its sRGB colours, log-uniform between these
-    #[arg(long, value_name = "FROM,TO", value_delimiter = ',', num_args = 2)]
-    gains: Option<Vec<f32>>,
+    #[arg(long, value_name = "FROM,TO", value_parser = pair)]
+    gains: Option<[f32; 2]>,
     /// A factor per channel and photograph, uniform between 1 - this and 1 + this
     #[arg(long, default_value_t = 0.0)]
     balance: f32,
     /// Standard deviations of the poses' rotation in degrees and of their position in extents of the scene
-    #[arg(long, value_name = "DEG,FRACTION", value_delimiter = ',', num_args = 2)]
-    pose_noise: Option<Vec<f32>>,
+    #[arg(long, value_name = "DEG,FRACTION", value_parser = pair)]
+    pose_noise: Option<[f32; 2]>,
     /// Random seed
     #[arg(long, default_value_t = 0)]
     seed: u64,
+}
+
+/// `0.6,1.6`
+fn pair(text: &str) -> Result<[f32; 2], String> {
+    let numbers = text
+        .split_once(',')
+        .and_then(|(a, b)| Some([a.trim().parse().ok()?, b.trim().parse().ok()?]));
+    numbers.ok_or_else(|| "must be two numbers with a comma between them, such as 0.6,1.6".into())
 }
 
 fn main() -> Result<()> {

@@ -49,9 +49,10 @@ const SPLATS_BY_PIXELS: f64 = 0.6;
 /// within this fraction of the recipe.
 const SPLATS_FOLLOW: f64 = 0.12;
 
-/// Uncertainty of a forecast, as a factor in both directions, up to a tenth of the recipe and from nine tenths on; in between it
-/// falls linearly in the logarithm. Seen after a tenth: 0.5 to 2.2 times the actual duration, on eight runs of four recipes.
-const UNCERTAINTY: [f64; 2] = [2.2, 1.1];
+/// How far off a prediction may be, as a factor either way: up to a tenth of the recipe, and from nine tenths on; in between it falls
+/// evenly in the logarithm. Over 21 runs of two recipes on six scenes, on a busy machine, the time that was left lay within this range
+/// in 92 % of the steps after the first tenth, and in 74 % in the worst run.
+const UNCERTAINTY: [f64; 2] = [2.5, 1.3];
 
 /// Range of the remaining time in nine of ten runs, if `left` seconds were predicted.
 pub fn range(left: f64, recipe: &Recipe, clock: &Clock) -> [f64; 2] {

@@ -11,12 +11,12 @@
 use anyhow::{Context, Result, bail};
 use clap::Parser;
 use glam::{Mat4, Quat, Vec3};
-use irradia_formats::{DatasetOptions, read_dataset, write_atomic, write_png};
-use irradia_scene::{Camera, Dataset, PointCloud, Rng};
+use irradia_formats::{DatasetOptions, read_dataset, write_atomic, write_png, write_points_ply};
+use irradia_scene::{Camera, Dataset, Rng};
 use irradia_splat::init::camera_extent;
 use rayon::prelude::*;
 use serde_json::{Value, json};
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 #[derive(Parser)]
 struct Args {
@@ -64,9 +64,11 @@ fn main() -> Result<()> {
     }
     std::fs::create_dir_all(args.out.join("images"))
         .with_context(|| format!("cannot create {}", args.out.display()))?;
+    let cameras: Vec<Camera> = dataset.train.iter().map(|i| dataset.views[*i].camera).collect();
+    let extent = camera_extent(&cameras);
     let frames: Vec<Value> = (0..dataset.views.len())
         .into_par_iter()
-        .map(|view| write_view(&args, &dataset, view))
+        .map(|view| write_view(&args, &dataset, extent, view))
         .collect::<Result<_>>()?;
     let files = |views: &[usize]| -> Vec<Value> { views.iter().map(|i| frames[*i]["file_path"].clone()).collect() };
     let mut transforms = json!({
@@ -75,7 +77,7 @@ fn main() -> Result<()> {
     });
     if let Some(points) = &dataset.points {
         transforms["ply_file_path"] = json!("points.ply");
-        write_points(&args.out.join("points.ply"), points)?;
+        write_points_ply(&args.out.join("points.ply"), points)?;
     }
     let bytes = serde_json::to_vec_pretty(&transforms)?;
     write_atomic(&args.out.join("transforms.json"), |file| file.write_all(&bytes))?;
@@ -84,9 +86,7 @@ fn main() -> Result<()> {
 }
 
 /// Writes one photograph; returns its frame of `transforms.json`.
-fn write_view(args: &Args, dataset: &Dataset, view: usize) -> Result<Value> {
-    let cameras: Vec<Camera> = dataset.train.iter().map(|i| dataset.views[*i].camera).collect();
-    let extent = camera_extent(&cameras);
+fn write_view(args: &Args, dataset: &Dataset, extent: f32, view: usize) -> Result<Value> {
     let mut rng = Rng::new(args.seed, view as u64);
     let gain = args
         .gains
@@ -135,17 +135,4 @@ fn write_view(args: &Args, dataset: &Dataset, view: usize) -> Result<Value> {
         frame["mask_path"] = json!(name);
     }
     Ok(frame)
-}
-
-fn write_points(path: &Path, points: &PointCloud) -> Result<()> {
-    let mut text = format!(
-        "ply\nformat ascii 1.0\nelement vertex {}\nproperty float x\nproperty float y\nproperty float z\n\
-         property uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n",
-        points.len()
-    );
-    for (p, c) in points.positions.iter().zip(&points.colors) {
-        text += &format!("{} {} {} {} {} {}\n", p.x, p.y, p.z, c[0], c[1], c[2]);
-    }
-    write_atomic(path, |file| file.write_all(text.as_bytes()))?;
-    Ok(())
 }

@@ -101,24 +101,26 @@ fn fitted_pose(model: &Model, renderer: &mut Renderer, view: &HeldOut, fit: Half
         data: truth.to_u8(),
         mask: mask.map(<[u8]>::to_vec),
     };
-    for (step, scale) in (0..STEPS).map(|step| (step, if 2 * step < STEPS { 0.5 } else { 1.0 })) {
-        camera.intrinsics = size.scaled(scale);
-        let (width, height) = (camera.intrinsics.width, camera.intrinsics.height);
-        let target = photo.resized(width, height);
-        let truth = Image::new(
-            width,
-            height,
-            3,
-            target.data.iter().map(|v| f32::from(*v) / 255.0).collect(),
-        );
-        let counts = |i: usize| is_left(i, width as usize) && target.mask.as_ref().is_none_or(|mask| mask[i] != 0);
+    // Half size first: what is far off is found there.
+    let targets = [0.5, 1.0].map(|scale| {
+        let intrinsics = size.scaled(scale);
+        let target = photo.resized(intrinsics.width, intrinsics.height);
+        let data = target.data.iter().map(|v| f32::from(*v) / 255.0).collect();
+        let truth = Image::new(target.width, target.height, 3, data);
+        (intrinsics, truth, target.mask)
+    });
+    for step in 0..STEPS {
+        let (intrinsics, truth, mask) = &targets[usize::from(2 * step >= STEPS)];
+        camera.intrinsics = *intrinsics;
+        let width = intrinsics.width;
+        let counts = |i: usize| is_left(i, width as usize) && mask.as_ref().is_none_or(|mask| mask[i] != 0);
         let render = model.render(renderer, &camera, options).color;
         let map = if fit.exposure {
-            Affine::fit(&render, &truth, counts)
+            Affine::fit(&render, truth, counts)
         } else {
             Affine::IDENTITY
         };
-        let v_color = squared_error_gradient(&render, &truth, &map, counts);
+        let v_color = squared_error_gradient(&render, truth, &map, counts);
         let v_out = OutputGradient {
             camera: true,
             ..OutputGradient::of_color(&v_color)

@@ -9,6 +9,7 @@ pub mod event;
 pub mod field_file;
 mod field_step;
 mod forecast;
+mod free_space;
 pub mod half_fit;
 pub mod model;
 mod objective;

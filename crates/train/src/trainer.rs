@@ -2,6 +2,7 @@
 
 use crate::event::{Event, StepReport};
 use crate::field_step::{first_field, is_field};
+use crate::free_space::FreeSpace;
 use crate::half_fit::HalfFit;
 use crate::model::Model;
 use crate::objective::{Objective, Reference};
@@ -119,6 +120,7 @@ pub struct Trainer {
     /// Known depths of the views on which a field is trained, by view, width and height.
     pub(crate) depths: HashMap<(usize, u32, u32), Arc<[KnownDepth]>>,
     objective: Objective,
+    free_space: FreeSpace,
 }
 
 impl Trainer {
@@ -156,6 +158,7 @@ impl Trainer {
             cap: cap(&recipe, &cameras),
             depths: HashMap::new(),
             objective: Objective::new(options.lpips.clone()),
+            free_space: FreeSpace::new(&dataset, recipe.free_space),
             engine: Engine::new(SplatState::new(Splats::zeros(0, sh::MAX_DEGREE))),
             field: None,
             sockets: Sockets::default(),
@@ -420,7 +423,14 @@ impl Trainer {
     }
 
     fn control_density(&mut self, plan: &StepPlan) -> Option<DensityChange> {
-        let change = plan.densify.as_ref().map(|round| self.densify(round));
+        let change = plan.densify.as_ref().map(|round| {
+            let cleared = self.free_space.clear(self.engine.state_mut());
+            let change = self.densify(round);
+            DensityChange {
+                pruned: change.pruned + cleared,
+                ..change
+            }
+        });
         let merged = plan
             .merge
             .map(|knobs| merge::merge(self.engine.state_mut(), &knobs.options()));

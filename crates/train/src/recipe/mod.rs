@@ -76,6 +76,10 @@ documented! {
         /// Maximum number of splats per pixel of a training image, averaged over views; no such limit when absent.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         pub splats_per_pixel: Option<f32>,
+        /// Radius around each training camera within which splats are removed at every round of density control, as a fraction of
+        /// the depth of the nearest points that its view sees (or of its depth bounds); 0 for none.
+        #[serde(default, skip_serializing_if = "is_zero")]
+        pub free_space: f32,
         /// Steps between evaluations of held-out views while training; at least 1.
         pub eval_every: u64,
         /// Steps between checkpoints; at least 1.
@@ -458,6 +462,10 @@ impl Recipe {
 
 fn is_false(value: &bool) -> bool {
     !value
+}
+
+fn is_zero(value: &f32) -> bool {
+    *value == 0.0
 }
 
 impl Recipe {

@@ -57,6 +57,20 @@ pub struct Rates {
     pub sh_rest: f32,
 }
 
+impl Rates {
+    /// All of them times `factor`.
+    pub fn scaled(self, factor: f32) -> Self {
+        Self {
+            means: self.means * factor,
+            quats: self.quats * factor,
+            log_scales: self.log_scales * factor,
+            opacities: self.opacities * factor,
+            sh_dc: self.sh_dc * factor,
+            sh_rest: self.sh_rest * factor,
+        }
+    }
+}
+
 impl SplatState {
     /// Statistics plane: sum of the screen-space gradient's norm, in normalised device coordinates as in 3DGS.
     pub const GRADIENT: usize = 0;

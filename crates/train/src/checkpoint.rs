@@ -6,8 +6,9 @@ mod carried;
 mod tests;
 
 use crate::field_file;
-use crate::recipe::Recipe;
+use crate::recipe::{Choice, Recipe};
 use crate::schedule::{Clock, ConvergenceMonitor};
+use crate::socket::Exposure;
 use crate::tensor_file::{NamedTensor, TensorSource};
 use crate::times::Times;
 use crate::trainer::{TrainError, TrainOptions, Trainer};
@@ -234,6 +235,10 @@ pub fn from_bytes(bytes: &[u8], dataset: Arc<Dataset>, options: TrainOptions) ->
         trainer.field = Some(state.map_err(|why| wrong(format!("{FIELD}{why}")))?);
     }
     trainer.sockets = trainer.first_sockets()?;
+    // The run decided whether to learn exposures.
+    if trainer.recipe.exposure == Choice::Auto && tensors("exposure.").whole("steps").is_some() {
+        trainer.sockets.exposure = Some(Exposure::new(trainer.dataset.views.len(), &trainer.dataset.train));
+    }
     for occupant in trainer.sockets.occupants_mut() {
         let prefix = format!("{}.", occupant.name());
         let restored = occupant.restore(TensorSource::new(&file, &prefix));

@@ -6,6 +6,7 @@ pub mod compare;
 mod edges;
 pub mod eval;
 pub mod event;
+mod exposure_probe;
 pub mod field_file;
 mod field_step;
 mod forecast;

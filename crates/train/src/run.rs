@@ -133,6 +133,7 @@ pub fn run(
         }
         trainer.times.wall = before + began.elapsed().as_secs_f64();
     }
+    events.extend(fewer_than_at_first(trainer));
     let stopped = if requests.stop { "stopped" } else { "recipe complete" };
     let reason = reason.unwrap_or(stopped).to_owned();
     events.push(Event::Finished {
@@ -144,6 +145,17 @@ pub fn run(
         tell(trainer, &mut events, observers);
     }
     Ok(reason)
+}
+
+/// A warning where a run ends with fewer splats than it began with.
+fn fewer_than_at_first(trainer: &Trainer) -> Option<Event> {
+    let (first, last) = (trainer.first_count(), trainer.engine.len());
+    let reduced = trainer.field.is_none() && trainer.finished() && last < first;
+    reduced.then(|| Event::Warned {
+        message: format!(
+            "{last} splats are left of {first} at first: the others had faded or showed in no photograph; if the scene is a blur, photographs disagree on it (light, poses, moving objects)"
+        ),
+    })
 }
 
 fn save(trainer: &Trainer, events: &mut Vec<Event>, observers: &mut [&mut dyn Observer]) {

@@ -1,15 +1,16 @@
 //! Start here: [`Trainer::step`] is one step from batch to update.
 
 use crate::event::{Event, StepReport};
+use crate::exposure_probe;
 use crate::field_step::{first_field, is_field};
 use crate::free_space::FreeSpace;
 use crate::half_fit::HalfFit;
 use crate::model::Model;
 use crate::objective::{Objective, Reference};
 use crate::photos::{PhotoCache, Prepared};
-use crate::recipe::{AdamKind, DensityControl, LengthUnit, Param, Recipe};
+use crate::recipe::{AdamKind, Choice, DensityControl, LengthUnit, Param, Recipe};
 use crate::schedule::{Clock, Round, StepMetrics, StepPlan, plan, upcoming_views};
-use crate::socket::{Residual, Sockets};
+use crate::socket::{Exposure, Residual, Sockets};
 use crate::times::Times;
 use cpu_time::ProcessTime;
 use irradia_compute::adam::AdamStep;
@@ -85,6 +86,9 @@ const STREAM_INIT: u64 = 1;
 const STREAM_DENSIFY: u64 = 2;
 const STREAM_STEP: u64 = 5;
 
+/// Points of a dataset below which splats begin at random positions.
+const MIN_POINTS: usize = 10;
+
 /// Training views over which the convergence error is measured.
 const MEASURED_VIEWS: usize = 8;
 
@@ -116,6 +120,8 @@ pub struct Trainer {
     pub times: Times,
     /// Maximum number of splats: the recipe's limits for this dataset.
     pub cap: usize,
+    /// Pixels of a training image, averaged over views.
+    pixels: f64,
     pub(crate) photos: PhotoCache,
     /// Known depths of the views on which a field is trained, by view, width and height.
     pub(crate) depths: HashMap<(usize, u32, u32), Arc<[KnownDepth]>>,
@@ -156,6 +162,7 @@ impl Trainer {
             extent: init::camera_extent(&cameras),
             photos: PhotoCache::new(dataset.clone(), recipe.render.background, options.photo_budget),
             cap: cap(&recipe, &cameras),
+            pixels: mean_pixels(&cameras),
             depths: HashMap::new(),
             objective: Objective::new(options.lpips.clone()),
             free_space: FreeSpace::new(&dataset, recipe.free_space),
@@ -205,7 +212,7 @@ impl Trainer {
         let options = self.init_options();
         let dataset = self.dataset.clone();
         let most = self.recipe.max_splats;
-        let splats = match dataset.points.as_ref().filter(|points| points.len() >= 10) {
+        let splats = match dataset.points.as_ref().filter(|points| points.len() >= MIN_POINTS) {
             // Evenly over the file: SfM writes points in the order in which it finds them, region by region.
             Some(points) if points.len() > most => {
                 let chosen = (0..most).map(|i| i * points.len() / most);
@@ -288,7 +295,13 @@ impl Trainer {
         } else {
             self.splat_step(events)?
         };
-        if self.tick(metrics) && !self.finished() {
+        let probe_at = exposure_probe::AT * self.recipe.total_steps() as f64;
+        let before = self.clock.time;
+        let entered = self.tick(metrics) && !self.finished();
+        if before < probe_at && self.clock.time >= probe_at && self.recipe.exposure == Choice::Auto && self.field.is_none() {
+            events.extend(self.decide_exposure()?);
+        }
+        if entered {
             events.push(Event::StageEntered {
                 stage: self.stage_name().to_owned(),
                 step: self.clock.step,
@@ -389,7 +402,8 @@ impl Trainer {
 
     /// The splat update of this step.
     fn update(&self, plan: &StepPlan) -> Update {
-        let mut rates = plan.rates();
+        let longer = self.pace.min(1.0).powf(f64::from(self.recipe.length_exponent)) as f32;
+        let mut rates = plan.rates().scaled(longer);
         rates.means *= self.extent;
         let adam = &self.recipe.adam;
         let (noise, limit) = (plan.value(Param::Noise), plan.value(Param::ConditionCap));
@@ -451,6 +465,7 @@ impl Trainer {
 
     fn densify(&mut self, round: &Round) -> DensityChange {
         let limit = self.limit(self.clock.stage, round.count_share);
+        let first = self.first_count();
         let mut rng = Rng::new(self.options.seed ^ self.clock.step << 20, STREAM_DENSIFY);
         let state = self.engine.state_mut();
         match round.density {
@@ -464,8 +479,20 @@ impl Trainer {
                 let options = knobs.options(self.extent, round.prune_large, round.number, target);
                 taming::densify(state, &options, &mut rng)
             }
-            DensityControl::Fast(knobs) => fast::densify(state, &knobs.options(self.pace, limit)),
+            DensityControl::Fast(knobs) => {
+                let floor = ((f64::from(knobs.floor) * self.pixels) as usize).min(first).min(limit);
+                fast::densify(state, &knobs.options(self.pace, floor, limit))
+            }
         }
+    }
+
+    /// Number of the first splats.
+    pub(crate) fn first_count(&self) -> usize {
+        let points = self.dataset.points.as_ref().map(|points| points.len());
+        points
+            .filter(|count| *count >= MIN_POINTS)
+            .unwrap_or(self.recipe.init.random_points)
+            .min(self.recipe.max_splats)
     }
 
     /// Maximum number of splats of stage `stage` at `count_share`, a fraction of the cap.
@@ -553,6 +580,45 @@ impl Trainer {
         Ok(sum / f64::from(count.max(1)))
     }
 
+    /// Adds an exposure per photograph if the photographs need it, and says so.
+    fn decide_exposure(&mut self) -> Result<Option<Event>, TrainError> {
+        let plan = plan(&self.recipe, &self.clock);
+        let upcoming = upcoming_views(&self.dataset.train, self.options.seed, &self.clock);
+        let train = self.dataset.train.clone();
+        let stride = train.len().div_ceil(exposure_probe::VIEWS).max(1);
+        let mut measured = Vec::new();
+        for view in train.into_iter().step_by(stride) {
+            let order: Vec<usize> = std::iter::once(view)
+                .chain(upcoming.iter().copied().filter(|other| *other != view))
+                .collect();
+            let photo = self.photos.get(&order, plan.image_scale)?;
+            let camera = self.scaled_camera(view, plan.image_scale);
+            self.engine.render(camera.into(), &self.render_options(plan.sh_degree));
+            if let Some(log) = exposure_probe::log_exposure(self.engine.frame().color, &photo) {
+                measured.push((view, camera, log));
+            }
+        }
+        let views: Vec<(Camera, f64)> = measured.iter().map(|(_, camera, log)| (*camera, *log)).collect();
+        let Some(spread) = exposure_probe::unpredicted(&views, self.extent) else {
+            return Ok(None);
+        };
+        if std::env::var_os("PROBE").is_some() {
+            eprintln!("PROBE {spread:.4}");
+        }
+        if spread < exposure_probe::THRESHOLD {
+            return Ok(None);
+        }
+        let logs: Vec<(usize, f64)> = measured.into_iter().map(|(view, _, log)| (view, log)).collect();
+        let exposure = Exposure::new(self.dataset.views.len(), &self.dataset.train).with_gains(&logs);
+        self.sockets.exposure = Some(exposure);
+        Ok(Some(Event::Warned {
+            message: format!(
+                "photographs differ in exposure by {:.0} % beyond what adjacent ones predict: each has its own from here on (--set exposure=false for none)",
+                100.0 * spread
+            ),
+        }))
+    }
+
     /// Advances the clock; steps saved by an early end of a stage go to the remaining stages.
     fn tick(&mut self, metrics: StepMetrics) -> bool {
         let stretch = self.clock.stretch;
@@ -625,13 +691,14 @@ fn train_cameras(dataset: &Dataset) -> Vec<Camera> {
 
 /// The recipe's limits on the number of splats, for images of these cameras.
 fn cap(recipe: &Recipe, cameras: &[Camera]) -> usize {
-    let pixels: f64 = cameras
-        .iter()
-        .map(|c| f64::from(c.intrinsics.width) * f64::from(c.intrinsics.height))
-        .sum();
-    let mean = pixels / cameras.len().max(1) as f64;
+    let mean = mean_pixels(cameras);
     let by_pixels = recipe
         .splats_per_pixel
         .map_or(usize::MAX, |per_pixel| (f64::from(per_pixel) * mean) as usize);
     recipe.max_splats.min(by_pixels).max(1)
+}
+
+fn mean_pixels(cameras: &[Camera]) -> f64 {
+    let pixels = |c: &Camera| f64::from(c.intrinsics.width) * f64::from(c.intrinsics.height);
+    cameras.iter().map(pixels).sum::<f64>() / cameras.len().max(1) as f64
 }

@@ -15,6 +15,8 @@ use crate::SplatState;
 pub struct FastOptions {
     /// Maximum number of splats after the round.
     pub target: usize,
+    /// Number of splats below which none that is finite is removed: where photographs disagree, all splats fade.
+    pub floor: usize,
     /// Opacity below which a splat is removed.
     pub min_opacity: f32,
     /// Mean weight per frame, in pixels, below which a splat is removed.
@@ -36,7 +38,10 @@ pub fn densify(state: &mut SplatState, options: &FastOptions) -> DensityChange {
         let shows = seen < FRAMES || state.mean_statistic(SplatState::WEIGHT, i) >= options.min_weight;
         shows && state.splats.opacity(i) >= options.min_opacity && is_finite(&state.splats, i)
     };
-    let kept: Vec<u32> = (0..n as u32).filter(|i| stays(*i as usize)).collect();
+    let mut kept: Vec<u32> = (0..n as u32).filter(|i| stays(*i as usize)).collect();
+    if kept.len() < options.floor.min(n) {
+        kept = most_shown(state, options.floor);
+    }
     state.gather(&kept);
 
     let room = options.target.saturating_sub(state.len());
@@ -62,6 +67,19 @@ pub fn densify(state: &mut SplatState, options: &FastOptions) -> DensityChange {
         split: split.len(),
         pruned: n - kept.len(),
     }
+}
+
+/// The `count` finite splats with the largest mean weight, in order.
+fn most_shown(state: &SplatState, count: usize) -> Vec<u32> {
+    let finite = (0..state.len()).filter(|i| is_finite(&state.splats, *i));
+    let mut ranked: Vec<(f32, u32)> = finite
+        .map(|i| (state.mean_statistic(SplatState::WEIGHT, i), i as u32))
+        .collect();
+    ranked.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
+    ranked.truncate(count);
+    let mut kept: Vec<u32> = ranked.into_iter().map(|(_, i)| i).collect();
+    kept.sort_unstable();
+    kept
 }
 
 #[cfg(test)]
@@ -96,6 +114,7 @@ mod tests {
         }
         let options = FastOptions {
             target: 4,
+            floor: 0,
             min_opacity: 0.01,
             min_weight: 0.1,
             error_threshold: 1.0,
@@ -109,5 +128,35 @@ mod tests {
         );
         let near_zero = (0..4).filter(|i| state.splats.means.get(0, *i).abs() < 5.0).count();
         assert_eq!(near_zero, 2);
+    }
+
+    #[test]
+    fn splats_that_all_fade_are_kept_down_to_the_floor() {
+        let mut splats = Splats::zeros(5, 0);
+        for i in 0..5 {
+            splats.means.set(0, i, i as f32);
+            splats.quats.set(0, i, 1.0);
+            splats.opacity_logits.set(0, i, logit(0.001));
+        }
+        splats.means.set(1, 4, f32::NAN);
+        let mut state = SplatState::new(splats);
+        for (i, weight) in [3.0, 1.0, 4.0, 2.0, 9.0].into_iter().enumerate() {
+            state.statistics.set(SplatState::SEEN, i, 2.0);
+            state.statistics.set(SplatState::WEIGHT, i, weight);
+        }
+        let options = FastOptions {
+            target: 9,
+            floor: 2,
+            min_opacity: 0.005,
+            min_weight: 0.1,
+            error_threshold: 1.0,
+            min_extent: 2.0,
+        };
+        assert_eq!(densify(&mut state, &options).pruned, 3);
+        let mut left: Vec<f32> = (0..2).map(|i| state.splats.means.get(0, i)).collect();
+        left.sort_by(f32::total_cmp);
+        assert_eq!(left, [0.0, 2.0], "those of the largest weight");
+        let none = FastOptions { floor: 0, ..options };
+        assert_eq!(densify(&mut state, &none).pruned, 2, "faded");
     }
 }

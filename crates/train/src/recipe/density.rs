@@ -221,14 +221,18 @@ documented! {
         pub error_threshold: f32,
         /// Half size on screen, pixels, from which a splat is worth splitting.
         pub min_extent: f32,
+        /// Splats per pixel of a training image down to which none are removed, at most as many as at first.
+        #[serde(default)]
+        pub floor: f32,
     }
 }
 
 impl FastKnobs {
-    /// Options for at most `target` splats after the round, in a run with `pace` recipe steps per step.
-    pub fn options(&self, pace: f64, target: usize) -> FastOptions {
+    /// Options for at least `floor` and at most `target` splats after the round, in a run with `pace` recipe steps per step.
+    pub fn options(&self, pace: f64, floor: usize, target: usize) -> FastOptions {
         FastOptions {
             target,
+            floor,
             min_opacity: self.min_opacity,
             min_weight: self.min_weight,
             error_threshold: self.error_threshold * pace as f32,

@@ -100,6 +100,7 @@ impl Documented {
             .and_then(|kind| kind.strip_suffix('>'));
         let value = match bare.unwrap_or(self.kind) {
             "bool" => "true or false",
+            "Choice" => "true, false or auto",
             "f32" | "f64" => "number",
             "u32" | "u64" | "usize" => "whole number",
             "String" => "text",
@@ -111,7 +112,7 @@ impl Documented {
         let default = match (self.serde.starts_with("default"), self.kind) {
             (false, _) => "required",
             (true, "bool") if self.serde.contains("\"on\"") => "true",
-            (true, "bool") => "false",
+            (true, "bool" | "Choice") => "false",
             (true, "f32" | "u32" | "u64" | "usize") => "0",
             (true, "AdamKind") => "sparse",
             (true, "FieldSpace") => "auto",

@@ -80,6 +80,10 @@ documented! {
         /// the depth of the nearest points that its view sees (or of its depth bounds); 0 for none.
         #[serde(default, skip_serializing_if = "is_zero")]
         pub free_space: f32,
+        /// Exponent of the rates' dependence on the length of a run that is longer than the recipe: with 0.5 a run of four times the
+        /// recipe's steps has half the rates; 0 for none.
+        #[serde(default, skip_serializing_if = "is_zero")]
+        pub length_exponent: f32,
         /// Steps between evaluations of held-out views while training; at least 1.
         pub eval_every: u64,
         /// Steps between checkpoints; at least 1.
@@ -99,9 +103,10 @@ documented! {
         /// The radiance field of the stages that train one.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         pub field: Option<FieldKnobs>,
-        /// Train a separate exposure and white balance, an affine colour map, for each photograph.
-        #[serde(default, skip_serializing_if = "is_false")]
-        pub exposure: bool,
+        /// Train a separate exposure and white balance, an affine colour map, for each photograph; with `auto` if, after a tenth
+        /// of the run, photographs differ in exposure beyond what adjacent cameras predict.
+        #[serde(default, skip_serializing_if = "Choice::is_no")]
+        pub exposure: Choice,
         /// Refine the cameras' poses.
         #[serde(default, skip_serializing_if = "is_false")]
         pub refine_poses: bool,
@@ -162,6 +167,59 @@ documented! {
         /// visible keep parameters and moments.
         #[serde(default, skip_serializing_if = "AdamKind::is_sparse")]
         pub kind: AdamKind,
+    }
+}
+
+/// Whether to do something, or let the data decide: `true`, `false` or `"auto"` in a recipe.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(from = "BoolOrAuto", into = "BoolOrAuto")]
+pub enum Choice {
+    /// No.
+    #[default]
+    No,
+    /// Yes.
+    Yes,
+    /// The data decide.
+    Auto,
+}
+
+impl Choice {
+    fn is_no(&self) -> bool {
+        *self == Self::No
+    }
+}
+
+/// How a [`Choice`] is written.
+#[derive(Serialize, Deserialize)]
+#[serde(untagged, expecting = "expected true, false or \"auto\"")]
+enum BoolOrAuto {
+    Bool(bool),
+    Word(Auto),
+}
+
+#[derive(Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+enum Auto {
+    Auto,
+}
+
+impl From<BoolOrAuto> for Choice {
+    fn from(written: BoolOrAuto) -> Self {
+        match written {
+            BoolOrAuto::Bool(false) => Self::No,
+            BoolOrAuto::Bool(true) => Self::Yes,
+            BoolOrAuto::Word(Auto::Auto) => Self::Auto,
+        }
+    }
+}
+
+impl From<Choice> for BoolOrAuto {
+    fn from(choice: Choice) -> Self {
+        match choice {
+            Choice::No => Self::Bool(false),
+            Choice::Yes => Self::Bool(true),
+            Choice::Auto => Self::Word(Auto::Auto),
+        }
     }
 }
 
@@ -366,7 +424,7 @@ impl Recipe {
                 self.params.entry(param).or_insert(ramp);
             }
         };
-        let (exposure, poses) = (self.exposure, self.refine_poses);
+        let (exposure, poses) = (self.exposure != Choice::No, self.refine_poses);
         // A photograph is used 30 to 100 times in a run, within which gains of 1.6 must be reached.
         default(exposure, Param::RateExposure, 0.03, 0.001);
         default(exposure, Param::ExposureReg, 0.01, 0.001);

@@ -36,6 +36,27 @@ impl Exposure {
         }
     }
 
+    /// The same with the gains exp(`logs`) of some views, relative to their mean.
+    pub fn with_gains(mut self, logs: &[(usize, f64)]) -> Self {
+        let mean = logs.iter().map(|(_, log)| log).sum::<f64>() / logs.len().max(1) as f64;
+        for (view, log) in logs {
+            let gain = (log - mean).exp() as f32;
+            self.maps[*view] = IDENTITY.map(|v| v * gain);
+        }
+        let mut common = [0.0f32; N];
+        for view in &self.train {
+            for ((sum, value), identity) in common.iter_mut().zip(self.maps[*view]).zip(IDENTITY) {
+                *sum += (value - identity) / self.train.len() as f32;
+            }
+        }
+        for view in &self.train {
+            for (value, common) in self.maps[*view].iter_mut().zip(common) {
+                *value -= common;
+            }
+        }
+        self
+    }
+
     /// The map of `view`.
     pub fn of(&self, view: usize) -> Affine {
         let m = self.maps[view].map(f64::from);
@@ -175,6 +196,15 @@ mod tests {
         let mut y = Vec::new();
         exposure.develop(0, &color, &mut y);
         assert_eq!(y, color);
+    }
+
+    #[test]
+    fn given_gains_are_relative_to_the_training_views() {
+        let exposure = Exposure::new(4, &[0, 1, 3]).with_gains(&[(0, 0.3), (1, 0.3), (3, -0.3)]);
+        let gain = |view: usize| exposure.of(view).apply([0.5; 3])[1] / 0.5;
+        assert!((gain(0) + gain(1) + gain(3) - 3.0).abs() < 1e-5);
+        assert!((gain(0) - gain(3) - (0.2f32.exp() - (-0.4f32).exp())).abs() < 1e-5);
+        assert_eq!(gain(2), 1.0);
     }
 
     #[test]

@@ -21,7 +21,7 @@ pub use poses::PoseRefinement;
 pub(crate) use poses::{corrected, tangent_gradient};
 pub use residual::{Residual, added_colors};
 
-use crate::recipe::{Param, Recipe};
+use crate::recipe::{Choice, Param, Recipe};
 use crate::schedule::StepPlan;
 use crate::tensor_file::{NamedTensor, TensorSource};
 use crate::trainer::TrainError;
@@ -80,9 +80,7 @@ impl Sockets {
         Ok(Self {
             poses: recipe.refine_poses.then(|| PoseRefinement::new(dataset)),
             residual,
-            exposure: recipe
-                .exposure
-                .then(|| Exposure::new(dataset.views.len(), &dataset.train)),
+            exposure: (recipe.exposure == Choice::Yes).then(|| Exposure::new(dataset.views.len(), &dataset.train)),
             developed: Vec::new(),
         })
     }

@@ -1,0 +1,122 @@
+//! Whether photographs differ in exposure beyond what a scene can explain, decided early in a run.
+//!
+//! After the first tenth of a run splats show every view's mean colour, in an exposure common to all photographs. Each
+//! photograph's brightness relative to its frame is then its relative exposure. Automatic exposure that follows the view changes
+//! smoothly from camera to camera: splats reproduce it, by spherical harmonics, in held-out views as well. What remains after a
+//! prediction by the nearest cameras fits no scene; splats explain it by veils before the cameras.
+
+use crate::photos::Prepared;
+use irradia_scene::Camera;
+
+/// Fraction of a run after which the decision is made.
+pub(crate) const AT: f64 = 0.1;
+/// Maximum number of training views to measure: enough for a standard deviation within a tenth.
+pub(crate) const VIEWS: usize = 64;
+/// Views below which nothing is decided.
+const MIN_VIEWS: usize = 8;
+/// Cameras that predict a view's exposure.
+const NEIGHBOURS: usize = 3;
+/// Standard deviation of ln exposure, beyond its prediction, from which exposures are learned.
+pub(crate) const THRESHOLD: f64 = 0.1;
+/// Colours outside are clipped in the photograph, or too dark for a ratio.
+const USABLE: std::ops::RangeInclusive<f32> = 8.0 / 255.0..=250.0 / 255.0;
+/// Pixels below which a view is skipped.
+const MIN_PIXELS: usize = 100;
+
+/// Mean ln exposure of `photo` relative to `color` `[3, H, W]`, its frame; `None` if too few pixels of both can be compared.
+pub(crate) fn log_exposure(color: &[f32], photo: &Prepared) -> Option<f64> {
+    let pixels = photo.rgb.len() / 3;
+    let counts = |i: &usize| {
+        let opaque = photo.alpha.as_ref().is_none_or(|alpha| alpha[*i] == 255);
+        opaque && photo.mask.as_ref().is_none_or(|mask| mask[*i] != 0)
+    };
+    let (mut ratios, mut frame_sum, mut photo_sum) = (0usize, 0.0f64, 0.0f64);
+    for i in (0..pixels).filter(counts) {
+        let truth: [f32; 3] = std::array::from_fn(|c| f32::from(photo.rgb[3 * i + c]) / 255.0);
+        let frame: [f32; 3] = std::array::from_fn(|c| color[c * pixels + i]);
+        if truth.iter().chain(&frame).all(|v| USABLE.contains(v)) {
+            ratios += 1;
+            photo_sum += f64::from(truth.iter().sum::<f32>());
+            frame_sum += f64::from(frame.iter().sum::<f32>());
+        }
+    }
+    (ratios >= MIN_PIXELS).then(|| (photo_sum / frame_sum).ln())
+}
+
+/// Standard deviation of the ln exposures of `views` beyond what the nearest cameras predict; `None` for too few views. `unit` is
+/// the extent of the scene, which makes a turn by one radian as far as a move by one extent.
+pub(crate) fn unpredicted(views: &[(Camera, f64)], unit: f32) -> Option<f64> {
+    if views.len() < MIN_VIEWS {
+        return None;
+    }
+    let residual = |(i, (camera, own)): (usize, &(Camera, f64))| {
+        let distance = |other: &Camera| {
+            let moved = camera.pose.position.distance(other.pose.position) / unit;
+            moved + camera.pose.rotation.angle_between(other.pose.rotation)
+        };
+        let others = views.iter().enumerate().filter(|(k, _)| *k != i);
+        let mut near: Vec<(f32, f64)> = others.map(|(_, (other, log))| (distance(other), *log)).collect();
+        near.sort_by(|a, b| a.0.total_cmp(&b.0));
+        let predicted = near[..NEIGHBOURS].iter().map(|(_, log)| log).sum::<f64>() / NEIGHBOURS as f64;
+        own - predicted
+    };
+    let mut residuals: Vec<f64> = views.iter().enumerate().map(|view| residual(view).abs()).collect();
+    residuals.sort_by(f64::total_cmp);
+    // From the median, for a few odd photographs are no reason; a mean of k independent values adds 1/k to the variance.
+    let spread = 1.4826 * residuals[residuals.len() / 2];
+    Some(spread / (1.0 + 1.0 / NEIGHBOURS as f64).sqrt())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use glam::{Quat, Vec3};
+    use irradia_scene::{Intrinsics, Pose, Rng};
+
+    fn camera(angle: f32) -> Camera {
+        let rotation = Quat::from_rotation_y(angle);
+        let pose = Pose {
+            rotation,
+            position: rotation * Vec3::NEG_Z,
+        };
+        Camera::new(pose, Intrinsics::from_fov_x(8, 8, 1.0))
+    }
+
+    #[test]
+    fn exposures_that_follow_the_view_are_predicted_and_random_ones_are_not() {
+        let mut rng = Rng::new(1, 1);
+        let around = |log: &mut dyn FnMut(f32) -> f64| -> Vec<(Camera, f64)> {
+            let angles = (0..60).map(|i| i as f32 * 0.1);
+            angles.map(|angle| (camera(angle), log(angle))).collect()
+        };
+        let smooth = around(&mut |angle| 0.3 * f64::from(angle.sin()));
+        let measured = unpredicted(&smooth, 1.0).unwrap();
+        assert!(measured < 0.03, "{measured}");
+        let random = around(&mut |_| f64::from(rng.normal()) * 0.2);
+        let measured = unpredicted(&random, 1.0).unwrap();
+        assert!((measured - 0.2).abs() < 0.06, "{measured}");
+        assert_eq!(unpredicted(&random[..7], 1.0), None);
+    }
+
+    #[test]
+    fn an_exposure_is_the_ratio_of_the_pixels_that_both_show() {
+        let pixels = 400;
+        let color: Vec<f32> = (0..3 * pixels).map(|i| 0.2 + 0.3 * (i % pixels) as f32 / 400.0).collect();
+        let rgb = (0..3 * pixels).map(|i| (color[i % 3 * pixels + i / 3] * 1.3 * 255.0).round() as u8);
+        let mut photo = Prepared {
+            width: 20,
+            height: 20,
+            rgb: rgb.collect(),
+            alpha: None,
+            mask: None,
+            background: [0.0; 3],
+        };
+        for value in &mut photo.rgb[..300] {
+            *value = 255;
+        }
+        let measured = log_exposure(&color, &photo).unwrap();
+        assert!((measured - 1.3f64.ln()).abs() < 0.01, "{measured}");
+        photo.mask = Some(vec![0; pixels]);
+        assert_eq!(log_exposure(&color, &photo), None);
+    }
+}

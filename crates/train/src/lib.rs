@@ -7,6 +7,7 @@ mod edges;
 pub mod eval;
 pub mod event;
 pub mod field_file;
+mod field_space;
 mod field_step;
 mod forecast;
 pub mod half_fit;

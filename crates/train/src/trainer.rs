@@ -115,6 +115,8 @@ pub struct Trainer {
     pub times: Times,
     /// Maximum number of splats: the recipe's limits for this dataset.
     pub cap: usize,
+    /// What was decided from the data before the first step, one line each.
+    pub(crate) decisions: Vec<String>,
     pub(crate) photos: PhotoCache,
     /// Known depths of the views on which a field is trained, by view, width and height.
     pub(crate) depths: HashMap<(usize, u32, u32), Arc<[KnownDepth]>>,
@@ -154,6 +156,7 @@ impl Trainer {
             extent: init::camera_extent(&cameras),
             photos: PhotoCache::new(dataset.clone(), recipe.render.background, options.photo_budget),
             cap: cap(&recipe, &cameras),
+            decisions: Vec::new(),
             depths: HashMap::new(),
             objective: Objective::new(options.lpips.clone()),
             engine: Engine::new(SplatState::new(Splats::zeros(0, sh::MAX_DEGREE))),
@@ -168,13 +171,14 @@ impl Trainer {
     /// The recipe's field, untrained.
     pub(crate) fn first_field(&mut self) -> Result<FieldState, TrainError> {
         let transparent = self.transparent()?;
-        let cameras = self.train_cameras();
         let knobs = self
             .recipe
             .field
             .as_ref()
             .expect("validated: a stage of field has its knobs");
-        first_field(knobs, &self.dataset, &cameras, transparent, self.options.seed)
+        let (field, why) = first_field(knobs, &self.dataset, transparent, self.options.seed)?;
+        self.decisions.push(format!("the field's space is {why}"));
+        Ok(field)
     }
 
     /// The recipe's components in the sockets of a step, untrained.

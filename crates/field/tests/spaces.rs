@@ -1,7 +1,7 @@
 //! Mappings between the world and the unit cube.
 
 use glam::{Quat, Vec3};
-use irradia_field::{Outside, Space};
+use irradia_field::{Facing, Outside, Space};
 use irradia_scene::{Camera, Intrinsics, Pose, Rng};
 
 fn forward_facing() -> Vec<Camera> {
@@ -107,4 +107,20 @@ fn spaces_are_derived_from_cameras() {
     assert!(Space::around(&[looking_in[0]; 3], false).is_none(), "all axes coincide");
     assert!(Space::ndc(&[], 1.0).is_none());
     assert!(Space::ndc(&looking_in, 1.0).is_none(), "they do not face one way");
+}
+
+#[test]
+fn cameras_face_forward_within_a_cone_and_before_the_scene() {
+    let facing = Facing::of(&forward_facing()).unwrap();
+    assert!((facing.cone - 0.04f32.to_degrees()).abs() < 0.05, "{facing:?}");
+    assert!(facing.foremost.abs() < 0.01 && facing.is_forward(2.0) && !facing.is_forward(-0.1));
+    let around: Vec<Camera> = (0..6)
+        .map(|i| {
+            let mut camera = forward_facing()[0];
+            camera.pose.rotation = Quat::from_rotation_y(0.3 * i as f32);
+            camera
+        })
+        .collect();
+    assert!(!Facing::of(&around).unwrap().is_forward(2.0));
+    assert!(Facing::of(&[]).is_none());
 }

@@ -42,7 +42,7 @@ enum Command {
     Info(command::files::InfoArgs),
     /// Convert a scene to another file format, by extension
     Convert(command::files::ConvertArgs),
-    /// Write the demo scene as a dataset: images, depth, normals, points, cameras
+    /// Write a ray-traced scene as a dataset: images, depth, normals, points, cameras
     Synth(command::demo::SynthArgs),
 }
 

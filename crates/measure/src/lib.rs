@@ -16,6 +16,6 @@ pub use loss::perceptual::{Crop, perceptual};
 pub use loss::smooth::{SmoothLoss, Smoothed};
 pub use loss::{LossValues, LossWeights, PhotometricLoss, Target, Truth};
 pub use metric::{
-    Affine, Evaluation, ImportedTensor, Lpips, LpipsError, LpipsNet, evaluate, psnr, psnr_masked, ssim, ssim_masked,
-    to_weights_file,
+    Affine, Evaluation, ImportedTensor, Lpips, LpipsError, LpipsNet, Networks, evaluate, psnr, psnr_masked, ssim,
+    ssim_masked, to_weights_file,
 };

@@ -2,7 +2,7 @@
 
 mod tensors;
 
-use irradia_measure::{Lpips, LpipsError, LpipsNet, evaluate, psnr, ssim};
+use irradia_measure::{Lpips, LpipsError, LpipsNet, Networks, evaluate, psnr, ssim};
 use irradia_scene::Image;
 use irradia_testkit::shared;
 use safetensors::SafeTensors;
@@ -78,7 +78,19 @@ fn lpips_rejects_images_below_the_minimum_size() {
         error,
         "an image of 100x16 is too small for LPIPS; use sides of at least 17 pixels"
     );
-    assert_eq!(evaluate(&small, &small, None, Some(&net)).lpips, None);
+    assert_eq!(
+        evaluate(
+            &small,
+            &small,
+            None,
+            Networks {
+                first: Some(&net),
+                unseen: None
+            }
+        )
+        .lpips,
+        None
+    );
 }
 
 #[test]
@@ -92,7 +104,15 @@ fn evaluating_a_real_pair_matches_golden_values() {
     };
     let (render, truth) = (read_image(render), read_image(truth));
     let net = Lpips::load(weights).unwrap();
-    let values = evaluate(&render, &truth, None, Some(&net));
+    let values = evaluate(
+        &render,
+        &truth,
+        None,
+        Networks {
+            first: Some(&net),
+            unseen: None,
+        },
+    );
     println!("{values:?}");
     // real_fox_pair of metrics.json was computed from these files.
     assert!((values.psnr - 24.646_030).abs() < 1e-3, "{values:?}");
@@ -106,8 +126,27 @@ fn evaluating_a_real_pair_matches_golden_values() {
         mask[i] = 0;
         poisoned.data[3 * i..3 * i + 3].fill(0.9);
     }
-    let masked = evaluate(&render, &truth, Some(&mask), Some(&net));
-    assert_eq!(evaluate(&poisoned, &truth, Some(&mask), Some(&net)), masked);
+    let masked = evaluate(
+        &render,
+        &truth,
+        Some(&mask),
+        Networks {
+            first: Some(&net),
+            unseen: None,
+        },
+    );
+    assert_eq!(
+        evaluate(
+            &poisoned,
+            &truth,
+            Some(&mask),
+            Networks {
+                first: Some(&net),
+                unseen: None
+            }
+        ),
+        masked
+    );
     // The upper half now equals the truth.
     assert!(masked.lpips < values.lpips.map(|v| 0.7 * v), "{masked:?}");
 }

@@ -213,6 +213,7 @@ impl Observer for Journal {
             Event::Finished { step, seconds, .. } => self.end_stage(*step, *seconds),
             Event::Warned { message } => self.warnings.push(message.clone()),
             Event::Started { .. }
+            | Event::Decided { .. }
             | Event::Densified { .. }
             | Event::Saved { .. }
             | Event::Paused { .. }

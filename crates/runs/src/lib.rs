@@ -6,7 +6,7 @@
 //! use irradia_runs::prelude::*;
 //!
 //! // A small dataset to try; any folder of posed photographs works.
-//! write_synth_dataset(here("photos"), &SynthOptions { views: 4, width: 24, height: 16, seed: 0 })?;
+//! write_synth_dataset(here("photos"), &SynthOptions { views: 4, width: 24, height: 16, ..Default::default() })?;
 //!
 //! // Train ..
 //! let mut run = Run::begin(TrainInput { steps: Some(5), ..TrainInput::new(here("photos"), here("run")) }.check()?)?;
@@ -45,6 +45,7 @@ mod folder;
 mod journal;
 mod lock;
 mod orbit;
+mod protocol;
 mod provenance;
 mod request;
 mod results;
@@ -63,6 +64,7 @@ pub use irradia_scene as scene;
 pub use irradia_synth as synth;
 pub use irradia_train as train;
 pub use journal::logged_errors;
+pub use protocol::Protocol;
 pub use provenance::{data_fingerprint, program_fingerprint};
 pub use request::{DEFAULT_RECIPE, HOW_TO_GET_LPIPS, Reading, TrainInput, TrainRequest, read_recipe};
 pub use results::write_image;

@@ -157,6 +157,7 @@ mod tests {
             width: 24,
             height: 16,
             seed: 1,
+            ..SynthOptions::default()
         };
         dataset(&options).unwrap()
     }

@@ -157,6 +157,9 @@ pub struct TrainInput {
     /// Weights of LPIPS. Without them a recipe's perceptual loss is skipped and reports have no LPIPS.
     #[serde(default)]
     pub lpips: Option<PathBuf>,
+    /// Weights of a second network of LPIPS, which only scores: a recipe with a perceptual loss is trained on the first one.
+    #[serde(default)]
+    pub unseen_lpips: Option<PathBuf>,
     /// How the dataset is read.
     #[serde(flatten)]
     pub reading: Reading,
@@ -187,6 +190,7 @@ impl TrainInput {
             until_psnr: None,
             seed: 0,
             lpips: None,
+            unseen_lpips: None,
             reading: Reading::default(),
             background: None,
             overwrite: false,
@@ -282,6 +286,12 @@ pub fn read_recipe(name: &str, overrides: &[String]) -> Result<Recipe, RunError>
     Ok(Recipe::parse(name, &text, overrides)?)
 }
 
+/// Whether the recipe's loss contains LPIPS at any time.
+pub(crate) fn has_perceptual_loss(recipe: &Recipe) -> bool {
+    let weighs = |moment: &OutlinePoint| moment.values[Param::PerceptualWeight] > 0.0;
+    outline(recipe, 1000).iter().any(weighs)
+}
+
 /// A validated request, created by [`TrainInput::check`]; one request is one run.
 #[derive(Debug)]
 pub struct TrainRequest {
@@ -313,8 +323,7 @@ impl TrainRequest {
 
     /// Parts of the request that cannot be satisfied, one line each.
     pub fn warnings(&self) -> Vec<String> {
-        let weighs = |moment: &OutlinePoint| moment.values[Param::PerceptualWeight] > 0.0;
-        let missing = self.input.lpips.is_none() && outline(&self.recipe, 1000).iter().any(weighs);
+        let missing = self.input.lpips.is_none() && has_perceptual_loss(&self.recipe);
         let line = || {
             format!(
                 "recipe {} is trained without its perceptual loss: no LPIPS weights found; {HOW_TO_GET_LPIPS}",

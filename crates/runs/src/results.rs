@@ -1,9 +1,11 @@
 //! The results of a finished run: its scene, the held-out views, and the report.
 
 use crate::folder::{FIELD, SCENE, to_json};
+use crate::request::has_perceptual_loss;
 use crate::{Run, RunError, RunFolder, evaluate, file_stems, unmeasured};
 use irradia_compute::Level;
 use irradia_formats::{write_png, write_splats};
+use irradia_measure::{Lpips, Networks};
 use irradia_scene::{Image, sh};
 use irradia_train::eval::{EvalOptions, EvaluatedView, Metrics};
 use irradia_train::field_file;
@@ -44,13 +46,18 @@ impl Run {
         let stems = file_stems(names);
         let mut stems = trainer.dataset.test.iter().map(|i| &stems[*i]);
         let mut views = Vec::new();
+        let networks = Networks {
+            first: trainer.options.lpips.as_deref(),
+            unseen: self.unseen_lpips.as_ref(),
+        };
+        let name_of = |lpips: Option<&Lpips>| lpips.map(|lpips| lpips.net().name().to_owned());
         let mean = evaluate(
             &trainer.scene(),
             &trainer.dataset,
             &trainer.dataset.test,
             &EvalOptions {
                 render: trainer.render_options(sh::MAX_DEGREE),
-                metrics: Metrics::All(trainer.options.lpips.as_deref()),
+                metrics: Metrics::All(networks),
                 half_fit: trainer.half_fit(),
             },
             |view| {
@@ -101,11 +108,10 @@ impl Run {
             psnr: mean.psnr,
             ssim: mean.ssim,
             lpips: mean.lpips,
-            lpips_net: trainer
-                .options
-                .lpips
-                .as_ref()
-                .map(|lpips| lpips.net().name().to_owned()),
+            lpips_net: name_of(networks.first),
+            unseen_lpips: mean.unseen_lpips,
+            unseen_lpips_net: name_of(networks.unseen),
+            trained_on_lpips: name_of(networks.first).filter(|_| has_perceptual_loss(&trainer.recipe)),
             half_fit_psnr: mean.half_fit_psnr,
             views,
             schedule: schedule(
@@ -161,6 +167,7 @@ fn write_view(folder: &RunFolder, stem: &str, view: &EvaluatedView) -> Result<Vi
         psnr: view.metrics.psnr,
         ssim: view.metrics.ssim,
         lpips: view.metrics.lpips,
+        unseen_lpips: view.metrics.unseen_lpips,
         half_fit_psnr: view.metrics.half_fit_psnr,
         truth: write("truth", &view.truth)?,
         render: write("render", &view.render)?,

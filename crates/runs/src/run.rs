@@ -21,7 +21,7 @@ use std::time::Instant;
 /// ```
 /// # let folder = tempfile::tempdir().unwrap();
 /// # let (photos, run) = (folder.path().join("photos"), folder.path().join("run"));
-/// # let options = SynthOptions { views: 4, width: 24, height: 16, seed: 0 };
+/// # let options = SynthOptions { views: 4, width: 24, height: 16, ..SynthOptions::default() };
 /// # write_synth_dataset(&photos, &options)?;
 /// use irradia_runs::prelude::*;
 ///
@@ -40,6 +40,7 @@ pub struct Run {
     pub(crate) trainer: Trainer,
     pub(crate) journal: Journal,
     snapshots: SnapshotServer,
+    pub(crate) unseen_lpips: Option<Lpips>,
     /// The paces to repeat of another run.
     paces: Option<Paces>,
     /// Seconds between the request and the first step.
@@ -148,10 +149,12 @@ impl Run {
         trainer: Trainer,
         paces: Option<Paces>,
     ) -> Result<Self, RunError> {
+        let unseen_lpips = request.input.unseen_lpips.as_ref().map(Lpips::load).transpose()?;
         let mut journal = Journal::open(&folder, trainer.clock.step)?;
         journal.warnings.extend(trainer.dataset.warnings.iter().cloned());
         journal.warnings.extend(request.warnings());
         Ok(Self {
+            unseen_lpips,
             folder,
             request,
             trainer,

@@ -1,4 +1,4 @@
-//! The demo scene on disk, in the layout of the Blender datasets (Mildenhall et al. 2020), with additional ground truth: depth
+//! A ray-traced scene on disk, in the layout of the Blender datasets (Mildenhall et al. 2020), with additional ground truth: depth
 //! and normals, and points like those of structure from motion.
 //!
 //! ```text
@@ -14,13 +14,15 @@ use crate::folder::to_json;
 use glam::{Mat4, Vec3};
 use irradia_formats::{write_atomic, write_png, write_png_16, write_points_ply};
 use irradia_scene::{Camera, PointCloud};
-use irradia_synth::{Capture, FOV_X, Part, SynthFrame, SynthOptions};
+use irradia_synth::{Capture, Part, SceneName, SynthFrame, SynthOptions};
 use serde_json::{Value, json};
 use std::path::Path;
 use std::{fmt, fs};
 
-/// World units per step of the depth images: 16 bits reach 32.8 units, the backdrop's far side is at 25.
+/// World units per step of the depth images: 16 bits reach 32.8 units, the demo's backdrop has its far side at 25.
 const DEPTH_SCALE: f32 = 0.0005;
+/// The same outdoors: they reach 655 units.
+const DEPTH_SCALE_OUTDOOR: f32 = 0.01;
 
 /// Summary of the dataset.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -50,7 +52,7 @@ impl fmt::Display for SynthSummary {
     }
 }
 
-/// Traces the demo scene and writes it under `out`, which is created if missing. Existing files of the same names are
+/// Traces a scene and writes it under `out`, which is created if missing. Existing files of the same names are
 /// replaced; the `transforms_*.json` come last, so that a folder that contains them is complete.
 ///
 /// # Errors
@@ -58,6 +60,10 @@ impl fmt::Display for SynthSummary {
 pub fn write_synth_dataset(out: impl AsRef<Path>, options: &SynthOptions) -> Result<SynthSummary, RunError> {
     let out = out.as_ref();
     let capture = Capture::new(options)?;
+    let depth_scale = match options.scene {
+        SceneName::Outdoor => DEPTH_SCALE_OUTDOOR,
+        _ => DEPTH_SCALE,
+    };
     let mut points = PointCloud::default();
     let mut frames: [Vec<Value>; 3] = Default::default();
     for part in Part::ALL {
@@ -68,7 +74,7 @@ pub fn write_synth_dataset(out: impl AsRef<Path>, options: &SynthOptions) -> Res
     }
     for shot in capture.shots() {
         let (frame, name) = (capture.trace(shot), shot.name());
-        write_frame(out, &name, &frame)?;
+        write_frame(out, &name, &frame, depth_scale)?;
         let found = capture.points(shot, &frame);
         points.positions.extend(found.positions);
         points.colors.extend(found.colors);
@@ -83,10 +89,10 @@ pub fn write_synth_dataset(out: impl AsRef<Path>, options: &SynthOptions) -> Res
     let [train, val, test] = [0, 1, 2].map(|part| frames[part].len() as u32);
     for (part, frames) in Part::ALL.into_iter().zip(frames) {
         let mut transforms = json!({
-            "camera_angle_x": FOV_X,
+            "camera_angle_x": capture.fov_x(),
             "w": options.width,
             "h": options.height,
-            "depth_scale": DEPTH_SCALE,
+            "depth_scale": depth_scale,
             "frames": frames,
         });
         if part == Part::Train {
@@ -104,9 +110,9 @@ pub fn write_synth_dataset(out: impl AsRef<Path>, options: &SynthOptions) -> Res
 }
 
 /// Picture, depth and normals of one view.
-fn write_frame(out: &Path, name: &str, frame: &SynthFrame) -> Result<(), RunError> {
+fn write_frame(out: &Path, name: &str, frame: &SynthFrame, depth_scale: f32) -> Result<(), RunError> {
     let (width, height) = (frame.color.width, frame.color.height);
-    let step = |depth: &f32| (depth / DEPTH_SCALE).round().clamp(0.0, 65535.0) as u16;
+    let step = |depth: &f32| (depth / depth_scale).round().clamp(0.0, 65535.0) as u16;
     let depth: Vec<u16> = frame.depth.data.iter().map(step).collect();
     let byte = |n: &f32| ((0.5 * n + 0.5).clamp(0.0, 1.0) * 255.0).round() as u8;
     let normals: Vec<u8> = frame.normals.data.iter().map(byte).collect();
@@ -130,6 +136,7 @@ mod tests {
     use std::path::PathBuf;
 
     const SMALL: SynthOptions = SynthOptions {
+        scene: SceneName::Demo,
         views: 4,
         width: 24,
         height: 16,

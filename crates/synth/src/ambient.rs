@@ -3,25 +3,20 @@
 //!
 //! Symbols: `n` the surface's normal, `w` the unit direction to a solid at distance `d`.
 
-use crate::scene::{Hit, SynthScene};
+use crate::scene::{Hit, Light, SynthScene};
 use crate::shape::Shape;
 use crate::texture::smooth;
 use glam::Vec3;
 
-/// Sky light on a surface that faces up, linear RGB.
-const SKY: Vec3 = Vec3::new(0.44, 0.56, 0.78);
-/// Light reflected upwards by the sunlit table and ground, linear RGB.
-const BOUNCE: Vec3 = Vec3::new(0.40, 0.30, 0.22);
-
 /// Irradiance over pi of everything but the sun, linear RGB, without occlusion.
-pub fn open(hit: &Hit) -> Vec3 {
-    // Close to the table top, shadows of the objects on it reduce the reflected light.
+pub fn open(light: &Light, hit: &Hit) -> Vec3 {
+    // Close to the table top or the ground, shadows of the objects on it reduce the reflected light.
     let bounce = if hit.point.z > 0.0 {
         0.35 + 0.65 * smooth(0.0, 0.45, hit.point.z)
     } else {
         0.5
     };
-    (BOUNCE * bounce).lerp(SKY, 0.5 + 0.5 * hit.normal.z)
+    (light.below * bounce).lerp(light.above, 0.5 + 0.5 * hit.normal.z)
 }
 
 /// As [`open`], less occlusion by the other objects.
@@ -32,14 +27,19 @@ pub fn shaded(scene: &SynthScene, hit: &Hit) -> Vec3 {
             uncovered *= 1.0 - covered(&object.shape, hit.point, hit.normal);
         }
     }
-    uncovered * open(hit)
+    uncovered * open(&scene.light, hit)
 }
 
 /// The cosine-weighted fraction of the hemisphere over `n` that a solid occludes, 0 to 1.
 fn covered(shape: &Shape, point: Vec3, n: Vec3) -> f32 {
     match *shape {
         // Thin parts occlude almost nothing; the surroundings are the light itself.
-        Shape::Ground { .. } | Shape::Backdrop { .. } | Shape::Rod { .. } | Shape::Ring { .. } => 0.0,
+        Shape::Ground { .. }
+        | Shape::Backdrop { .. }
+        | Shape::Interior { .. }
+        | Shape::Rod { .. }
+        | Shape::Ring { .. } => 0.0,
+        Shape::Block { half, .. } if half.min_element() < 0.2 * half.max_element() => 0.0,
         Shape::Sphere { center, radius } => covered_by_ball(center - point, radius, n),
         Shape::Block { center, half, .. } => covered_by_ball(center - point, 1.2 * half.element_sum() / 3.0, n),
         Shape::Drum { base, radius, height } if radius > 2.0 * height => covered_by_disc_above(base - point, radius, n),

@@ -1,17 +1,60 @@
-//! The cameras of the demo dataset: all around the table, near and far, low and high.
+//! The cameras of the scenes.
 
-use glam::Vec3;
+use glam::{Vec2, Vec3};
 use irradia_scene::{Camera, Intrinsics, Pose, Rng};
 use std::f32::consts::TAU;
 
-/// Horizontal field of view, radians.
-pub const FOV_X: f32 = 0.84;
-/// Distance from the table's centre to the camera, world units. The table's edge is at 2.
-const DISTANCE: [f32; 2] = [3.6, 4.4];
-/// Elevation of the camera above its target, radians.
-const ELEVATION: [f32; 2] = [0.20, 0.80];
-/// The cameras' approximate target.
-const TARGET: Vec3 = Vec3::new(0.0, 0.0, 0.36);
+/// How the cameras of a scene are placed.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Rig {
+    /// Where they are and where they look.
+    pub path: Path,
+    /// Horizontal field of view, radians.
+    pub fov_x: f32,
+}
+
+/// Where cameras are and where they look; lengths in world units.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Path {
+    /// All around a target, near and far, low and high.
+    Around {
+        /// The cameras' approximate target.
+        target: Vec3,
+        /// Distance from the target.
+        distance: [f32; 2],
+        /// Elevation above the target, radians.
+        elevation: [f32; 2],
+        /// How far each camera's target deviates along each axis.
+        aside: f32,
+    },
+    /// In a plane before a target, facing forward along +Y.
+    Before {
+        /// The cameras' approximate target.
+        target: Vec3,
+        /// Distance of the plane.
+        distance: f32,
+        /// Half the width and half the height of the part of the plane in which they are.
+        half: Vec2,
+    },
+    /// On an ellipse about the z axis, each looking across it.
+    Within {
+        /// Half the width and half the length of the ellipse.
+        half: Vec2,
+        /// Height of the cameras.
+        height: [f32; 2],
+    },
+}
+
+/// The rig of the demo scene. The table's edge is at 2.
+pub(crate) const DEMO: Rig = Rig {
+    path: Path::Around {
+        target: Vec3::new(0.0, 0.0, 0.36),
+        distance: [3.6, 4.4],
+        elevation: [0.20, 0.80],
+        aside: 0.12,
+    },
+    fov_x: 0.84,
+};
 
 /// The part of the dataset that a view belongs to.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -38,9 +81,9 @@ impl Part {
     }
 }
 
-/// Places `count` cameras. Those of [`Part::Val`] and [`Part::Test`] are well within the elevations and distances of
-/// [`Part::Train`], and between its azimuths.
-pub fn cameras(part: Part, count: u32, width: u32, height: u32, seed: u64) -> Vec<Camera> {
+/// Places `count` cameras. Those of [`Part::Val`] and [`Part::Test`] are well within the span of [`Part::Train`], and between its
+/// azimuths.
+pub fn cameras(rig: &Rig, part: Part, count: u32, width: u32, height: u32, seed: u64) -> Vec<Camera> {
     let (stream, inset, turn) = match part {
         Part::Train => (0, 0.0, 0.0),
         Part::Val => (1, 0.2, 0.3),
@@ -56,15 +99,37 @@ pub fn cameras(part: Part, count: u32, width: u32, height: u32, seed: u64) -> Ve
                 let t = (number as f32 * irrational + 0.5).fract();
                 low + (high - low) * (inset + (1.0 - 2.0 * inset) * t)
             };
-            let (elevation, distance) = (within(ELEVATION, 0.618_034), within(DISTANCE, 0.754_878));
             let level = azimuth.sin_cos();
-            let away = Vec3::new(level.1 * elevation.cos(), level.0 * elevation.cos(), elevation.sin());
-            let mut aside = || rng.range(-0.12, 0.12);
-            let target = TARGET + Vec3::new(aside(), aside(), aside());
-            Camera::new(
-                Pose::look_at(TARGET + distance * away, target, Vec3::Z),
-                Intrinsics::from_fov_x(width, height, FOV_X),
-            )
+            let pose = match rig.path {
+                Path::Around {
+                    target,
+                    distance,
+                    elevation,
+                    aside,
+                } => {
+                    let (elevation, distance) = (within(elevation, 0.618_034), within(distance, 0.754_878));
+                    let away = Vec3::new(level.1 * elevation.cos(), level.0 * elevation.cos(), elevation.sin());
+                    let mut aside = || rng.range(-aside, aside);
+                    let aimed = target + Vec3::new(aside(), aside(), aside());
+                    Pose::look_at(target + distance * away, aimed, Vec3::Z)
+                }
+                Path::Before { target, distance, half } => {
+                    let x = within([-half.x, half.x], 0.618_034);
+                    let z = within([-half.y, half.y], 0.754_878);
+                    let mut aside = || rng.range(-0.06, 0.06) * distance;
+                    let eye = target + Vec3::new(x, aside() - distance, z);
+                    // Their axes meet well behind the target: hand-held captures turn a little inwards.
+                    let aimed = target + Vec3::new(0.4 * x + aside(), 0.0, 0.4 * z + aside());
+                    Pose::look_at(eye, aimed, Vec3::Z)
+                }
+                Path::Within { half, height } => {
+                    let eye = Vec3::new(half.x * level.1, half.y * level.0, within(height, 0.618_034));
+                    let mut aside = || rng.range(-0.5, 0.5);
+                    let aimed = Vec3::new(-0.8 * eye.x + aside(), -0.8 * eye.y + aside(), 0.75 + 0.6 * aside());
+                    Pose::look_at(eye, aimed, Vec3::Z)
+                }
+            };
+            Camera::new(pose, Intrinsics::from_fov_x(width, height, rig.fov_x))
         })
         .collect()
 }
@@ -75,8 +140,8 @@ mod tests {
 
     fn spans(part: Part, count: u32) -> ([f32; 2], [f32; 2]) {
         let mut spans = ([f32::MAX, f32::MIN], [f32::MAX, f32::MIN]);
-        for camera in cameras(part, count, 64, 64, 0) {
-            let away = camera.pose.position - TARGET;
+        for camera in cameras(&DEMO, part, count, 64, 64, 0) {
+            let away = camera.pose.position - Vec3::new(0.0, 0.0, 0.36);
             let widen = |span: &mut [f32; 2], v: f32| *span = [span[0].min(v), span[1].max(v)];
             widen(&mut spans.0, away.length());
             widen(&mut spans.1, (away.z / away.length()).asin());
@@ -97,7 +162,7 @@ mod tests {
     #[test]
     fn no_surface_is_close_to_a_camera() {
         let scene = crate::demo_scene();
-        for camera in cameras(Part::Train, 40, 8, 8, 3) {
+        for camera in cameras(&DEMO, Part::Train, 40, 8, 8, 3) {
             let frame = scene.trace(&camera, 1, 0);
             assert!(frame.depth.data.iter().all(|depth| *depth > 0.5));
         }

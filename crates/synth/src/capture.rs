@@ -1,7 +1,9 @@
-//! The views of the demo scene: cameras, frames, and points such as structure from motion produces.
+//! The views of a scene: cameras, frames, and points such as structure from motion produces.
 
 use crate::cameras::{Part, cameras};
-use crate::scene::{SynthScene, demo_scene};
+use crate::scene::SynthScene;
+use crate::scenes::SceneName;
+use crate::shape::Ray;
 use crate::trace::SynthFrame;
 use glam::{Vec2, Vec3};
 use irradia_scene::{Camera, Dataset, Photo, PointCloud, Rng, View};
@@ -14,23 +16,32 @@ const POINTS: u32 = 6000;
 /// Standard deviation of a point's error as a fraction of its distance, as for structure from motion on good photographs.
 const POINT_ERROR: f32 = 0.001;
 
-/// Options of the demo dataset.
+/// Pixels to each side of a point among which structure from motion looks for contrast.
+const PATCH: u32 = 2;
+/// Least contrast of such a patch, largest less smallest green in \[0, 1\]: a plain wall has less.
+const CONTRAST: f32 = 0.06;
+
+/// Options of a dataset.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct SynthOptions {
+    /// The scene.
+    pub scene: SceneName,
     /// Training views, 3 to 1000; one more in eight is held out, one more in twenty is for validation.
     pub views: u32,
     /// Size along this axis in pixels, 8 to 4096.
     pub width: u32,
     /// Size along this axis in pixels, 8 to 4096.
     pub height: u32,
-    /// Random seed of cameras, samples and points: equal seeds give equal views.
+    /// Random seed of cameras, samples and points, and of layout and colours of all scenes but the demo: equal seeds give equal
+    /// views.
     pub seed: u64,
 }
 
 impl Default for SynthOptions {
-    /// 40 views of 256 x 256, seed 0.
+    /// The demo scene, 40 views of 256 x 256, seed 0.
     fn default() -> Self {
         Self {
+            scene: SceneName::Demo,
             views: 40,
             width: 256,
             height: 256,
@@ -70,12 +81,13 @@ impl Shot {
     }
 }
 
-/// The demo scene with its cameras.
+/// A scene with its cameras.
 #[derive(Clone, Debug)]
 pub struct Capture {
     scene: SynthScene,
     options: SynthOptions,
     shots: Vec<Shot>,
+    fov_x: f32,
 }
 
 impl Capture {
@@ -85,6 +97,7 @@ impl Capture {
     /// When a count or a size of `options` is out of its range.
     pub fn new(options: &SynthOptions) -> Result<Self, SynthError> {
         let SynthOptions {
+            scene,
             views,
             width,
             height,
@@ -96,9 +109,10 @@ impl Capture {
         if ![width, height].iter().all(|side| (8..=4096).contains(side)) {
             return Err(SynthError::Size(width, height));
         }
+        let (scene, rig) = scene.build(seed);
         let mut shots: Vec<Shot> = Vec::new();
         for part in Part::ALL {
-            let cameras = cameras(part, Self::count(views, part), width, height, seed);
+            let cameras = cameras(&rig, part, Self::count(views, part), width, height, seed);
             for (number, camera) in (0..).zip(cameras) {
                 let seed = seed.wrapping_mul(1_000_003).wrapping_add(shots.len() as u64);
                 shots.push(Shot {
@@ -110,9 +124,10 @@ impl Capture {
             }
         }
         Ok(Self {
-            scene: demo_scene(),
+            scene,
             options: *options,
             shots,
+            fov_x: rig.fov_x,
         })
     }
 
@@ -129,6 +144,11 @@ impl Capture {
         &self.options
     }
 
+    /// Horizontal field of view, radians.
+    pub fn fov_x(&self) -> f32 {
+        self.fov_x
+    }
+
     /// All views, part by part: training, validation, held out.
     pub fn shots(&self) -> &[Shot] {
         &self.shots
@@ -139,15 +159,39 @@ impl Capture {
         self.scene.trace(&shot.camera, SAMPLES, shot.seed)
     }
 
-    /// Simulated structure-from-motion points of the `frame` of a training view; none for other views.
+    /// Simulated structure-from-motion points of the `frame` of a training view; none for other views. Except in the demo scene,
+    /// whose points are spread evenly, only places with contrast have points, and the sky has none.
     pub fn points(&self, shot: &Shot, frame: &SynthFrame) -> PointCloud {
         let mut points = PointCloud::default();
         if shot.part == Part::Train {
             let count = (POINTS / self.options.views).max(1);
             let mut rng = Rng::new(self.options.seed, 1000 + u64::from(shot.number));
-            (0..count).for_each(|_| add_point(&mut points, &shot.camera, frame, &mut rng));
+            for _ in 0..count {
+                let (x, y) = (rng.below(frame.color.width), rng.below(frame.color.height));
+                if self.options.scene == SceneName::Demo || self.is_distinct(&shot.camera, frame, x, y) {
+                    add_point(&mut points, &shot.camera, frame, [x, y], &mut rng);
+                }
+            }
         }
         points
+    }
+
+    /// Whether structure from motion would find the surface under a pixel.
+    fn is_distinct(&self, camera: &Camera, frame: &SynthFrame, x: u32, y: u32) -> bool {
+        let around = |at: u32, side: u32| at.saturating_sub(PATCH)..=(at + PATCH).min(side - 1);
+        let (mut low, mut high) = (f32::INFINITY, f32::NEG_INFINITY);
+        for row in around(y, frame.color.height) {
+            for column in around(x, frame.color.width) {
+                let green = frame.color.pixel(column, row)[1];
+                (low, high) = (low.min(green), high.max(green));
+            }
+        }
+        let ray = Ray {
+            origin: camera.pose.position,
+            direction: camera.ray_direction(Vec2::new(x as f32 + 0.5, y as f32 + 0.5)),
+        };
+        let hit = self.scene.hit(&ray, camera.near);
+        high - low >= CONTRAST && hit.is_some_and(|hit| !hit.object.material.texture.is_emissive())
     }
 }
 
@@ -191,9 +235,8 @@ pub fn dataset(options: &SynthOptions) -> Result<Dataset, SynthError> {
     Ok(dataset)
 }
 
-/// Adds the surface point under a random pixel, with noise.
-fn add_point(points: &mut PointCloud, camera: &Camera, frame: &SynthFrame, rng: &mut Rng) {
-    let (x, y) = (rng.below(frame.color.width), rng.below(frame.color.height));
+/// Adds the surface point under a pixel, with noise.
+fn add_point(points: &mut PointCloud, camera: &Camera, frame: &SynthFrame, [x, y]: [u32; 2], rng: &mut Rng) {
     let direction = camera.ray_direction(Vec2::new(x as f32 + 0.5, y as f32 + 0.5));
     let depth = frame.depth.pixel(x, y)[0];
     let distance = depth / direction.dot(camera.pose.rotation * Vec3::Z);
@@ -210,6 +253,7 @@ mod tests {
     use super::*;
 
     const SMALL: SynthOptions = SynthOptions {
+        scene: SceneName::Demo,
         views: 4,
         width: 32,
         height: 32,

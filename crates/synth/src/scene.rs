@@ -1,4 +1,5 @@
 use crate::shape::{Ray, Shape};
+use crate::sky;
 use crate::texture::Texture;
 use glam::{Quat, Vec3};
 use std::f32::consts::FRAC_PI_2;
@@ -17,7 +18,8 @@ pub struct Material {
 }
 
 impl Material {
-    fn matte(texture: Texture) -> Self {
+    /// Scatters light only.
+    pub(crate) fn matte(texture: Texture) -> Self {
         Self {
             texture,
             coat: 0.0,
@@ -26,7 +28,8 @@ impl Material {
         }
     }
 
-    fn glazed(texture: Texture, coat: f32, roughness: f32) -> Self {
+    /// Under a clear coat.
+    pub(crate) fn glazed(texture: Texture, coat: f32, roughness: f32) -> Self {
         Self {
             texture,
             coat,
@@ -35,7 +38,8 @@ impl Material {
         }
     }
 
-    fn metal(color: Vec3, roughness: f32) -> Self {
+    /// Reflects light only.
+    pub(crate) fn metal(color: Vec3, roughness: f32) -> Self {
         Self {
             texture: Texture::Plain(color),
             coat: 0.0,
@@ -81,13 +85,31 @@ impl Cluster {
     }
 }
 
-/// A scene. World: z up, the centre of the table top at the origin, one unit about half a metre.
+/// A scene. World: z up. In the demo scene the centre of the table top is at the origin, and one unit is about half a metre; in the
+/// others the ground or the floor is at `z = 0`, and one unit is a metre.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SynthScene {
     /// The unbounded objects, ground and backdrop. They cast no shadow.
     pub surroundings: Vec<Object>,
     /// Everything else.
     pub clusters: Vec<Cluster>,
+    /// What illuminates it.
+    pub light: Light,
+}
+
+/// The light of a scene: a sun or a lamp at infinity, and the mean light from above and from below.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Light {
+    /// Unit direction to the sun.
+    pub sun: Vec3,
+    /// Its irradiance on a surface facing it, linear RGB.
+    pub sun_light: Vec3,
+    /// Tangent of its angular radius.
+    pub sun_spread: f32,
+    /// Light on a surface that faces up, linear RGB, without the sun's.
+    pub above: Vec3,
+    /// Light reflected upwards by the ground, linear RGB.
+    pub below: Vec3,
 }
 
 /// The first surface point along a ray.
@@ -168,6 +190,7 @@ fn passes(ray: &Ray, (center, radius): (Vec3, f32), far: f32) -> bool {
 pub fn demo_scene() -> SynthScene {
     let object = |shape, material| Object { shape, material };
     SynthScene {
+        light: sky::DAYLIGHT,
         surroundings: vec![
             object(Shape::Ground { height: -1.45 }, Material::matte(Texture::Meadow)),
             object(Shape::Backdrop { radius: 20.0 }, Material::matte(Texture::Sky)),

@@ -33,6 +33,13 @@ pub enum Shape {
         /// World units.
         radius: f32,
     },
+    /// The inside of a room: an upright box on `z = 0` about the z axis, which contains everything else.
+    Interior {
+        /// Half the width and half the length.
+        half: Vec2,
+        /// Height.
+        height: f32,
+    },
     /// A ball.
     Sphere {
         /// Centre.
@@ -81,10 +88,10 @@ pub enum Shape {
 }
 
 impl Shape {
-    /// A sphere that contains the shape, `None` for the two unbounded shapes.
+    /// A sphere that contains the shape, `None` for the shapes that surround everything.
     pub fn bound(&self) -> Option<(Vec3, f32)> {
         match *self {
-            Shape::Ground { .. } | Shape::Backdrop { .. } => None,
+            Shape::Ground { .. } | Shape::Backdrop { .. } | Shape::Interior { .. } => None,
             Shape::Sphere { center, radius } => Some((center, radius)),
             Shape::Drum { base, radius, height } => Some((base + Vec3::Z * (0.5 * height), radius.hypot(0.5 * height))),
             Shape::Rod { a, b, radius } => Some((0.5 * (a + b), 0.5 * (b - a).length() + radius)),
@@ -96,7 +103,7 @@ impl Shape {
     }
 
     /// The nearest `t` in `(near, far)` at which the ray hits the surface, and the unit normal there: outward, or inward for
-    /// the backdrop.
+    /// backdrop and interior.
     pub fn intersect(&self, ray: &Ray, near: f32, far: f32) -> Option<(f32, Vec3)> {
         match *self {
             Shape::Ground { height } => {
@@ -106,6 +113,15 @@ impl Shape {
             Shape::Backdrop { radius } => {
                 let (_, t) = sphere_interval(ray, Vec3::ZERO, radius)?;
                 (t > near && t < far).then(|| (t, -ray.at(t) / radius))
+            }
+            Shape::Interior { half, height } => {
+                let center = Vec3::Z * (0.5 * height);
+                let local = Ray {
+                    origin: ray.origin - center,
+                    ..*ray
+                };
+                let (_, (t, normal)) = block(&local, half.extend(0.5 * height))?;
+                (t > near && t < far).then_some((t, -normal))
             }
             Shape::Sphere { center, radius } => {
                 let (t0, t1) = sphere_interval(ray, center, radius)?;
@@ -138,7 +154,8 @@ impl Shape {
                     origin: block_from_world * (ray.origin - center),
                     direction: block_from_world * ray.direction,
                 };
-                let (t, normal) = block(&local, near, far, half)?;
+                let ends = <[_; 2]>::from(block(&local, half)?);
+                let (t, normal) = ends.into_iter().find(|(t, _)| *t > near && *t < far)?;
                 Some((t, world_from_block * normal))
             }
         }
@@ -147,7 +164,7 @@ impl Shape {
     /// Transforms a world point to the shape's local frame, in which its texture is defined.
     pub fn local(&self, world: Vec3) -> Vec3 {
         match *self {
-            Shape::Ground { .. } | Shape::Backdrop { .. } => world,
+            Shape::Ground { .. } | Shape::Backdrop { .. } | Shape::Interior { .. } => world,
             Shape::Sphere { center, .. } => world - center,
             Shape::Drum { base, .. } => world - base,
             Shape::Rod { a, .. } => world - a,
@@ -284,7 +301,8 @@ fn ring(ray: &Ray, near: f32, far: f32, radius: f32, tube: f32) -> Option<(f32, 
     None
 }
 
-fn block(ray: &Ray, near: f32, far: f32, half: Vec3) -> Option<(f32, Vec3)> {
+/// Where the line enters the box and where it leaves it, with the outward normals there.
+fn block(ray: &Ray, half: Vec3) -> Option<((f32, Vec3), (f32, Vec3))> {
     let (mut t0, mut t1) = (f32::NEG_INFINITY, f32::INFINITY);
     let (mut axis0, mut axis1) = (0, 0);
     for axis in 0..3 {
@@ -296,14 +314,12 @@ fn block(ray: &Ray, near: f32, far: f32, half: Vec3) -> Option<(f32, Vec3)> {
             (t1, axis1) = (b, axis);
         }
     }
-    if t0 > t1 {
-        return None;
-    }
-    let t = first_within(t0, t1, near, far)?;
-    let axis = if t == t0 { axis0 } else { axis1 };
-    let mut normal = Vec3::ZERO;
-    normal[axis] = ray.at(t)[axis].signum();
-    Some((t, normal))
+    let end = |t: f32, axis: usize| {
+        let mut normal = Vec3::ZERO;
+        normal[axis] = ray.at(t)[axis].signum();
+        (t, normal)
+    };
+    (t0 <= t1).then(|| (end(t0, axis0), end(t1, axis1)))
 }
 
 #[cfg(test)]

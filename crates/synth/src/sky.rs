@@ -1,14 +1,21 @@
 //! Distant light: a low sun, a clear sky with thin clouds, three ranges of hills.
 
+use crate::scene::Light;
 use crate::texture::{fbm, noise, smooth};
 use glam::{Vec2, Vec3};
 
 /// Unit direction to the afternoon sun, at an elevation of 36 degrees.
-pub const SUN: Vec3 = Vec3::new(-0.548, -0.591, 0.592);
-/// Irradiance of the sun on a surface facing it, linear RGB.
-pub const SUN_LIGHT: Vec3 = Vec3::new(2.75, 2.25, 1.62);
-/// Tangent of the sun's angular radius. Four times the real one: a soft edge can be trained, a sharp one aliases.
-pub const SUN_SPREAD: f32 = 0.018;
+const SUN: Vec3 = Vec3::new(-0.548, -0.591, 0.592);
+
+/// The light of a sunny afternoon.
+pub const DAYLIGHT: Light = Light {
+    sun: SUN,
+    sun_light: Vec3::new(2.75, 2.25, 1.62),
+    // Four times the real one: a soft edge can be trained, a sharp one aliases.
+    sun_spread: 0.018,
+    above: Vec3::new(0.44, 0.56, 0.78),
+    below: Vec3::new(0.40, 0.30, 0.22),
+};
 
 const ZENITH: Vec3 = Vec3::new(0.16, 0.33, 0.68);
 const HORIZON: Vec3 = Vec3::new(0.78, 0.72, 0.66);

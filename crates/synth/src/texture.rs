@@ -32,12 +32,32 @@ pub enum Texture {
     Wood(Vec3),
     /// Flagstones around the table, then meadow.
     Meadow,
+    /// Patches of two colours, such as stone, cloth or leaves.
+    Patches {
+        /// The two colours.
+        colors: [Vec3; 2],
+        /// Size of the largest patches, world units.
+        size: f32,
+    },
+    /// A room with a floor of planks, white ceiling and skirting, and plain walls.
+    Interior {
+        /// Colour of the walls.
+        wall: Vec3,
+        /// Colour of the planks.
+        floor: Vec3,
+        /// Height of the room, world units.
+        height: f32,
+    },
+    /// Grass with flowers and a winding path.
+    Park,
     /// Sky, clouds and hills on the backdrop; emissive.
     Sky,
+    /// Sky and hills as from the middle of a room; emissive. For upright panes across the object's local Y axis.
+    Window,
 }
 
 impl Texture {
-    /// Albedo (radiance for [`Texture::Sky`]) at a point in the object's local frame.
+    /// Albedo, or radiance if it is emissive, at a point in the object's local frame.
     pub fn color(&self, local: Vec3) -> Vec3 {
         match *self {
             Texture::Plain(color) => color,
@@ -55,8 +75,21 @@ impl Texture {
                 color * (0.75 + 0.5 * grain)
             }
             Texture::Meadow => meadow(local.truncate()),
+            Texture::Patches { colors: [a, b], size } => {
+                // A slice through the noise that is parallel to no face.
+                let p = Vec2::new(local.x + 0.61 * local.z, local.y - 0.53 * local.z) / size;
+                a.lerp(b, smooth(0.35, 0.65, fbm(p * 2.0, 4)))
+            }
+            Texture::Interior { wall, floor, height } => interior(local, wall, floor, height),
+            Texture::Park => park(local.truncate()),
             Texture::Sky => crate::sky::radiance(local.normalize()),
+            Texture::Window => crate::sky::radiance(Vec3::new(local.x, 2.0, local.z + 0.1).normalize()),
         }
+    }
+
+    /// Whether its colour is radiance, not albedo.
+    pub fn is_emissive(&self) -> bool {
+        matches!(self, Texture::Sky | Texture::Window)
     }
 }
 
@@ -118,6 +151,37 @@ fn meadow(p: Vec2) -> Vec3 {
     let stone_number = ((p.y.atan2(p.x) / TAU + 0.137 * row) * count).floor().rem_euclid(count);
     let slab = Vec3::new(0.36, 0.335, 0.30) * (0.7 + 0.5 * lattice(stone_number as i32, row as i32 + 50));
     slab.lerp(grass * blades, smooth(3.5, 4.3, r + 0.9 * (patches - 0.5)))
+}
+
+fn interior(p: Vec3, wall: Vec3, floor: Vec3, height: f32) -> Vec3 {
+    const WHITE: Vec3 = Vec3::new(0.78, 0.77, 0.74);
+    if p.z > height - 1e-3 {
+        return WHITE;
+    }
+    if p.z > 1e-3 {
+        return if p.z < 0.09 { WHITE * 0.9 } else { wall };
+    }
+    let row = (p.y / 0.16).floor();
+    let along = p.x / 1.3 + 0.37 * row;
+    let seam = (p.y / 0.16).rem_euclid(1.0) < 0.05 || along.rem_euclid(1.0) < 0.008;
+    let tone = 0.7 + 0.5 * lattice(along.floor() as i32, row as i32);
+    let grain = 0.7 + 0.6 * fbm(Vec2::new(p.x * 2.0, p.y * 22.0), 3);
+    floor * tone * grain * if seam { 0.45 } else { 1.0 }
+}
+
+fn park(p: Vec2) -> Vec3 {
+    let tufts = fbm(p * 1.1, 5);
+    let fields = fbm(p * 0.06 + 3.0, 3);
+    let grass = Vec3::new(0.06, 0.13, 0.03).lerp(Vec3::new(0.27, 0.30, 0.08), smooth(0.3, 0.7, tufts));
+    let dry = Vec3::new(0.36, 0.31, 0.13) * (0.6 + 0.8 * tufts);
+    let land = grass.lerp(dry, smooth(0.45, 0.65, fields));
+    let cell = (p / 0.3).floor();
+    let off_flower = (p / 0.3 - cell - 0.5).length();
+    let is_flower = off_flower < 0.25 && lattice(cell.x as i32, cell.y as i32 + 900) > 0.93;
+    let land = if is_flower { Vec3::new(0.75, 0.62, 0.18) } else { land };
+    let gravel = Vec3::new(0.44, 0.38, 0.30) * (0.55 + 0.9 * fbm(p * 7.0, 3));
+    let off_path = (p.y + 1.2 * (0.45 * p.x).sin()).abs();
+    gravel.lerp(land, smooth(0.55, 0.8, off_path + 0.3 * (tufts - 0.5)))
 }
 
 /// 0 below `from`, 1 above `to`, smooth in between.

@@ -5,7 +5,6 @@ use crate::ambient;
 use crate::scene::{Hit, SynthScene};
 use crate::shape::Ray;
 use crate::sky;
-use crate::texture::Texture;
 use glam::{Vec2, Vec3};
 use irradia_scene::{Camera, Image, Rng};
 use rayon::prelude::*;
@@ -123,13 +122,13 @@ impl SynthScene {
 
     /// Radiance towards the ray's origin; `sun` and `mirror` are uniform in the unit square.
     fn shade(&self, ray: &Ray, hit: &Hit, sun: Vec2, mirror: Vec2) -> Vec3 {
-        let material = &hit.object.material;
+        let (material, light) = (&hit.object.material, &self.light);
         let color = material.texture.color(hit.object.shape.local(hit.point));
-        if material.texture == Texture::Sky {
+        if material.texture.is_emissive() {
             return color;
         }
         let start = hit.point + hit.normal * LIFT;
-        let toward_sun = around(sky::SUN, disc(sun) * sky::SUN_SPREAD);
+        let toward_sun = around(light.sun, disc(sun) * light.sun_spread);
         let facing = hit.normal.dot(toward_sun);
         let lit = facing > 0.0
             && !self.is_blocked(
@@ -139,7 +138,7 @@ impl SynthScene {
                 },
                 LIFT,
             );
-        let sunlight = if lit { sky::SUN_LIGHT * facing } else { Vec3::ZERO };
+        let sunlight = if lit { light.sun_light * facing } else { Vec3::ZERO };
 
         let mut radiance = Vec3::ZERO;
         if !material.metal {
@@ -171,9 +170,9 @@ impl SynthScene {
             }
             if lit {
                 // The sun's reflection: a Gaussian of the lobe's width around the mirror direction.
-                let off = 2.0 * (1.0 - exact.dot(sky::SUN)).max(0.0);
-                let width = 0.5 * material.roughness * material.roughness + sky::SUN_SPREAD * sky::SUN_SPREAD;
-                reflected += sky::SUN_LIGHT * ((-off / width).exp() * 0.05 / width);
+                let off = 2.0 * (1.0 - exact.dot(light.sun)).max(0.0);
+                let width = 0.5 * material.roughness * material.roughness + light.sun_spread * light.sun_spread;
+                reflected += light.sun_light * ((-off / width).exp() * 0.05 / width);
             }
             radiance += fresnel * reflected;
         }
@@ -188,12 +187,13 @@ impl SynthScene {
         };
         let texture = hit.object.material.texture;
         let color = texture.color(hit.object.shape.local(hit.point));
-        if texture == Texture::Sky {
+        if texture.is_emissive() {
             return color;
         }
+        let light = &self.light;
         // Without a shadow ray: 0.7 is the assumed fraction of sunlit surfaces.
-        let sunlit = 0.7 * hit.normal.dot(sky::SUN).max(0.0);
-        color * (sky::SUN_LIGHT * sunlit + ambient::open(&hit))
+        let sunlit = 0.7 * hit.normal.dot(light.sun).max(0.0);
+        color * (light.sun_light * sunlit + ambient::open(light, &hit))
     }
 }
 

@@ -4,7 +4,7 @@ use crate::half_fit::{HalfFit, HeldOut, half_fit_psnr};
 use crate::model::{Model, RenderOptions};
 use crate::photos::Prepared;
 use crate::trainer::TrainError;
-use irradia_measure::{Evaluation, Lpips, evaluate, psnr_masked};
+use irradia_measure::{Evaluation, Networks, evaluate, psnr_masked};
 use irradia_scene::{Camera, Dataset, Image, Photo, View};
 use irradia_splat::Renderer;
 use irradia_splat::init::camera_extent;
@@ -40,8 +40,8 @@ impl EvaluatedView {
 pub enum Metrics<'a> {
     /// PSNR only (the others are NaN and `None`): for evaluation during training.
     Psnr,
-    /// All, including LPIPS if network weights are available.
-    All(Option<&'a Lpips>),
+    /// All, including LPIPS by the networks given.
+    All(Networks<'a>),
 }
 
 /// How views are evaluated.
@@ -78,11 +78,12 @@ pub fn evaluate_views(
         let blank = mask.is_some_and(|mask| mask.iter().all(|m| *m == 0));
         let mut metrics = match options.metrics {
             _ if blank => NOT_MEASURED,
-            Metrics::All(lpips) => evaluate(&render, &truth, mask, lpips),
+            Metrics::All(networks) => evaluate(&render, &truth, mask, networks),
             Metrics::Psnr => Evaluation {
                 psnr: psnr_masked(&render.rounded_to_8_bits(), &truth, mask),
                 ssim: f64::NAN,
                 lpips: None,
+                unseen_lpips: None,
                 half_fit_psnr: None,
             },
         };
@@ -129,6 +130,7 @@ const NOT_MEASURED: Evaluation = Evaluation {
     psnr: f64::NAN,
     ssim: f64::NAN,
     lpips: None,
+    unseen_lpips: None,
     half_fit_psnr: None,
 };
 
@@ -138,11 +140,15 @@ pub fn mean(metrics: &[Evaluation]) -> Evaluation {
     let measured: Vec<&Evaluation> = metrics.iter().filter(|m| !m.psnr.is_nan()).collect();
     let mean = |values: Vec<f64>| (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64);
     let all = |of: fn(&Evaluation) -> f64| mean(measured.iter().map(|m| of(m)).collect()).unwrap_or(f64::NAN);
-    let lpips: Option<Vec<f64>> = measured.iter().map(|m| m.lpips).collect();
+    let distance = |of: fn(&Evaluation) -> Option<f64>| {
+        let distances: Option<Vec<f64>> = measured.iter().map(|m| of(m)).collect();
+        distances.and_then(mean)
+    };
     Evaluation {
         psnr: all(|m| m.psnr),
         ssim: all(|m| m.ssim),
-        lpips: lpips.and_then(mean),
+        lpips: distance(|m| m.lpips),
+        unseen_lpips: distance(|m| m.unseen_lpips),
         half_fit_psnr: mean(measured.iter().filter_map(|m| m.half_fit_psnr).collect()),
     }
 }
@@ -204,7 +210,7 @@ mod tests {
         ] {
             let options = EvalOptions {
                 render: RenderOptions::default(),
-                metrics: Metrics::All(None),
+                metrics: Metrics::All(Networks::default()),
                 half_fit,
             };
             let data = dataset();

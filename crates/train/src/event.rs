@@ -78,6 +78,11 @@ pub enum Event {
         /// Steps made so far.
         step: u64,
     },
+    /// What was decided from the data before the first step.
+    Decided {
+        /// One line.
+        message: String,
+    },
     /// A warning: the run continues.
     Warned {
         /// One line.

@@ -1,13 +1,14 @@
 //! A stage of radiance field: its steps, and the initialisation of splats after it.
 
+use crate::field_space::field_space;
 use crate::photos::Prepared;
-use crate::recipe::{FieldKnobs, FieldSpace, Param, Recipe};
+use crate::recipe::{FieldKnobs, Param, Recipe};
 use crate::schedule::{StepMetrics, StepPlan, plan, upcoming_views};
 use crate::trainer::{TrainError, Trainer};
 use crate::{event::StepReport, recipe::Represents};
 use cpu_time::ProcessTime;
 use irradia_field::{
-    Background, Field, FieldState, KnownDepth, PointsOptions, Space, StepOptions, TrainView, to_points, train_views,
+    Background, Field, FieldState, KnownDepth, PointsOptions, StepOptions, TrainView, to_points, train_views,
 };
 use irradia_scene::{Camera, Dataset, PointCloud};
 use irradia_splat::{SplatState, init};
@@ -19,47 +20,23 @@ const STREAM_FIELD: u64 = 6;
 const STREAM_POINTS: u64 = 7;
 /// Photographs per step if not all of them fit into memory.
 const SHARED: usize = 16;
-/// Factor on the near plane of the depth bounds, which leaves a margin (NeRF's code: 0.9).
-const NEAR_MARGIN: f32 = 0.9;
-
 /// Whether stage `stage` trains a field.
 pub fn is_field(recipe: &Recipe, stage: usize) -> bool {
     let stage = &recipe.stage[stage.min(recipe.stage.len() - 1)];
     stage.represents == Represents::Field
 }
 
-/// The field of `knobs` in the space determined by `cameras`.
+/// The field of `knobs` in the space determined by the dataset, and why that space.
 pub fn first_field(
     knobs: &FieldKnobs,
     dataset: &Dataset,
-    cameras: &[Camera],
     transparent: bool,
     seed: u64,
-) -> Result<FieldState, TrainError> {
-    let bounds: Option<Vec<[f32; 2]>> = dataset.train.iter().map(|i| dataset.views[*i].depth_bounds).collect();
-    let kind = match (knobs.space, &bounds) {
-        (FieldSpace::Auto, Some(bounds)) if !bounds.is_empty() => FieldSpace::Ndc,
-        (FieldSpace::Auto, _) if transparent => FieldSpace::Bounded,
-        (FieldSpace::Auto, _) => FieldSpace::Unbounded,
-        (kind, _) => kind,
-    };
-    let space = match kind {
-        FieldSpace::Ndc => {
-            let nearest = bounds.iter().flatten().map(|b| b[0]).fold(f32::INFINITY, f32::min);
-            let near = if nearest.is_finite() {
-                NEAR_MARGIN * nearest
-            } else {
-                cameras[0].near
-            };
-            Space::ndc(cameras, near)
-        }
-        FieldSpace::Bounded => Space::around(cameras, false),
-        FieldSpace::Auto | FieldSpace::Unbounded => Space::around(cameras, true),
-    };
-    let space = space.ok_or(TrainError::NoSpace)?;
+) -> Result<(FieldState, String), TrainError> {
+    let (space, why) = field_space(knobs.space, dataset, transparent)?;
     let config = knobs.config(dataset.train.len(), &space, transparent);
     let field = Field::new(config, space, seed ^ STREAM_FIELD << 40)?;
-    Ok(FieldState::new(field))
+    Ok((FieldState::new(field), why))
 }
 
 impl Trainer {

@@ -8,6 +8,7 @@ pub mod eval;
 pub mod event;
 mod exposure_probe;
 pub mod field_file;
+mod field_space;
 mod field_step;
 mod forecast;
 mod free_space;

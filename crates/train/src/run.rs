@@ -64,6 +64,8 @@ pub fn run(
         views: trainer.dataset.train.len(),
     }];
     if trainer.clock.step == 0 {
+        let decisions = std::mem::take(&mut trainer.decisions);
+        events.extend(decisions.into_iter().map(|message| Event::Decided { message }));
         events.extend(trainer.warnings().into_iter().map(|message| Event::Warned { message }));
         events.push(Event::StageEntered {
             stage: trainer.stage_name().to_owned(),

@@ -122,6 +122,8 @@ pub struct Trainer {
     pub cap: usize,
     /// Pixels of a training image, averaged over views.
     pixels: f64,
+    /// What was decided from the data before the first step, one line each.
+    pub(crate) decisions: Vec<String>,
     pub(crate) photos: PhotoCache,
     /// Known depths of the views on which a field is trained, by view, width and height.
     pub(crate) depths: HashMap<(usize, u32, u32), Arc<[KnownDepth]>>,
@@ -163,6 +165,7 @@ impl Trainer {
             photos: PhotoCache::new(dataset.clone(), recipe.render.background, options.photo_budget),
             cap: cap(&recipe, &cameras),
             pixels: mean_pixels(&cameras),
+            decisions: Vec::new(),
             depths: HashMap::new(),
             objective: Objective::new(options.lpips.clone()),
             free_space: FreeSpace::new(&dataset, recipe.free_space),
@@ -178,13 +181,14 @@ impl Trainer {
     /// The recipe's field, untrained.
     pub(crate) fn first_field(&mut self) -> Result<FieldState, TrainError> {
         let transparent = self.transparent()?;
-        let cameras = self.train_cameras();
         let knobs = self
             .recipe
             .field
             .as_ref()
             .expect("validated: a stage of field has its knobs");
-        first_field(knobs, &self.dataset, &cameras, transparent, self.options.seed)
+        let (field, why) = first_field(knobs, &self.dataset, transparent, self.options.seed)?;
+        self.decisions.push(format!("the field's space is {why}"));
+        Ok(field)
     }
 
     /// The recipe's components in the sockets of a step, untrained.

@@ -13,11 +13,13 @@ use clap::builder::RangedU64ValueParser;
 use image::codecs::jpeg::JpegEncoder;
 use irradia_runs::formats::write_atomic;
 use irradia_runs::train::compare::{
-    Comparison, Figures, PictureRow, Render, Run, Scene, overall, picture, to_html, to_markdown, to_text,
+    Comparison, Figures, PictureRow, Published, Render, Run, Scene, flattered, overall, picture, published, to_html,
+    to_markdown, to_text,
 };
 use irradia_runs::train::report::{Report, ViewReport, machine};
 use irradia_runs::{
-    Background, RunFolder, data_fingerprint, distinct, file_stem, logged_errors, program_fingerprint, read_recipe,
+    Background, Protocol, Reading, RunFolder, data_fingerprint, distinct, file_stem, logged_errors,
+    program_fingerprint, read_recipe,
 };
 use serde::{Deserialize, Serialize};
 use std::fs::{self, File};
@@ -67,8 +69,18 @@ pub struct Args {
     /// absent white for Blender scenes and the recipe's own for others
     #[arg(long, value_name = "COLOR")]
     pub background: Option<Background>,
+    /// Read and score the datasets as the papers do, and show their figures: blender, llff, mipnerf360 or tandt; a dataset's folder is
+    /// named after the benchmark's scene, such as .../nerf_synthetic/chair
+    #[arg(long, value_name = "NAME", conflicts_with_all = ["downscale", "max_side", "full_size", "holdout", "background"])]
+    pub protocol: Option<Protocol>,
     #[command(flatten)]
     pub reading: DataArgs,
+}
+
+impl Args {
+    fn background(&self) -> Option<Background> {
+        self.background.or_else(|| self.protocol?.background())
+    }
 }
 
 /// A recipe with overrides.
@@ -120,6 +132,12 @@ struct Source {
     name: String,
     /// Hash of its content; empty if it cannot be read, which its runs then report.
     fingerprint: String,
+    /// How it is read.
+    reading: Reading,
+    /// Published figures under the protocol.
+    published: Vec<Published>,
+    /// How it differs from the protocol's scene, one line each.
+    notes: Vec<String>,
 }
 
 const REQUEST: &str = "request.json";
@@ -215,7 +233,11 @@ pub fn run(args: &Args) -> Result<()> {
             break;
         }
     }
+    let mut notes: Vec<String> = sources.iter().flat_map(|source| source.notes.clone()).collect();
+    notes.extend(flattered(&scenes));
     let comparison = Comparison {
+        notes,
+        published: sources.into_iter().flat_map(|source| source.published).collect(),
         version: env!("CARGO_PKG_VERSION").to_owned(),
         conditions: conditions(args),
         device,
@@ -234,10 +256,18 @@ pub fn run(args: &Args) -> Result<()> {
 
 /// The datasets of the command line; those that can be read must have held-out views.
 fn sources(args: &Args) -> Result<Vec<Source>> {
-    let reading = args.reading.reading();
-    reading.check().map_err(by_option)?;
     let names = distinct(args.data.iter().map(|data| folder_name(data)));
     let source = |(data, name): (&PathBuf, String)| {
+        // The scene of the benchmark, before the name is made distinct.
+        let scene = folder_name(data).to_lowercase();
+        let reading = match args.protocol {
+            Some(protocol) => Reading {
+                format: args.reading.format.clone(),
+                ..protocol.reading(&scene)
+            },
+            None => args.reading.reading(),
+        };
+        reading.check().map_err(by_option)?;
         let dataset = reading.read(data).ok();
         if dataset.as_ref().is_some_and(|dataset| dataset.test.is_empty()) {
             let message = format!(
@@ -246,7 +276,27 @@ fn sources(args: &Args) -> Result<Vec<Source>> {
             );
             return Err(Usage(message).into());
         }
+        let (mut published_rows, mut notes) = (Vec::new(), Vec::new());
+        if let Some(protocol) = args.protocol {
+            published_rows = published(protocol.name(), &scene, &name);
+            if published_rows.is_empty() {
+                notes.push(format!(
+                    "{name}: no published figures of a scene of this name under protocol {protocol}"
+                ));
+            } else if let Some(dataset) = &dataset {
+                let differences = protocol.differences(&scene, dataset);
+                notes.extend(
+                    differences
+                        .into_iter()
+                        .map(|line| format!("{name}: not comparable with the published figures: {line}")),
+                );
+            }
+            notes.iter().for_each(note);
+        }
         Ok(Source {
+            published: published_rows,
+            notes,
+            reading,
             data: data.clone(),
             name,
             fingerprint: dataset.map_or(String::new(), |dataset| data_fingerprint(&dataset, data)),
@@ -309,13 +359,13 @@ fn request(args: &Args, program: &str, source: &Source, variant: &Variant, seed:
     option("--threads", args.threads.map(|n| n.to_string()));
     option("--lpips", args.lpips.as_ref().map(|path| path.display().to_string()));
     option("--format", args.reading.format.clone());
-    let reading = args.reading.reading();
+    let reading = &source.reading;
     match reading.max_side {
         Some(side) => option("--max-side", Some(side.to_string())),
         None => option("--downscale", Some(reading.downscale.to_string())),
     }
-    option("--holdout", reading.holdout);
-    option("--background", args.background.map(|b| b.name().to_owned()));
+    option("--holdout", reading.holdout.clone());
+    option("--background", args.background().map(|b| b.name().to_owned()));
     Request {
         arguments,
         recipe_hash: variant.hash.clone(),
@@ -463,6 +513,10 @@ fn conditions(args: &Args) -> Vec<String> {
         (None, Some(seconds)) => format!("{seconds} s of training"),
         (None, None) => "whole recipes".into(),
     };
+    if let Some(protocol) = args.protocol {
+        let seeds = format!("{} seed{}", args.seeds, if args.seeds == 1 { "" } else { "s" });
+        return vec![length, format!("protocol {protocol}"), seeds];
+    }
     let reading = args.reading.reading();
     let size = match reading.max_side {
         Some(side) => Some(format!("images of at most {side} px")),

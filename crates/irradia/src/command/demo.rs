@@ -1,11 +1,11 @@
 //! `irradia demo` and `irradia synth`
 
-use super::lpips::lpips_path;
+use super::lpips::{lpips_path, unseen_lpips_path};
 use super::render::parse_size;
 use super::{thread_count, train, use_threads};
 use crate::terminal::{note, say};
 use anyhow::Result;
-use irradia_runs::synth::SynthOptions;
+use irradia_runs::synth::{SceneName, SynthOptions};
 use irradia_runs::{TrainInput, write_synth_dataset};
 use std::path::PathBuf;
 use std::time::Instant;
@@ -39,9 +39,12 @@ pub struct SynthArgs {
     /// Size of the images
     #[arg(long, value_name = "WxH", value_parser = parse_size, default_value = "256x256")]
     pub size: (u32, u32),
-    /// Random seed
+    /// Random seed: cameras and noise, and layout and colours of all scenes but the demo
     #[arg(long, default_value_t = 0)]
     pub seed: u64,
+    /// Scene: demo, room, shelf, outdoor or thin
+    #[arg(long, value_name = "NAME", default_value_t = SceneName::Demo)]
+    pub scene: SceneName,
 }
 
 pub fn run(args: &Args) -> Result<()> {
@@ -61,9 +64,11 @@ pub fn run(args: &Args) -> Result<()> {
         start.elapsed().as_secs_f64(),
         data.display()
     ));
+    let lpips = lpips_path(None)?;
     train::begin(TrainInput {
         steps: Some(args.steps),
-        lpips: lpips_path(None)?,
+        unseen_lpips: unseen_lpips_path(None, lpips.as_ref()),
+        lpips,
         overwrite: true,
         ..TrainInput::new(data, out.clone())
     })?;
@@ -76,6 +81,7 @@ pub fn run(args: &Args) -> Result<()> {
 
 pub fn synth(args: &SynthArgs) -> Result<()> {
     let options = SynthOptions {
+        scene: args.scene,
         views: args.views,
         width: args.size.0,
         height: args.size.1,

@@ -1,11 +1,11 @@
 //! `irradia eval`
 
-use super::lpips::lpips;
+use super::lpips::{lpips, unseen_lpips};
 use super::{DataArgs, Split, thread_count, use_threads, warn};
 use crate::Usage;
 use crate::terminal::{note, say};
 use anyhow::{Context, Result};
-use irradia_measure::{Evaluation, LpipsNet};
+use irradia_measure::{Evaluation, Lpips, LpipsNet, Networks};
 use irradia_runs::formats::write_atomic;
 use irradia_runs::train::eval::{EvalOptions, EvaluatedView, Metrics};
 use irradia_runs::train::half_fit::HalfFit;
@@ -95,10 +95,17 @@ pub fn run(args: &Args) -> Result<()> {
             "LPIPS is not measured: no LPIPS weights found;  {HOW_TO_GET_LPIPS}"
         ));
     }
-    let net = lpips.as_ref().map(|lpips| lpips.net());
+    let unseen = match (args.lpips_net, &lpips) {
+        (None, Some(first)) => unseen_lpips(args.lpips.as_ref(), first)?,
+        _ => None,
+    };
+    let nets = [&lpips, &unseen].map(|lpips| lpips.as_ref().map(Lpips::net));
     let options = EvalOptions {
         render: scene.options,
-        metrics: Metrics::All(lpips.as_ref()),
+        metrics: Metrics::All(Networks {
+            first: lpips.as_ref(),
+            unseen: unseen.as_ref(),
+        }),
         half_fit: args.half_fit(),
     };
     let (mut rows, mut measured) = (Vec::new(), Vec::new());
@@ -109,9 +116,10 @@ pub fn run(args: &Args) -> Result<()> {
         let stem = stems.next().expect("one per view");
         measured.push((view.name.clone(), view.is_measured()));
         if view.is_measured() {
-            say(figures(&view.name, &m, net))?;
+            say(figures(&view.name, &m, nets))?;
             rows.push(json!({
-                "name": view.name, "psnr": m.psnr, "ssim": m.ssim, "lpips": m.lpips, "half_fit_psnr": m.half_fit_psnr,
+                "name": view.name, "psnr": m.psnr, "ssim": m.ssim, "lpips": m.lpips, "unseen_lpips": m.unseen_lpips,
+                "half_fit_psnr": m.half_fit_psnr,
             }));
         }
         if let Some(folder) = &args.save_images {
@@ -126,13 +134,15 @@ pub fn run(args: &Args) -> Result<()> {
         return Err(Usage(unmeasured.unwrap_or_default()).into());
     }
     warn(unmeasured.as_slice());
-    say(figures(&format!("mean of {}", rows.len()), &mean, net))?;
+    say(figures(&format!("mean of {}", rows.len()), &mean, nets))?;
     if let Some(path) = &args.json {
         let figures = json!({
             "scene": scene_of(&args.scene), "data": args.data,
             "splats": scene.model.splats().map(|splats| splats.len()),
             "parameters": scene.model.field().map(|field| field.len()),
-            "psnr": mean.psnr, "ssim": mean.ssim, "lpips": mean.lpips, "lpips_net": net.map(LpipsNet::name), "half_fit_psnr": mean.half_fit_psnr, "views": rows,
+            "psnr": mean.psnr, "ssim": mean.ssim, "lpips": mean.lpips, "lpips_net": nets[0].map(LpipsNet::name),
+            "unseen_lpips": mean.unseen_lpips, "unseen_lpips_net": nets[1].map(LpipsNet::name),
+            "half_fit_psnr": mean.half_fit_psnr, "views": rows,
         });
         let bytes = serde_json::to_vec_pretty(&figures)?;
         write_atomic(path, |out| out.write_all(&bytes))?;
@@ -141,9 +151,10 @@ pub fn run(args: &Args) -> Result<()> {
 }
 
 /// One line of figures.
-fn figures(name: &str, m: &Evaluation, net: Option<LpipsNet>) -> String {
+fn figures(name: &str, m: &Evaluation, nets: [Option<LpipsNet>; 2]) -> String {
     let mut line = format!("{name:<40} PSNR {:6.2} dB  SSIM {:.4}", m.psnr, m.ssim);
-    if let (Some(lpips), Some(net)) = (m.lpips, net) {
+    for (lpips, net) in [m.lpips, m.unseen_lpips].into_iter().zip(nets) {
+        let Some((lpips, net)) = lpips.zip(net) else { continue };
         line += &format!("  LPIPS ({net}) {lpips:.4}");
     }
     if let Some(psnr) = m.half_fit_psnr {

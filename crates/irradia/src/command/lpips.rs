@@ -94,15 +94,41 @@ pub fn lpips_path(given: Option<&PathBuf>) -> Result<Option<PathBuf>> {
     find(given, None)
 }
 
+/// The file of a network other than that of `first`, which only scores: VGG's if it lies where the others are searched for, since most
+/// papers on view synthesis report it, else AlexNet's. `None` if there is none, or `given` is a file.
+pub fn unseen_lpips_path(given: Option<&PathBuf>, first: Option<&PathBuf>) -> Option<PathBuf> {
+    let folder = match named(given) {
+        Some(path) if path.is_dir() => path,
+        Some(_) => return None,
+        None => data_folder()?,
+    };
+    let mut found = [LpipsNet::Vgg, LpipsNet::Alex]
+        .into_iter()
+        .filter_map(|net| within(&folder, Some(net)));
+    let path = found.find(|path| first.is_some_and(|first| first.file_name() != path.file_name()))?;
+    Some(std::path::absolute(&path).unwrap_or(path))
+}
+
+/// The network in that file, with a note of it.
+pub fn unseen_lpips(given: Option<&PathBuf>, first: &Lpips) -> Result<Option<Lpips>> {
+    let Some(path) = unseen_lpips_path(given, Some(&first.net().file_name().into())) else {
+        return Ok(None);
+    };
+    let lpips = Lpips::load(&path).context("LPIPS weights")?;
+    tell(&lpips, &path);
+    Ok(Some(lpips))
+}
+
+/// What `--lpips` or `IRRADIA_LPIPS` names.
+fn named(given: Option<&PathBuf>) -> Option<PathBuf> {
+    let variable = || std::env::var_os(VARIABLE).filter(|path| !path.is_empty());
+    given.cloned().or_else(|| variable().map(PathBuf::from))
+}
+
 /// Searches `--lpips`, `IRRADIA_LPIPS`, then the user's data directory. A path to a file is used directly; in a folder, files are
 /// found by their names, the first of [`LpipsNet::ALL`] unless a network is given.
 fn find(given: Option<&PathBuf>, net: Option<LpipsNet>) -> Result<Option<PathBuf>> {
-    let variable = || {
-        std::env::var_os(VARIABLE)
-            .filter(|path| !path.is_empty())
-            .map(PathBuf::from)
-    };
-    let named = given.cloned().or_else(variable);
+    let named = named(given);
     let missing = || match net {
         Some(net) => format!("LPIPS weights of {net} ({})", net.file_name()),
         None => "LPIPS weights".to_owned(),

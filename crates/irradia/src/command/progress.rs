@@ -131,6 +131,7 @@ impl Observer for Progress {
             Event::StageEntered { stage, .. } => self.stage.clone_from(stage),
             Event::Step(report) => self.step(report, trainer),
             Event::Evaluated { psnr, .. } => self.held_out = Some(*psnr),
+            Event::Decided { message } => self.say(message),
             Event::Warned { message } => self.say(&format!("warning: {message}")),
             Event::Finished { step, seconds, reason } => {
                 if let Some(bar) = self.bar.take() {

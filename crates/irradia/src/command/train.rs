@@ -1,6 +1,6 @@
 //! `irradia train`
 
-use super::lpips::{self, lpips_path};
+use super::lpips::{self, lpips_path, unseen_lpips_path};
 use super::progress::{Progress, size_in_words};
 use super::{DataArgs, by_option, thread_count, use_threads, warn};
 use crate::interrupt::stop_flag;
@@ -95,6 +95,7 @@ fn replay(run: &Path, args: &Args) -> Result<TrainInput> {
         input.data.clone_from(data);
     }
     input.lpips = lpips_for(input.lpips, args)?;
+    input.unseen_lpips = input.unseen_lpips.filter(|path| path.exists());
     input.overwrite = args.overwrite;
     Ok(input)
 }
@@ -108,7 +109,9 @@ fn lpips_for(kept: Option<PathBuf>, args: &Args) -> Result<Option<PathBuf>> {
 /// The input of a new run.
 fn input(args: &Args) -> Result<TrainInput> {
     let given = |path: &Option<PathBuf>| path.clone().expect("required by clap");
+    let lpips = lpips_path(args.lpips.as_ref())?;
     Ok(TrainInput {
+        unseen_lpips: unseen_lpips_path(args.lpips.as_ref(), lpips.as_ref()),
         recipe: args.recipe.clone(),
         set: args.set.clone(),
         max_splats: args.max_splats,
@@ -116,7 +119,7 @@ fn input(args: &Args) -> Result<TrainInput> {
         budget: args.budget,
         until_psnr: args.until_psnr,
         seed: args.seed,
-        lpips: lpips_path(args.lpips.as_ref())?,
+        lpips,
         reading: args.reading.reading(),
         background: args.background,
         overwrite: args.overwrite,
@@ -199,10 +202,11 @@ fn tell(finished: &Finished) -> Result<()> {
         "nothing was evaluated: there is no held-out view with pixels to measure".to_owned()
     } else {
         format!(
-            "held-out PSNR {:.2} dB, SSIM {:.4}{}{}",
+            "held-out PSNR {:.2} dB, SSIM {:.4}{}{}{}",
             report.psnr,
             report.ssim,
             in_words(report.lpips, report.lpips_net.as_deref()),
+            in_words(report.unseen_lpips, report.unseen_lpips_net.as_deref()),
             report.half_fit_psnr.map_or(String::new(), |psnr| format!(
                 ", {psnr:.2} dB on right halves after a fit on left halves"
             )),

@@ -103,6 +103,45 @@ fn a_failed_run_is_a_row_and_does_not_end_the_comparison() {
 }
 
 #[test]
+fn a_protocol_fixes_the_conditions_and_shows_published_figures() {
+    let folder = with_data();
+    fs::rename(folder.path().join("data"), folder.path().join("chair")).expect("renamed");
+    let line = "compare chair --recipes classic --seeds 1 --steps 5 --protocol blender --out both";
+    let ended = irradia(folder.path(), line).success();
+    for says in [
+        "irradia classic",
+        "3DGS",
+        "35.83",
+        "instant-ngp",
+        "not comparable",
+        "instead of 800",
+    ] {
+        assert!(ended.stdout.contains(says), "{says}: {ended:?}");
+    }
+    let both = folder.path().join("both");
+    let published = json(&both.join("compare.json"))["published"].clone();
+    assert!(
+        published[0]["scene"] == "chair" && published[0]["psnr"] == 33.0,
+        "{published}"
+    );
+    let request = fs::read_to_string(both.join("chair/classic/seed_0/request.json")).expect("a request");
+    assert!(
+        request.contains("--background") && request.contains("white"),
+        "{request}"
+    );
+
+    fs::rename(folder.path().join("chair"), folder.path().join("teapot")).expect("renamed");
+    let ended = irradia(folder.path(), &line.replace("chair", "teapot")).success();
+    assert!(ended.stdout.contains("teapot: no published figures"), "{ended:?}");
+    irradia(folder.path(), &(line.to_owned() + " --downscale 2")).refused(2, &["--protocol"]);
+    irradia(
+        folder.path(),
+        "compare teapot --recipes classic --protocol nerf --out x",
+    )
+    .refused(2, &["mipnerf360"]);
+}
+
+#[test]
 fn mistakes_are_found_before_any_training() {
     let folder = with_data();
     let cases = [

@@ -74,4 +74,19 @@ fn a_perceptual_loss_finds_the_weights_of_the_evaluation() {
     let with = irradia_with(folder.path(), &format!("{line} with"), &[&data, "--lpips", &weights]).success();
     assert!(!with.stderr.contains("warning:"), "{with:?}");
     assert!(scene(&folder.path().join("with")) != scene(&folder.path().join("without")));
+    let report = json(&folder.path().join("with/report.json"));
+    assert!(report["trained_on_lpips"] == "squeeze" && report["unseen_lpips"].is_null());
+
+    // In a folder, AlexNet is found too: the loss does not see it.
+    let weights = shared.join("lpips").display().to_string();
+    irradia_with(
+        folder.path(),
+        &format!("{line} both --overwrite"),
+        &[&data, "--lpips", &weights],
+    )
+    .success();
+    assert!(scene(&folder.path().join("both")) == scene(&folder.path().join("with")));
+    let report = json(&folder.path().join("both/report.json"));
+    assert!(report["lpips_net"] == "squeeze" && report["unseen_lpips_net"] == "alex");
+    assert!(report["unseen_lpips"].as_f64() > Some(0.0) && report["views"][0]["unseen_lpips"].as_f64() > Some(0.0));
 }

@@ -22,9 +22,20 @@ pub struct Evaluation {
     pub ssim: f64,
     /// Learned perceptual distance, 0 for equal images; `None` without weights or for images below [`LpipsNet::min_side`].
     pub lpips: Option<f64>,
+    /// The same of [`Networks::unseen`].
+    pub unseen_lpips: Option<f64>,
     /// PSNR in dB over the right half of the view, after fitting exposure or pose on its left half; `None` if not requested.
     /// [`evaluate`] returns `None`.
     pub half_fit_psnr: Option<f64>,
+}
+
+/// The networks by which LPIPS is measured.
+#[derive(Clone, Copy, Default)]
+pub struct Networks<'a> {
+    /// The network that a recipe's perceptual loss uses, if it has one.
+    pub first: Option<&'a Lpips>,
+    /// A network that training does not see: a scene trained on one network's distance is flattered by the same network.
+    pub unseen: Option<&'a Lpips>,
 }
 
 /// All metrics of `render` against `truth`, both `[H, W, 3]` and first rounded to 8 bits, as for published figures.
@@ -34,16 +45,18 @@ pub struct Evaluation {
 ///
 /// # Panics
 /// When sizes differ: a bug in the caller.
-pub fn evaluate(render: &Image, truth: &Image, mask: Option<&[u8]>, lpips: Option<&Lpips>) -> Evaluation {
+pub fn evaluate(render: &Image, truth: &Image, mask: Option<&[u8]>, networks: Networks) -> Evaluation {
     assert_same_size(render, truth, mask);
     let (mut render, truth) = (render.rounded_to_8_bits(), truth.rounded_to_8_bits());
     if let Some(mask) = mask {
         render = with_truth_where_masked(&render, &truth, mask);
     }
+    let distance = |lpips: Option<&Lpips>| lpips.and_then(|net| net.distance(&render, &truth).ok());
     Evaluation {
         psnr: psnr_masked(&render, &truth, mask),
         ssim: ssim_masked(&render, &truth, mask),
-        lpips: lpips.and_then(|net| net.distance(&render, &truth).ok()),
+        lpips: distance(networks.first),
+        unseen_lpips: distance(networks.unseen),
         half_fit_psnr: None,
     }
 }

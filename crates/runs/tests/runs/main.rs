@@ -1,5 +1,6 @@
 //! The library as a program uses it: requests, runs, observers, and scenes.
 
+mod every_recipe;
 mod requests;
 mod scenes;
 mod snapshots;
@@ -11,6 +12,7 @@ use tempfile::TempDir;
 
 /// A dataset that trains in moments.
 const SMALL: SynthOptions = SynthOptions {
+    scene: irradia_runs::synth::SceneName::Demo,
     views: 4,
     width: 24,
     height: 16,

@@ -45,7 +45,7 @@ fn the_mean_of_an_evaluation_is_that_of_its_views() {
     let mut psnr = Vec::new();
     let options = EvalOptions {
         render: scene.options,
-        metrics: Metrics::All(None),
+        metrics: Metrics::All(Default::default()),
         half_fit: HalfFit::default(),
     };
     let mean = evaluate(&scene.model, &dataset, &dataset.test, &options, |view| {

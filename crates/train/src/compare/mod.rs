@@ -5,14 +5,17 @@
 
 mod curves;
 mod page;
+mod published;
 mod table;
 
 pub use curves::{EvaluationPoint, falls, reached, rises};
 pub use page::{picture, to_html};
+pub use published::{Published, PublishedFigures, published};
 pub use table::{to_markdown, to_text};
 
 use crate::report::{Machine, Report};
 use serde::Serialize;
+use std::collections::BTreeSet;
 
 /// The results of a comparison; figures that are not finite are written as `null`.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
@@ -29,6 +32,10 @@ pub struct Comparison {
     pub scenes: Vec<Scene>,
     /// The recipes' means over scenes, in the order of [`Scene::entries`].
     pub overall: Vec<Overall>,
+    /// Published figures of the scenes, if the comparison follows their protocol.
+    pub published: Vec<Published>,
+    /// What limits the figures, one line each.
+    pub notes: Vec<String>,
 }
 
 /// One dataset.
@@ -68,6 +75,8 @@ pub struct Entry {
     pub ssim: Option<Spread>,
     /// Held-out LPIPS, if network weights are available.
     pub lpips: Option<Spread>,
+    /// Held-out LPIPS of a network that training does not see, if its weights are available.
+    pub unseen_lpips: Option<Spread>,
     /// Wall-clock seconds of the training loop.
     pub seconds: Option<Spread>,
     /// CPU seconds of the training loop.
@@ -130,6 +139,12 @@ pub struct Figures {
     pub lpips: Option<f64>,
     /// Network of LPIPS.
     pub lpips_net: Option<String>,
+    /// Perceptual distance by a network that training does not see.
+    pub unseen_lpips: Option<f64>,
+    /// That network.
+    pub unseen_lpips_net: Option<String>,
+    /// The network whose LPIPS was part of the training loss.
+    pub trained_on_lpips: Option<String>,
     /// Evaluations of held-out PSNR, including the final one.
     #[serde(rename = "looks")]
     pub evaluations: Vec<EvaluationPoint>,
@@ -176,6 +191,8 @@ pub struct Overall {
     pub ssim: f64,
     /// Likewise, if network weights are available.
     pub lpips: Option<f64>,
+    /// Likewise, by a network that training does not see.
+    pub unseen_lpips: Option<f64>,
     /// Likewise.
     pub seconds: f64,
     /// Likewise; `None` if the recipe trains fields.
@@ -213,18 +230,46 @@ pub struct Render {
 impl Comparison {
     /// Heading of LPIPS with its network, or with all networks if the runs differ.
     pub fn lpips_head(&self) -> String {
-        let entries = self.scenes.iter().flat_map(|scene| &scene.entries);
-        let figures = entries
-            .flat_map(|entry| &entry.runs)
-            .filter_map(|run| run.figures.as_ref());
-        let mut nets: Vec<&str> = figures.filter_map(|figures| figures.lpips_net.as_deref()).collect();
+        self.head_of(|figures| figures.lpips_net.as_deref())
+            .unwrap_or("LPIPS".to_owned())
+    }
+
+    /// Heading of the LPIPS of a network that training does not see; `None` if no run has one.
+    pub fn unseen_lpips_head(&self) -> Option<String> {
+        self.head_of(|figures| figures.unseen_lpips_net.as_deref())
+    }
+
+    fn head_of<'a>(&'a self, net: impl Fn(&'a Figures) -> Option<&'a str>) -> Option<String> {
+        let mut nets: Vec<&str> = all_figures(&self.scenes)
+            .filter_map(|(_, figures)| net(figures))
+            .collect();
         nets.sort_unstable();
         nets.dedup();
-        match nets[..] {
-            [] => "LPIPS".to_owned(),
-            _ => format!("LPIPS ({})", nets.join(", ")),
-        }
+        (!nets.is_empty()).then(|| format!("LPIPS ({})", nets.join(", ")))
     }
+}
+
+/// A note for each recipe that was trained on the distance by which it is scored.
+pub fn flattered(scenes: &[Scene]) -> Vec<String> {
+    let line = |(recipe, figures): (&str, &Figures)| {
+        let net = figures.trained_on_lpips.as_deref()?;
+        let other = figures.unseen_lpips_net.as_ref();
+        let other = other.map(|other| format!("; LPIPS ({other}) is not part of its loss"));
+        Some(format!(
+            "{recipe} was trained on LPIPS ({net}), which flatters that figure{}",
+            other.unwrap_or_default()
+        ))
+    };
+    let lines: BTreeSet<String> = all_figures(scenes).filter_map(line).collect();
+    lines.into_iter().collect()
+}
+
+/// The recipe and the figures of every finished run.
+fn all_figures(scenes: &[Scene]) -> impl Iterator<Item = (&str, &Figures)> {
+    scenes.iter().flat_map(|scene| &scene.entries).flat_map(|entry| {
+        let figures = entry.runs.iter().filter_map(|run| run.figures.as_ref());
+        figures.map(|figures| (entry.recipe.as_str(), figures))
+    })
 }
 
 impl Spread {
@@ -246,6 +291,16 @@ impl Spread {
 }
 
 impl Figures {
+    /// LPIPS of the network `net`, if measured.
+    fn lpips_of(&self, net: &str) -> Option<f64> {
+        let measured = [
+            (&self.lpips_net, self.lpips),
+            (&self.unseen_lpips_net, self.unseen_lpips),
+        ];
+        let found = measured.into_iter().find(|(name, _)| name.as_deref() == Some(net));
+        found.and_then(|(_, lpips)| lpips)
+    }
+
     /// From a run's report and the logged mean squared errors of the training views, in order.
     pub fn of(report: &Report, errors: &[f64]) -> Self {
         let evaluations = curves::evaluations(report);
@@ -261,6 +316,9 @@ impl Figures {
             ssim: report.ssim,
             lpips: report.lpips,
             lpips_net: report.lpips_net.clone(),
+            unseen_lpips: report.unseen_lpips,
+            unseen_lpips_net: report.unseen_lpips_net.clone(),
+            trained_on_lpips: report.trained_on_lpips.clone(),
             loss_rises: rises(&report.curve.iter().map(|point| point.loss).collect::<Vec<_>>()),
             error_rises: rises(errors),
             psnr_falls: falls(&evaluations),
@@ -312,6 +370,7 @@ impl Scene {
                     psnr: spread(&|f| Some(f.psnr)),
                     ssim: spread(&|f| Some(f.ssim)),
                     lpips: spread(&|f| f.lpips),
+                    unseen_lpips: spread(&|f| f.unseen_lpips),
                     seconds: spread(&|f| Some(f.seconds)),
                     cpu_seconds: spread(&|f| Some(f.cpu_seconds)),
                     splats: spread(&|f| f.parameters.is_none().then_some(f.splats as f64)),
@@ -364,6 +423,7 @@ pub fn overall(scenes: &[Scene]) -> Vec<Overall> {
                 psnr: mean(values(&|e| e.psnr)),
                 ssim: mean(values(&|e| e.ssim)),
                 lpips: all(values(&|e| e.lpips)),
+                unseen_lpips: all(values(&|e| e.unseen_lpips)),
                 seconds: mean(values(&|e| e.seconds)),
                 splats: all(values(&|e| e.splats)),
                 parameters: all(values(&|e| e.parameters)),

@@ -31,18 +31,22 @@
   const names = comparison.scenes.map((scene) => scene.name);
   at("title").textContent = names.length === 1 ? `Recipes on ${names[0]}` : "Recipes compared";
   at("subtitle").textContent = comparison.conditions.join(" · ");
+  for (const note of comparison.notes) at("notes").append(make("li", note));
   const { cpu, memory, os } = comparison.machine;
   at("where").textContent = [comparison.device, cpu, memory && bytes(memory), os].filter(Boolean).join(" · ");
 
   const runs = comparison.scenes.flatMap((scene) => scene.entries).flatMap((entry) => entry.runs);
   const nets = [...new Set(runs.map((run) => run.figures && run.figures.lpips_net).filter(Boolean))].sort();
   const lpips = nets.length ? `LPIPS (${nets.join(", ")})` : "LPIPS";
+  const unseenNets = [...new Set(runs.map((run) => run.figures && run.figures.unseen_lpips_net).filter(Boolean))].sort();
+  const unseen = `LPIPS (${unseenNets.join(", ")})`;
 
   // Mean and spread; the best mean of a column is bold if more than one recipe has one.
   const MEASURES = [
     ["PSNR, dB", "psnr", (x) => fixed(x, 2), 1],
     ["SSIM", "ssim", (x) => fixed(x, 4), 1],
     [lpips, "lpips", (x) => fixed(x, 4), -1],
+    [unseen, "unseen_lpips", (x) => fixed(x, 4), -1],
     ["Training, s", "seconds", (x) => fixed(x, 1), -1],
     ["CPU, s", "cpu_seconds", (x) => fixed(x, 1), -1],
     ["Splats", "splats", whole, 0],
@@ -170,12 +174,17 @@
   for (const scene of comparison.scenes) {
     const section = make("section", undefined, { class: "scene" });
     const part = (title, ...content) => section.append(make("h3", title, { class: "part" }), ...content);
+    const theirs = comparison.published.filter((p) => p.scene === scene.name);
     section.append(make("h2", scene.name), make("p", scene.data, { class: "soft" }));
     section.append(scrolled(figures(scene.entries)));
     section.append(make("p", "Mean ± sample standard deviation over seeds. Loss rises: fraction of blocks of 25 logged steps (of fewer " +
       "in short runs) whose mean training loss is above that of the previous block. Error rises: the same for the mean squared error of the " +
       "training views, which is comparable between recipes. PSNR falls: fraction of evaluations of the held-out " +
       "views with a lower PSNR than the previous one.", { class: "note" }));
+    if (theirs.length) {
+      const lines = theirs.map((p) => row([p.method, fixed(p.psnr, 2), fixed(p.ssim, 3), fixed(p.lpips_vgg, 3), p.source]));
+      part("Published figures", scrolled(table(["Method", "PSNR, dB", "SSIM", "LPIPS (vgg)", "Source"], lines)));
+    }
     if (scene.entries.some((entry) => entry.psnr)) {
       const both = make("div", undefined, { class: "two" });
       both.append(curves(scene.entries, "seconds", "Held-out PSNR over seconds of training"),

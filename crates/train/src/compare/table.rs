@@ -1,16 +1,13 @@
 //! The comparison as a plain table for a terminal and as Markdown.
 
-use super::{Comparison, Entry, Reached, Spread};
+use super::{Comparison, Entry, Reached, Spread, published};
 use crate::report::columns;
 
 fn heads(comparison: &Comparison) -> Vec<String> {
-    let lpips = comparison.lpips_head();
-    let heads: [&str; 12] = [
-        "scene",
-        "recipe",
-        "PSNR, dB",
-        "SSIM",
-        &lpips,
+    let mut heads: Vec<String> = ["scene", "recipe", "PSNR, dB", "SSIM"].map(str::to_owned).to_vec();
+    heads.push(comparison.lpips_head());
+    heads.extend(comparison.unseen_lpips_head());
+    let rest = [
         "train, s",
         "CPU, s",
         "splats",
@@ -19,7 +16,8 @@ fn heads(comparison: &Comparison) -> Vec<String> {
         "error rises",
         "runs",
     ];
-    heads.map(str::to_owned).to_vec()
+    heads.extend(rest.map(str::to_owned));
+    heads
 }
 
 /// The table with aligned columns; errors and explanations follow it.
@@ -30,6 +28,10 @@ pub fn to_text(comparison: &Comparison) -> String {
     }
     for line in errors(comparison) {
         text += &format!("failed: {line}\n");
+    }
+    text += &published::to_text(comparison);
+    for line in &comparison.notes {
+        text += &format!("note: {line}\n");
     }
     text
 }
@@ -71,9 +73,18 @@ pub fn to_markdown(comparison: &Comparison) -> String {
     for line in errors(comparison) {
         text += &format!("- failed: {}\n", escaped(&line));
     }
+    for line in &comparison.notes {
+        text += &format!("- {}\n", escaped(line));
+    }
     text += "Mean ± sample standard deviation over seeds. *Loss rises*: fraction of blocks of 25 logged steps (of fewer in \
              short runs) whose mean training loss is above that of the previous block; *error rises*: the same for the mean \
              squared error of the training views, which is comparable between recipes.\n";
+    if let Some(lines) = published::lines(comparison) {
+        text += &format!("\nBeside published figures:\n\n{}\n", markdown(&lines, 2));
+        for source in published::sources(comparison) {
+            text += &format!("- {}\n", escaped(&source));
+        }
+    }
     if let Some(lines) = marks(comparison) {
         text += &format!("\n{MARKS}:\n\n{}", markdown(&lines, 1));
     }
@@ -112,15 +123,19 @@ fn time(entry: &Entry, level: Option<&Reached>) -> String {
 
 fn rows(comparison: &Comparison) -> Vec<Vec<String>> {
     let mut rows = Vec::new();
+    let has_unseen = comparison.unseen_lpips_head().is_some();
     for scene in &comparison.scenes {
         for entry in &scene.entries {
             let done = entry.runs.iter().filter(|run| run.figures.is_some()).count();
-            rows.push(vec![
+            let mut row = vec![
                 scene.name.clone(),
                 entry.recipe.clone(),
                 number(entry.psnr, 2, 1.0),
                 number(entry.ssim, 4, 1.0),
                 number(entry.lpips, 4, 1.0),
+            ];
+            row.extend(has_unseen.then(|| number(entry.unseen_lpips, 4, 1.0)));
+            row.extend([
                 number(entry.seconds, 1, 1.0),
                 number(entry.cpu_seconds, 1, 1.0),
                 size(entry),
@@ -129,17 +144,22 @@ fn rows(comparison: &Comparison) -> Vec<Vec<String>> {
                 number(entry.error_rises, 2, 1.0),
                 format!("{done}/{}", entry.runs.len()),
             ]);
+            rows.push(row);
         }
     }
     if comparison.scenes.len() > 1 {
         for o in &comparison.overall {
             let dash = || "–".to_owned();
-            rows.push(vec![
+            let distance = |lpips: Option<f64>| lpips.map_or_else(dash, |l| format!("{l:.4}"));
+            let mut row = vec![
                 format!("mean of {}", o.scenes),
                 o.recipe.clone(),
                 format!("{:.2}", o.psnr),
                 format!("{:.4}", o.ssim),
-                o.lpips.map_or_else(dash, |l| format!("{l:.4}")),
+                distance(o.lpips),
+            ];
+            row.extend(has_unseen.then(|| distance(o.unseen_lpips)));
+            row.extend([
                 format!("{:.1}", o.seconds),
                 dash(),
                 o.parameters
@@ -149,6 +169,7 @@ fn rows(comparison: &Comparison) -> Vec<Vec<String>> {
                 dash(),
                 dash(),
             ]);
+            rows.push(row);
         }
     }
     rows

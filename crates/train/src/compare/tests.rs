@@ -50,6 +50,43 @@ fn room() -> Scene {
 }
 
 #[test]
+fn a_second_network_and_published_figures_are_shown_beside_ours() {
+    let trained = Report {
+        lpips: Some(0.1),
+        lpips_net: Some("squeeze".into()),
+        unseen_lpips: Some(0.2),
+        unseen_lpips_net: Some("vgg".into()),
+        trained_on_lpips: Some("squeeze".into()),
+        ..report(10.0, 26.0)
+    };
+    let runs = vec![("curriculum".to_owned(), vec![run(0, Some(trained))])];
+    let scenes = vec![Scene::new("chair".into(), "data/chair".into(), runs, None)];
+    let comparison = Comparison {
+        notes: flattered(&scenes),
+        published: published("blender", "chair", "chair"),
+        scenes,
+        ..Comparison::default()
+    };
+    assert_eq!(
+        comparison.notes,
+        ["curriculum was trained on LPIPS (squeeze), which flatters that figure; LPIPS (vgg) is not part of its loss"]
+    );
+    for text in [to_text(&comparison), to_markdown(&comparison)] {
+        for says in [
+            "LPIPS (squeeze)",
+            "0.2000",
+            "irradia curriculum",
+            "0.200",
+            "35.83",
+            "flatters",
+        ] {
+            assert!(text.contains(says), "{says}: {text}");
+        }
+    }
+    assert!(published("blender", "chair", "chair").len() > 3);
+}
+
+#[test]
 fn tables_name_the_network_of_lpips() {
     let with = |net: &str| Report {
         lpips: Some(0.1),

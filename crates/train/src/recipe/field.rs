@@ -65,7 +65,8 @@ impl ResidualKnobs {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum FieldSpace {
-    /// `ndc` if every view has depth bounds (LLFF captures), `bounded` if every photograph has alpha, `unbounded` otherwise.
+    /// `ndc` if all cameras face forward, towards a scene whose nearest depth is known from depth bounds or points; otherwise
+    /// `bounded` if photographs have alpha, else `unbounded`.
     #[default]
     Auto,
     /// The cube on which the cameras focus.

@@ -69,6 +69,15 @@ pub struct Report {
     /// The network of LPIPS: `squeeze`, `alex` or `vgg`.
     #[serde(default)]
     pub lpips_net: Option<String>,
+    /// LPIPS of a network that training does not see, mean over the held-out views; `None` without its weights.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub unseen_lpips: Option<f64>,
+    /// The network of that LPIPS.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub unseen_lpips_net: Option<String>,
+    /// The network whose LPIPS was part of the training loss, and so flatters this run; `None` if none was.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub trained_on_lpips: Option<String>,
     /// PSNR in dB over the right halves of the held-out views, after their exposure or pose was fitted on their left
     /// halves; `None` if the recipe trains neither.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -163,6 +172,9 @@ pub struct ViewReport {
     pub ssim: f64,
     /// Perceptual distance, if network weights are available.
     pub lpips: Option<f64>,
+    /// Perceptual distance by a network that training does not see.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub unseen_lpips: Option<f64>,
     /// PSNR in dB of the right half after a fit on the left half, if measured.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub half_fit_psnr: Option<f64>,

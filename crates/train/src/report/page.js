@@ -1,6 +1,7 @@
 (() => {
   const report = JSON.parse(document.getElementById("data").textContent);
   const lpips = report.lpips_net ? `LPIPS (${report.lpips_net})` : "LPIPS";
+  const unseen = report.unseen_lpips_net && `LPIPS (${report.unseen_lpips_net})`;
   // A field has a number of parameters instead of splats.
   const isField = known(report.parameters);
   document.title = `${report.dataset || "Report"} – Irradia`;
@@ -11,6 +12,7 @@
     ["PSNR", fixed(report.psnr, 2), "dB"],
     ["SSIM", fixed(report.ssim, 4)],
     [lpips, fixed(report.lpips, 4)],
+    ...(unseen ? [[unseen, fixed(report.unseen_lpips, 4)]] : []),
     isField ? ["Parameters", whole(report.parameters)] : ["Splats", whole(report.splats)],
     ["Steps", whole(report.steps)],
     ["First to last step", duration(report.seconds)],
@@ -23,9 +25,14 @@
     at("figures").append(box);
   }
 
-  if (report.warnings.length) {
+  const notes = [...report.warnings];
+  if (report.trained_on_lpips) {
+    const other = unseen ? `; ${unseen} is not part of its loss` : "";
+    notes.push(`this run was trained on LPIPS (${report.trained_on_lpips}), which flatters that figure${other}`);
+  }
+  if (notes.length) {
     at("warnings").hidden = false;
-    for (const line of report.warnings) at("warning-list").append(make("li", line));
+    for (const line of notes) at("warning-list").append(make("li", line));
   }
 
   // Held-out views: a selector, truth and render with a slider, the error beside them.
@@ -53,6 +60,7 @@
     ["PSNR, dB", (v) => v.psnr, (v) => fixed(v.psnr, 2)],
     ["SSIM", (v) => v.ssim, (v) => fixed(v.ssim, 4)],
     [lpips, (v) => v.lpips, (v) => fixed(v.lpips, 4)],
+    ...(unseen ? [[unseen, (v) => v.unseen_lpips, (v) => fixed(v.unseen_lpips, 4)]] : []),
   ];
   let sorted = { column: 0, up: true };
   const before = (a, b) => {
@@ -97,7 +105,9 @@
     });
     const mean = make("tr");
     mean.append(make("td", "Mean"));
-    for (const text of [fixed(report.psnr, 2), fixed(report.ssim, 4), fixed(report.lpips, 4)]) mean.append(make("td", text));
+    const means = [fixed(report.psnr, 2), fixed(report.ssim, 4), fixed(report.lpips, 4)];
+    if (unseen) means.push(fixed(report.unseen_lpips, 4));
+    for (const text of means) mean.append(make("td", text));
     const [head, foot] = [make("thead"), make("tfoot")];
     head.append(heads);
     foot.append(mean);

@@ -81,6 +81,12 @@ impl Planes {
         &mut self.data[c * self.stride..(c + 1) * self.stride]
     }
 
+    /// The first N planes at once, mutable, including padding; beyond the last plane empty slices.
+    pub fn planes_mut<const N: usize>(&mut self) -> [&mut [f32]; N] {
+        let mut planes = self.data.chunks_mut(self.stride.max(1));
+        std::array::from_fn(|_| planes.next().unwrap_or_default())
+    }
+
     /// All planes in order, `[count, stride]`.
     pub fn as_slice(&self) -> &[f32] {
         &self.data

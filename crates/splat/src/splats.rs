@@ -1,6 +1,7 @@
 use glam::{Quat, Vec3};
 use irradia_compute::Planes;
 use irradia_scene::{GaussianCloud, sh};
+use rayon::prelude::*;
 
 /// The surface element that a splat represents.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -162,7 +163,7 @@ impl Splats {
             mean: self.mean(*i as usize),
             normal: self.shortest_axis(*i as usize),
         };
-        indices.iter().map(surface).collect()
+        indices.par_iter().with_min_len(1024).map(surface).collect()
     }
 
     /// Allocated bytes.

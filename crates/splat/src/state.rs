@@ -1,4 +1,5 @@
 use crate::regularize::Regularized;
+use crate::render::CHUNK;
 use crate::{SplatGradients, Splats};
 use irradia_compute::Planes;
 use irradia_compute::adam::{Active, AdamStep, adam};
@@ -155,12 +156,15 @@ impl SplatState {
         {
             *rate = if plane < 3 { rates.sh_dc } else { rates.sh_rest };
         }
-        let active = &gradients.active[..];
-        let all: Vec<f32> = match regularized {
-            Regularized::Visible => Vec::new(),
-            Regularized::All => (0..active.len()).map(|i| f32::from(u8::from(i < self.len()))).collect(),
+        let active = if optimizer.dense {
+            Active::Dense(&gradients.active)
+        } else {
+            Active::Sparse(&gradients.active, &gradients.counts)
         };
-        let shape_active = if all.is_empty() { active } else { &all[..] };
+        let shape_active = match regularized {
+            Regularized::Visible => active,
+            Regularized::All => Active::All,
+        };
         let rules = [
             (vec![rates.means; 3], active),
             (vec![rates.quats; 4], active),
@@ -178,11 +182,6 @@ impl SplatState {
         for (((parameters, first), second), (g, (rates, active))) in
             columns.zip(gradients.splats.columns().into_iter().zip(rules))
         {
-            let active = if optimizer.dense {
-                Active::Dense(active)
-            } else {
-                Active::Sparse(active)
-            };
             adam(level, parameters, g, [first, second], &rates, active, optimizer.step);
         }
     }
@@ -198,7 +197,6 @@ impl SplatState {
         extent: impl Fn(usize) -> f32 + Sync,
     ) {
         let n = self.len();
-        let stride = self.statistics.stride();
         let screen = match what {
             Statistics::AbsoluteGradient => &gradients.gathered,
             Statistics::Gradient | Statistics::Error => &gradients.screen,
@@ -207,27 +205,33 @@ impl SplatState {
         let (error, weight) = (gradients.gathered.plane(0), gradients.gathered.plane(1));
         // Pixels to normalised device coordinates, whose range has length 2.
         let scale = [0.5 * width as f32, 0.5 * height as f32];
-        let mut planes = self.statistics.as_mut_slice().chunks_mut(stride.max(1));
-        let mut plane = || &mut planes.next().expect("a plane for each statistic")[..n];
-        let (gradient, seen, extents, errors, weights) = (plane(), plane(), plane(), plane(), plane());
-        gradient
-            .par_iter_mut()
-            .zip(seen)
-            .zip(extents)
-            .zip(errors.par_iter_mut().zip(weights))
-            .with_min_len(4096)
-            .enumerate()
-            .filter(|(i, _)| gradients.active[*i] != 0.0)
-            .for_each(|(i, (((gradient, seen), largest), (errors, weights)))| {
-                let (gx, gy) = (x[i] * scale[0], y[i] * scale[1]);
-                *gradient += (gx * gx + gy * gy).sqrt();
-                *seen += 1.0;
-                *largest = largest.max(extent(i));
-                if what == Statistics::Error {
-                    *errors += error[i];
-                    *weights += weight[i];
+        let planes = self.statistics.planes_mut::<{ Self::STATISTICS }>();
+        let [gradient, seen, extents, errors, weights] = planes.map(|plane| &mut plane[..n]);
+        let chunks = gradient
+            .par_chunks_mut(CHUNK)
+            .zip(seen.par_chunks_mut(CHUNK))
+            .zip(extents.par_chunks_mut(CHUNK))
+            .zip(errors.par_chunks_mut(CHUNK).zip(weights.par_chunks_mut(CHUNK)))
+            .zip(&gradients.counts)
+            .enumerate();
+        chunks.filter(|(_, (_, active))| **active > 0).for_each(
+            |(chunk, ((((gradient, seen), extents), (errors, weights)), _))| {
+                for at in 0..gradient.len() {
+                    let i = chunk * CHUNK + at;
+                    if gradients.active[i] == 0.0 {
+                        continue;
+                    }
+                    let (gx, gy) = (x[i] * scale[0], y[i] * scale[1]);
+                    gradient[at] += (gx * gx + gy * gy).sqrt();
+                    seen[at] += 1.0;
+                    extents[at] = extents[at].max(extent(i));
+                    if what == Statistics::Error {
+                        errors[at] += error[i];
+                        weights[at] += weight[i];
+                    }
                 }
-            });
+            },
+        );
     }
 }
 

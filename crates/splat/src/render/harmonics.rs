@@ -10,7 +10,7 @@ use irradia_compute::simd::{Lanes, Simd};
 use irradia_scene::sh::coefficients;
 
 /// Splats per task of projection: a multiple of every vector length, and small enough for the buffers to stay in cache.
-pub(super) const CHUNK: usize = 512;
+pub const CHUNK: usize = irradia_compute::adam::RUN;
 
 /// A chunk's harmonics.
 pub(super) struct Harmonics {

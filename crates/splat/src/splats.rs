@@ -136,10 +136,15 @@ impl Splats {
         }
     }
 
-    /// Appends `other`.
-    pub fn append(&mut self, other: &Self) {
-        for (to, from) in self.columns_mut().into_iter().zip(other.columns()) {
-            to.append(from);
+    /// A copy, made by all threads.
+    pub fn copied(&self) -> Self {
+        let [means, quats, log_scales, opacity_logits, sh] = self.columns().map(Planes::copied);
+        Self {
+            means,
+            quats,
+            log_scales,
+            opacity_logits,
+            sh,
         }
     }
 

@@ -6,7 +6,7 @@
 use crate::machine::{self, Limits};
 use crate::time;
 use anyhow::Result;
-use cpu_time::ProcessTime;
+use cpu_time::{ProcessTime, ThreadTime};
 use glam::{Quat, Vec3};
 use irradia_compute::adam::AdamStep;
 use irradia_scene::{Camera, Dataset, GaussianCloud, Intrinsics, Photo, PointCloud, Pose, Rng, View, sh};
@@ -15,7 +15,8 @@ use irradia_splat::regularize::{Regularized, Regularizers};
 use irradia_splat::{
     Engine, Gather, Optimizer, OutputGradient, Rates, RenderOptions, SplatState, Splats, Statistics, Update, ViewParams,
 };
-use irradia_train::{Recipe, TrainOptions, Trainer, checkpoint};
+use irradia_train::checkpoint::Checkpoint;
+use irradia_train::{Recipe, TrainOptions, Trainer};
 use std::sync::Arc;
 use std::time::Instant;
 
@@ -82,7 +83,10 @@ fn measure(number: usize, limits: &Limits) -> Result<()> {
     let (step, cpu) = time(repeats, || {
         trainer.step(&mut Vec::new()).expect("photographs in memory");
     });
-    println!(" a training step at 1280 x 720: {step:.1} ms wall, {cpu:.1} ms CPU");
+    println!(
+        " a training step at 1280 x 720: {step:.1} ms wall, {cpu:.1} ms CPU, {:.2} % of it serial",
+        serial(&mut trainer, repeats)
+    );
     let bytes = machine::resident();
     println!(
         " resident {:.2} GB, at most {:.2}",
@@ -92,6 +96,16 @@ fn measure(number: usize, limits: &Limits) -> Result<()> {
     save(&trainer, state_bytes)?;
     density(&mut trainer.engine, state_bytes, step, limits);
     Ok(())
+}
+
+/// Amdahl's serial share of a training step, percent: parallel work runs on the threads of the pool, so that the CPU time of this
+/// thread is that of everything else.
+fn serial(trainer: &mut Trainer, repeats: u32) -> f64 {
+    let (alone, all) = (ThreadTime::now(), ProcessTime::now());
+    for _ in 0..repeats {
+        trainer.step(&mut Vec::new()).expect("photographs in memory");
+    }
+    100.0 * alone.elapsed().as_secs_f64() / all.elapsed().as_secs_f64()
 }
 
 /// Forward, backward and update with all splats in view.
@@ -226,16 +240,16 @@ fn save(trainer: &Trainer, state_bytes: f64) -> Result<()> {
     let path = folder.path().join("checkpoint");
     let before = machine::resident()[0];
     machine::reset_peak();
-    let (written, (wall, cpu)) = once(|| {
-        let bytes = checkpoint::to_bytes(trainer);
-        irradia_formats::write_atomic(&path, |out| out.write_all(&bytes))
-    });
+    let (written, (wall, cpu)) =
+        once(|| irradia_formats::write_atomic(&path, |out| Checkpoint::of(trainer).write(out)));
     written?;
     println!(
         " checkpoint: {wall:.0} ms wall, {cpu:.0} ms CPU, {:.0} MB/s; {:.2} times the state's memory in addition",
         state_bytes / wall / 1e3,
         machine::resident()[1].saturating_sub(before) as f64 / state_bytes
     );
+    let (_, (wall, cpu)) = once(|| Checkpoint::of(trainer).copied());
+    println!(" copy for a checkpoint in the background: {wall:.0} ms wall, {cpu:.0} ms CPU");
     Ok(())
 }
 

@@ -25,6 +25,21 @@ where
     }
 }
 
+/// How many splats ahead geometry is fetched.
+const AHEAD: usize = 64;
+
+/// Fetches what [`load_geometry`] will read.
+#[inline(always)]
+fn prefetch_geometry<S: Simd>(simd: S, splats: &Splats, at: usize) {
+    let at = at.min(splats.stride() - 1);
+    let [means, quats, log_scales, opacity_logits, _] = splats.columns();
+    for column in [means, quats, log_scales, opacity_logits] {
+        for c in 0..column.count() {
+            simd.prefetch(&column.plane(c)[at]);
+        }
+    }
+}
+
 /// The filter's variances from splat `at` on, if there is a filter.
 #[inline(always)]
 fn load_filter<S: Simd>(simd: S, filter: &[f32], at: usize) -> Option<S::F>
@@ -97,6 +112,7 @@ impl ProjectPart<'_, '_> {
         job.depth_keys.fill(u32::MAX);
         for at in (0..job.footprints.len()).step_by(S::LANES) {
             let first = base + at;
+            prefetch_geometry(simd, self.splats, first + AHEAD);
             let geometry = load_geometry(simd, self.splats, first);
             let filter = load_filter(simd, self.filter, first);
             let (footprint, visible) = project(&view, &geometry, filter, self.options.antialias);

@@ -7,6 +7,7 @@ mod bin;
 mod blend;
 mod chunk;
 mod cull;
+mod develop;
 mod harmonics;
 mod project;
 mod sh;
@@ -23,9 +24,10 @@ pub use project::{ALPHA_MIN, DILATION};
 pub use view::ViewParams;
 
 use crate::Splats;
-use bin::{BAND_BLOCKS, BLOCK_HEIGHT, BLOCK_WIDTH, Bins, Part, TILE};
+use bin::{Bins, Part, TILE};
 use blend::{BLOCK, BlendTile, BlendTileVjp, CHANNELS, Footprint2d, SUMS, TILE_PIXELS, gather};
 use chunk::{ChunkJob, ChunkOutcome, GradientRun, ProjectChunkVjp, ProjectPart};
+use develop::{Content, DevelopLine, GatherTile, Tiles};
 use irradia_compute::Planes;
 use irradia_compute::simd::Level;
 use rayon::prelude::*;
@@ -434,35 +436,34 @@ impl Renderer {
         self.color.resize(3 * pixels, 0.0);
         self.alpha.resize(pixels, 0.0);
         self.depth.resize(if options.depth { pixels } else { 0 }, 0.0);
-        let tiles = &self.tiles;
-        // The eight pixels of a channel in row y starting at column x, a multiple of eight.
-        let run = |channel: usize, y: usize, x: usize| {
-            let tile = (y / TILE) * bins.tiles_x + x / TILE;
-            let at = (tile * CHANNELS + channel) * TILE_PIXELS + pixel_in_tile(x % TILE, y % TILE);
-            &tiles[at..at + BLOCK_WIDTH]
+        let tiles = Tiles {
+            values: &self.tiles,
+            tiles_x: bins.tiles_x,
         };
         self.color.par_chunks_mut(width).enumerate().for_each(|(line, to)| {
             let (channel, y) = (line / height, line % height);
-            let background = options.background[channel];
-            for (i, to) in to.chunks_mut(BLOCK_WIDTH).enumerate() {
-                let (color, t) = (run(channel, y, i * BLOCK_WIDTH), run(CHANNELS - 1, y, i * BLOCK_WIDTH));
-                for ((to, color), t) in to.iter_mut().zip(color).zip(t) {
-                    *to = color + t.abs() * background;
-                }
-            }
+            level.run(DevelopLine {
+                tiles,
+                y,
+                content: Content::Color(channel, options.background[channel]),
+                to,
+            });
         });
         self.alpha.par_chunks_mut(width).enumerate().for_each(|(y, to)| {
-            for (i, to) in to.chunks_mut(BLOCK_WIDTH).enumerate() {
-                for (to, t) in to.iter_mut().zip(run(CHANNELS - 1, y, i * BLOCK_WIDTH)) {
-                    *to = 1.0 - t.abs();
-                }
-            }
+            level.run(DevelopLine {
+                tiles,
+                y,
+                content: Content::Alpha,
+                to,
+            });
         });
         self.depth.par_chunks_mut(width).enumerate().for_each(|(y, to)| {
-            for (i, to) in to.chunks_mut(BLOCK_WIDTH).enumerate() {
-                let len = to.len();
-                to.copy_from_slice(&run(3, y, i * BLOCK_WIDTH)[..len]);
-            }
+            level.run(DevelopLine {
+                tiles,
+                y,
+                content: Content::Depth,
+                to,
+            });
         });
     }
 
@@ -506,10 +507,10 @@ impl Renderer {
             })
             .collect();
         let background = self.options.background;
-        let (gather, error) = match v_out.gather {
-            Gather::Nothing => (gather::NOTHING, None),
-            Gather::Absolute => (gather::ABSOLUTE, None),
-            Gather::Error(error) => (gather::ERROR, Some(error)),
+        let gather = match v_out.gather {
+            Gather::Nothing => gather::NOTHING,
+            Gather::Absolute => gather::ABSOLUTE,
+            Gather::Error(_) => gather::ERROR,
         };
         self.tiles
             .as_chunks::<{ CHANNELS * TILE_PIXELS }>()
@@ -520,47 +521,15 @@ impl Renderer {
             .for_each(|(tile, (state, sums))| {
                 let mut v_tile = [0.0f32; CHANNELS * TILE_PIXELS];
                 let mut rest = [0.0f32; TILE_PIXELS];
-                let (x0, y0) = ((tile % bins.tiles_x) * TILE, (tile / bins.tiles_x) * TILE);
-                let columns = TILE.min(width - x0);
-                for row in 0..TILE.min(height - y0) {
-                    let image = (y0 + row) * width + x0;
-                    for column in (0..columns).step_by(BLOCK_WIDTH) {
-                        let (at, from) = (pixel_in_tile(column, row), image + column);
-                        let v = |plane: &[f32], offset: usize| run_of(&plane[offset..], columns - column);
-                        let state_at = |channel: usize| -> &[f32; BLOCK_WIDTH] {
-                            state[channel * TILE_PIXELS + at..].first_chunk().expect("a run")
-                        };
-                        let t = state_at(CHANNELS - 1).map(f32::abs);
-                        let mut total = [0.0f32; BLOCK_WIDTH];
-                        let mut put = |channel: usize, v: [f32; BLOCK_WIDTH]| {
-                            v_tile[channel * TILE_PIXELS + at..][..BLOCK_WIDTH].copy_from_slice(&v);
-                        };
-                        for c in 0..3 {
-                            let (v, color) = (v(v_out.color, c * width * height + from), state_at(c));
-                            for i in 0..BLOCK_WIDTH {
-                                total[i] += (color[i] + t[i] * background[c]) * v[i];
-                            }
-                            put(c, v);
-                        }
-                        if let Some(v_depth) = v_out.depth {
-                            let (v, depth) = (v(v_depth, from), state_at(3));
-                            for i in 0..BLOCK_WIDTH {
-                                total[i] += depth[i] * v[i];
-                            }
-                            put(3, v);
-                        }
-                        if let Some(error) = error {
-                            put(4, v(error, from));
-                        }
-                        if let Some(v_alpha) = v_out.alpha {
-                            let v = v(v_alpha, from);
-                            for i in 0..BLOCK_WIDTH {
-                                total[i] -= t[i] * v[i];
-                            }
-                        }
-                        rest[at..at + BLOCK_WIDTH].copy_from_slice(&total);
-                    }
-                }
+                level.run(GatherTile {
+                    state,
+                    v_out,
+                    background,
+                    size: [width, height],
+                    corner: [(tile % bins.tiles_x) * TILE, (tile / bins.tiles_x) * TILE],
+                    v_tile: &mut v_tile,
+                    rest: &mut rest,
+                });
                 level.run(BlendTileVjp {
                     footprints,
                     entries: bins.tile(tile),
@@ -620,22 +589,6 @@ impl Renderer {
 
 /// Parts of a frame's projection for each thread: more balance better, and cost a count for every tile.
 const PARTS_PER_THREAD: usize = 4;
-
-/// The first eight of `values`, with zeros from index `len` on.
-#[inline(always)]
-fn run_of(values: &[f32], len: usize) -> [f32; BLOCK_WIDTH] {
-    match values.first_chunk() {
-        Some(whole) if len >= BLOCK_WIDTH => *whole,
-        _ => std::array::from_fn(|i| if i < len { values[i] } else { 0.0 }),
-    }
-}
-
-/// Index of pixel (x, y) of a tile in its block-wise order.
-#[inline(always)]
-fn pixel_in_tile(x: usize, y: usize) -> usize {
-    let block = (x / BLOCK_WIDTH) * BAND_BLOCKS + y / BLOCK_HEIGHT;
-    block * BLOCK + (y % BLOCK_HEIGHT) * BLOCK_WIDTH + x % BLOCK_WIDTH
-}
 
 fn corner(bins: &Bins, tile: usize) -> [f32; 2] {
     [

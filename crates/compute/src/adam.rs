@@ -17,20 +17,28 @@ pub struct AdamStep {
     pub step: u64,
 }
 
+/// Items whose activity is counted together.
+pub const RUN: usize = 512;
+/// Runs of a parallel task.
+const TASK: usize = 32 * RUN;
+
 /// Which items have a gradient in this step, and what the step does to the others. The flags (length: the stride) are not 0
 /// where an item has one; elsewhere the gradient is not read.
 #[derive(Clone, Copy, Debug)]
 pub enum Active<'a> {
-    /// The others keep parameters and moments.
-    Sparse(&'a [f32]),
+    /// The others keep parameters and moments. Also the number of items with a gradient in each [`RUN`]: runs without any are
+    /// skipped whole.
+    Sparse(&'a [f32], &'a [u32]),
     /// The others have a gradient of zero: their moments decay and move them, as in the paper and in 3DGS.
     Dense(&'a [f32]),
+    /// All items have one.
+    All,
 }
 
 /// One step on every plane.
 ///
 /// `parameters`, `gradients` and both `moments` have the same shape; `rates[c]` is plane `c`'s learning rate, and a plane whose
-/// rate is 0 rests with its moments. Planes run in parallel; the result does not depend on how.
+/// rate is 0 rests with its moments. Pieces of planes run in parallel; the result does not depend on how.
 ///
 /// # Panics
 /// When shapes differ.
@@ -43,20 +51,21 @@ pub fn adam(
     active: Active,
     step: AdamStep,
 ) {
-    let (flags, dense) = match active {
-        Active::Sparse(flags) => (flags, false),
-        Active::Dense(flags) => (flags, true),
-    };
     let [first, second] = moments;
-    let (count, stride) = (parameters.count(), parameters.stride());
+    let (count, len, stride) = (parameters.count(), parameters.len(), parameters.stride());
     let shape = |p: &Planes| (p.count(), p.stride());
     assert!(
         [shape(gradients), shape(first), shape(second)] == [(count, stride); 3],
         "same shapes"
     );
+    let complete = match active {
+        Active::Sparse(flags, counts) => flags.len() == stride && counts.len() == stride.div_ceil(RUN),
+        Active::Dense(flags) => flags.len() == stride,
+        Active::All => true,
+    };
     assert!(
-        rates.len() == count && flags.len() == stride,
-        "a rate a plane, a flag an item"
+        rates.len() == count && complete,
+        "a rate a plane, a flag an item, a count a run"
     );
     if stride == 0 {
         return;
@@ -69,17 +78,26 @@ pub fn adam(
         .zip(second.as_mut_slice().par_chunks_mut(stride))
         .zip(rates)
         .filter(|(_, rate)| **rate != 0.0)
-        .for_each(|((((parameter, gradient), first), second), rate)| {
-            level.run(AdamPlane {
-                parameter,
-                gradient,
-                first,
-                second,
-                flags,
-                dense,
-                rate: *rate,
-                step,
-            });
+        .for_each(|((((parameters, gradients), first), second), rate)| {
+            parameters
+                .par_chunks_mut(TASK)
+                .zip(gradients.par_chunks(TASK))
+                .zip(first.par_chunks_mut(TASK))
+                .zip(second.par_chunks_mut(TASK))
+                .enumerate()
+                .for_each(|(task, (((parameter, gradient), first), second))| {
+                    level.run(AdamPiece {
+                        parameter,
+                        gradient,
+                        first,
+                        second,
+                        from: task * TASK,
+                        len,
+                        active,
+                        rate: *rate,
+                        step,
+                    });
+                });
         });
 }
 
@@ -124,18 +142,21 @@ impl<L: Lanes<Scalar = f32>> AdamRule<L> {
 /// slow at. The largest move that is lost is 1e-15 of a rate.
 const FAINTEST_MOMENT: f64 = 1e-30;
 
-struct AdamPlane<'a> {
+struct AdamPiece<'a> {
     parameter: &'a mut [f32],
     gradient: &'a [f32],
     first: &'a mut [f32],
     second: &'a mut [f32],
-    flags: &'a [f32],
-    dense: bool,
+    /// The piece's first item, a multiple of [`RUN`].
+    from: usize,
+    /// Number of items of the plane.
+    len: usize,
+    active: Active<'a>,
     rate: f32,
     step: AdamStep,
 }
 
-impl Kernel for AdamPlane<'_> {
+impl Kernel for AdamPiece<'_> {
     type Output = ();
 
     #[inline(always)]
@@ -145,26 +166,41 @@ impl Kernel for AdamPlane<'_> {
     {
         let rule = AdamRule::new(simd, &self.step, self.rate);
         let (zero, faintest) = (simd.splat(0.0), simd.splat(FAINTEST_MOMENT));
-        for at in (0..self.parameter.len()).step_by(S::LANES) {
-            let on = zero.lt(simd.load(&self.flags[at..]));
-            if on.none() && !self.dense {
+        let dense = matches!(self.active, Active::Dense(_));
+        for run in (0..self.parameter.len()).step_by(RUN) {
+            if let Active::Sparse(_, counts) = self.active
+                && counts[(self.from + run) / RUN] == 0
+            {
                 continue;
             }
-            let g = simd.load(&self.gradient[at..]).masked(on);
-            let m_old = simd.load(&self.first[at..]);
-            let v_old = simd.load(&self.second[at..]);
-            let p_old = simd.load(&self.parameter[at..]);
-            let [mut p, mut m, mut v] = rule.step(g, p_old, m_old, v_old);
-            if self.dense {
-                m = m.masked(faintest.lt(m.abs()));
-            } else {
-                m = m.select(on, m_old);
-                v = v.select(on, v_old);
-                p = p.select(on, p_old);
+            for at in (run..self.parameter.len().min(run + RUN)).step_by(S::LANES) {
+                let item = self.from + at;
+                let on = match self.active {
+                    Active::Sparse(flags, _) | Active::Dense(flags) => zero.lt(simd.load(&flags[item..])),
+                    Active::All => {
+                        let left = self.len.saturating_sub(item).min(S::LANES);
+                        simd.lanes(|i| i as f32).lt(simd.set(left as f32))
+                    }
+                };
+                if on.none() && !dense {
+                    continue;
+                }
+                let g = simd.load(&self.gradient[at..]).masked(on);
+                let m_old = simd.load(&self.first[at..]);
+                let v_old = simd.load(&self.second[at..]);
+                let p_old = simd.load(&self.parameter[at..]);
+                let [mut p, mut m, mut v] = rule.step(g, p_old, m_old, v_old);
+                if dense {
+                    m = m.masked(faintest.lt(m.abs()));
+                } else {
+                    m = m.select(on, m_old);
+                    v = v.select(on, v_old);
+                    p = p.select(on, p_old);
+                }
+                m.store(&mut self.first[at..]);
+                v.store(&mut self.second[at..]);
+                p.store(&mut self.parameter[at..]);
             }
-            m.store(&mut self.first[at..]);
-            v.store(&mut self.second[at..]);
-            p.store(&mut self.parameter[at..]);
         }
     }
 }
@@ -192,8 +228,9 @@ mod tests {
 
     /// Items come and go, each at its own pace, and have no gradient worth reading while they are away; some never come.
     fn agrees_with_the_paper(dense: bool) {
-        let (n, rate, steps) = (37, 0.01, 12);
-        let present = |i: usize, t: u64| i % 5 != 4 && (t + i as u64).is_multiple_of(1 + i as u64 % 4);
+        let (n, rate, steps) = (3 * RUN + 37, 0.01, 12);
+        // The items of the second run never come.
+        let present = |i: usize, t: u64| i / RUN != 1 && i % 5 != 4 && (t + i as u64).is_multiple_of(1 + i as u64 % 4);
         for level in Level::all() {
             let mut p = Planes::zeros(2, n);
             let (mut m, mut v) = (Planes::zeros(2, n), Planes::zeros(2, n));
@@ -204,8 +241,12 @@ mod tests {
                 let active: Vec<f32> = (0..p.stride())
                     .map(|i| f32::from(u8::from(i < n && present(i, t))))
                     .collect();
+                let counts: Vec<u32> = active
+                    .chunks(RUN)
+                    .map(|run| run.iter().filter(|flag| **flag != 0.0).count() as u32)
+                    .collect();
                 for i in 0..n {
-                    let gradient = (i as f32 - 10.5) * 0.1 + t as f32 * 0.03;
+                    let gradient = ((i % 37) as f32 - 10.5) * 0.1 + t as f32 * 0.03;
                     if present(i, t) {
                         g.set(1, i, gradient);
                         expected[i].step(f64::from(gradient), rate, t);
@@ -223,7 +264,7 @@ mod tests {
                 let active = if dense {
                     Active::Dense(&active)
                 } else {
-                    Active::Sparse(&active)
+                    Active::Sparse(&active, &counts)
                 };
                 adam(level, &mut p, &g, [&mut m, &mut v], &rates, active, step);
             }

@@ -1,5 +1,21 @@
 //! Planar arrays: one contiguous run per component.
 
+use rayon::prelude::*;
+
+/// Values of a parallel task.
+const PIECE: usize = 1 << 14;
+
+/// Sets `to[k]` to `value(order[k])`.
+fn collect(to: &mut [f32], order: &[u32], value: impl Fn(usize) -> f32 + Sync) {
+    to.par_chunks_mut(PIECE)
+        .zip(order.par_chunks(PIECE))
+        .for_each(|(to, order)| {
+            for (to, i) in to.iter_mut().zip(order) {
+                *to = value(*i as usize);
+            }
+        });
+}
+
 /// Components ("planes") of `len` items each, planar: `[planes, stride]` with `stride >= len` a multiple of
 /// [`Planes::ALIGN`], so that every plane can be read in whole vectors. Values past `len` are padding, initially zero.
 ///
@@ -81,6 +97,12 @@ impl Planes {
         &mut self.data[c * self.stride..(c + 1) * self.stride]
     }
 
+    /// The first N planes at once, mutable, including padding; beyond the last plane empty slices.
+    pub fn planes_mut<const N: usize>(&mut self) -> [&mut [f32]; N] {
+        let mut planes = self.data.chunks_mut(self.stride.max(1));
+        std::array::from_fn(|_| planes.next().unwrap_or_default())
+    }
+
     /// All planes in order, `[count, stride]`.
     pub fn as_slice(&self) -> &[f32] {
         &self.data
@@ -103,36 +125,83 @@ impl Planes {
         self.data[c * self.stride + i] = value;
     }
 
-    /// Gathers the items `indices`, in that order: for pruning, sorting and cloning.
+    /// Gathers the items `indices`, in that order: for cloning, and for what is edited apart from the rest.
     pub fn gather(&self, indices: &[u32]) -> Self {
         let mut out = Self::zeros(self.count, indices.len());
         for c in 0..self.count {
-            let from = self.plane(c);
-            for (to, i) in out.plane_mut(c).iter_mut().zip(indices) {
-                *to = from[*i as usize];
-            }
+            collect(&mut out.plane_mut(c)[..indices.len()], indices, |i| self.plane(c)[i]);
         }
         out
     }
 
-    /// Appends the items of `other`.
+    /// Replaces the items by `order`, in place, with a single plane of working memory in `scratch`: for pruning, sorting and
+    /// growing. Indices from [`Planes::len`] on count through the items of `added`, one after the other; beyond the last, an item
+    /// is zero.
     ///
     /// # Panics
     /// When the number of planes differs.
-    pub fn append(&mut self, other: &Self) {
-        assert_eq!(self.count, other.count, "same components");
-        let mut out = Self::zeros(self.count, self.len + other.len);
-        for c in 0..self.count {
-            let to = out.plane_mut(c);
-            to[..self.len].copy_from_slice(&self.plane(c)[..self.len]);
-            to[self.len..self.len + other.len].copy_from_slice(&other.plane(c)[..other.len]);
+    pub fn rearrange(&mut self, order: &[u32], added: &[&Self], scratch: &mut Vec<f32>) {
+        assert!(added.iter().all(|other| other.count == self.count), "same components");
+        let (old, new) = (self.stride, order.len().next_multiple_of(Self::ALIGN));
+        if new > old {
+            // Exact, since half of the state in reserve would cost more than a later move.
+            self.data.reserve_exact(self.count * (new - old));
+            self.data.resize(self.count * new, 0.0);
         }
-        *self = out;
+        scratch.resize(order.len(), 0.0);
+        for step in 0..self.count {
+            // A plane moves up or down in memory: the order in which none is overwritten before its turn.
+            let c = if new > old { self.count - 1 - step } else { step };
+            let plane = &self.data[c * old..][..self.len];
+            let value = |i: usize| {
+                let mut i = i;
+                if let Some(value) = plane.get(i) {
+                    return *value;
+                }
+                i -= plane.len();
+                for other in added {
+                    if i < other.len {
+                        return other.data[c * other.stride + i];
+                    }
+                    i -= other.len;
+                }
+                0.0
+            };
+            collect(scratch, order, value);
+            let to = &mut self.data[c * new..(c + 1) * new];
+            let (to, padding) = to.split_at_mut(order.len());
+            to.par_chunks_mut(PIECE)
+                .zip(scratch.par_chunks(PIECE))
+                .for_each(|(to, from)| to.copy_from_slice(from));
+            padding.fill(0.0);
+        }
+        self.data.truncate(self.count * new);
+        (self.len, self.stride) = (order.len(), new);
+    }
+
+    /// Becomes `len` items of zeros.
+    pub fn reset(&mut self, len: usize) {
+        self.reshape(self.count, len);
+        self.clear();
+    }
+
+    /// A copy, made by all threads.
+    pub fn copied(&self) -> Self {
+        let mut data = vec![0.0; self.data.len()];
+        data.par_chunks_mut(PIECE)
+            .zip(self.data.par_chunks(PIECE))
+            .for_each(|(to, from)| to.copy_from_slice(from));
+        Self {
+            data,
+            count: self.count,
+            len: self.len,
+            stride: self.stride,
+        }
     }
 
     /// Sets all values to zero, including padding.
     pub fn clear(&mut self) {
-        self.data.fill(0.0);
+        self.data.par_chunks_mut(PIECE).for_each(|piece| piece.fill(0.0));
     }
 
     /// Changes the shape, leaving values unspecified; reuses memory where possible.
@@ -155,9 +224,9 @@ mod tests {
     use super::*;
 
     #[test]
-    fn gather_and_append_match_interleaved_arrays() {
+    fn gathered_items_match_interleaved_arrays() {
         let values: Vec<f32> = (0..51).map(|v| v as f32).collect();
-        let mut planes = Planes::from_interleaved(3, &values);
+        let planes = Planes::from_interleaved(3, &values);
         assert_eq!(
             (planes.len(), planes.stride(), planes.to_interleaved()),
             (17, 32, values)
@@ -167,8 +236,40 @@ mod tests {
             picked.to_interleaved(),
             [48.0, 49.0, 50.0, 0.0, 1.0, 2.0, 9.0, 10.0, 11.0]
         );
-        planes.append(&picked);
-        assert_eq!((planes.len(), planes.get(1, 17), planes.get(2, 19)), (20, 49.0, 11.0));
-        assert!(planes.plane(0)[20..].iter().all(|v| *v == 0.0), "padding stays zero");
+    }
+
+    /// Shrinking, keeping and growing, over several pieces, against one item at a time; with 1 and with 2 threads.
+    #[test]
+    fn rearranging_in_place_gives_what_item_by_item_gives_with_any_number_of_threads() {
+        let n = 2 * PIECE + 40;
+        let items = |from: usize, n: usize| -> Vec<f32> { (from..from + 2 * n).map(|v| v as f32).collect() };
+        let added = [3, PIECE + 9].map(|n| Planes::from_interleaved(2, &items(1_000_000, n)));
+        let total = n + added[0].len() + added[1].len();
+        for (len, step) in [(n / 3, 2), (n, 7), (total + 5, 11), (0, 1)] {
+            // Every kind of index, out of order, with gaps and repetitions; some beyond the last item.
+            let order: Vec<u32> = (0..len).map(|i| (i * step % (total + 3)) as u32).collect();
+            let all = [
+                items(0, n),
+                added[0].to_interleaved(),
+                added[1].to_interleaved(),
+                vec![0.0; 8],
+            ]
+            .concat();
+            let expected: Vec<f32> = order
+                .iter()
+                .flat_map(|i| all[2 * *i as usize..][..2].to_vec())
+                .collect();
+            for threads in [1, 2] {
+                let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+                let mut planes = Planes::from_interleaved(2, &items(0, n));
+                pool.install(|| planes.rearrange(&order, &[&added[0], &added[1]], &mut Vec::new()));
+                assert_eq!(
+                    planes,
+                    Planes::from_interleaved(2, &expected),
+                    "{len}, {threads} threads"
+                );
+                assert_eq!(planes.copied(), planes);
+            }
+        }
     }
 }

@@ -6,6 +6,7 @@ use crate::{RunError, TrainInput};
 use glam::{Quat, Vec3};
 use irradia_formats::write_atomic;
 use irradia_scene::{Camera, Dataset, Intrinsics, Pose};
+use irradia_train::checkpoint::Checkpoint;
 use irradia_train::paces::Paces;
 use irradia_train::{Trainer, socket};
 use serde::{Deserialize, Serialize};
@@ -292,10 +293,11 @@ impl RunFolder {
         Ok(found)
     }
 
-    /// Writes the checkpoint of `step` and removes older ones; returns its path relative to the run.
-    pub(crate) fn write_checkpoint(&self, step: u64, bytes: &[u8]) -> Result<String, RunError> {
+    /// Writes a checkpoint and removes older ones; returns its path relative to the run.
+    pub(crate) fn write_checkpoint(&self, checkpoint: &Checkpoint) -> Result<String, RunError> {
+        let step = checkpoint.step;
         let name = format!("checkpoints/step_{step}.safetensors");
-        self.write(&name, bytes)?;
+        write_atomic(&self.file(&name), |out| checkpoint.write(out))?;
         for (_, old) in self.checkpoints()?.into_iter().filter(|(s, _)| *s < step) {
             fs::remove_file(&old).map_err(RunError::io("remove", &old))?;
         }

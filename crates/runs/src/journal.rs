@@ -1,11 +1,13 @@
 //! The files that a run writes while training: `events.jsonl`, paces, checkpoints, and the curves for its report.
 
 use crate::folder::PACES;
+use crate::saver::Saver;
 use crate::{RunError, RunFolder};
+use irradia_train::Trainer;
+use irradia_train::checkpoint::Checkpoint;
 use irradia_train::event::{Event, Observer, Signal};
 use irradia_train::paces::Paces;
 use irradia_train::report::{CurvePoint, StageReport};
-use irradia_train::{Trainer, checkpoint};
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, Write};
 use std::path::Path;
@@ -29,6 +31,7 @@ pub struct Journal {
     paces: File,
     /// The last pace written.
     pace: Option<f64>,
+    saver: Saver,
     failed: bool,
     /// The warning for [`Observer::warning`].
     warning: Option<String>,
@@ -69,6 +72,7 @@ impl Journal {
             non_finite: 0,
             paces: kept_paces(folder, from)?,
             pace: None,
+            saver: Saver::default(),
             failed: false,
             warning: None,
         };
@@ -174,6 +178,26 @@ impl Journal {
         }
     }
 
+    /// Writes a checkpoint, and returns when it is complete.
+    ///
+    /// # Errors
+    /// One line.
+    pub fn save_now(&mut self, trainer: &Trainer) -> Result<(), RunError> {
+        let saved = self.saver.save_now(&self.folder, &Checkpoint::of(trainer));
+        saved.map(drop).map_err(RunError::NotSaved)
+    }
+
+    /// Returns when the checkpoint that is being written is complete.
+    ///
+    /// # Errors
+    /// One line, if it could not be written.
+    pub fn finish_saving(&mut self) -> Result<(), RunError> {
+        self.saver.wait();
+        self.saver
+            .take_failure()
+            .map_or(Ok(()), |why| Err(RunError::NotSaved(why)))
+    }
+
     /// All warnings, including counts.
     pub fn all_warnings(&self) -> Vec<String> {
         let counted = (self.non_finite > 0).then(|| {
@@ -224,15 +248,15 @@ impl Observer for Journal {
     }
 
     fn save(&mut self, trainer: &Trainer) -> Result<Option<String>, String> {
-        let bytes = checkpoint::to_bytes(trainer);
-        self.folder
-            .write_checkpoint(trainer.clock.step, &bytes)
-            .map(Some)
-            .map_err(|e| format!("no checkpoint: {e}"))
+        self.saver.save(&self.folder, Checkpoint::of(trainer))
+    }
+
+    fn saved(&mut self) -> Option<(u64, String)> {
+        self.saver.take_saved()
     }
 
     fn warning(&mut self) -> Option<String> {
-        self.warning.take()
+        self.warning.take().or_else(|| self.saver.take_failure())
     }
 }
 

@@ -50,6 +50,7 @@ mod provenance;
 mod request;
 mod results;
 mod run;
+mod saver;
 mod scene_file;
 mod snapshot;
 mod synth_files;

@@ -213,6 +213,10 @@ impl Run {
         all.push(&mut self.snapshots);
         let ended = irradia_train::run(&mut self.trainer, &limits, &mut all);
         self.snapshots.close(&self.trainer);
+        // A failure is a warning here: the steps were made, and the end of the run is saved again.
+        if let Err(error) = self.journal.finish_saving() {
+            self.journal.warnings.push(error.to_string());
+        }
         ended.map_err(|error| {
             // The first error is the one to report.
             let _ = self.save_unfinished();
@@ -241,7 +245,7 @@ impl Run {
         saved?;
         let report = self.report(finishing, stop);
         if matches!(report, Err(RunError::EvaluationStopped)) && self.trainer.finished() {
-            self.journal.save(&self.trainer).map_err(RunError::NotSaved)?;
+            self.journal.save_now(&self.trainer)?;
         }
         let report = report?;
         self.write_report(&report)?;
@@ -259,7 +263,7 @@ impl Run {
 
     fn save_unfinished(&mut self) -> Result<(), RunError> {
         if !self.trainer.finished() && self.trainer.clock.step > 0 {
-            self.journal.save(&self.trainer).map_err(RunError::NotSaved)?;
+            self.journal.save_now(&self.trainer)?;
         }
         Ok(())
     }

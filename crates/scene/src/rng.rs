@@ -30,6 +30,22 @@ impl Rng {
         xorshifted.rotate_right((old >> 59) as u32)
     }
 
+    /// Skips `count` draws of 32 bits, in logarithmic time (Brown 1994): threads begin in the middle of one sequence.
+    pub fn advance(&mut self, mut count: u64) {
+        let (mut factor, mut summand) = (6_364_136_223_846_793_005u64, self.stream);
+        let (mut total_factor, mut total_summand) = (1u64, 0u64);
+        while count > 0 {
+            if count & 1 == 1 {
+                total_factor = total_factor.wrapping_mul(factor);
+                total_summand = total_summand.wrapping_mul(factor).wrapping_add(summand);
+            }
+            summand = factor.wrapping_add(1).wrapping_mul(summand);
+            factor = factor.wrapping_mul(factor);
+            count >>= 1;
+        }
+        self.state = total_factor.wrapping_mul(self.state).wrapping_add(total_summand);
+    }
+
     /// Uniform in \[0, 1), 24 bits.
     pub fn uniform(&mut self) -> f32 {
         (self.next_u32() >> 8) as f32 * (1.0 / 16_777_216.0)
@@ -84,6 +100,18 @@ mod tests {
         // Standard errors at n = 1e5: 0.0032 for the mean, 0.0045 for the variance; five of them.
         assert!((sum / f64::from(n)).abs() < 0.016);
         assert!((squares / f64::from(n) - 1.0).abs() < 0.023);
+    }
+
+    #[test]
+    fn advancing_skips_as_many_draws() {
+        for count in [0, 1, 2, 77, 4096] {
+            let (mut a, mut b) = (Rng::new(3, 9), Rng::new(3, 9));
+            (0..count).for_each(|_| {
+                a.next_u32();
+            });
+            b.advance(count);
+            assert_eq!(a, b);
+        }
     }
 
     #[test]

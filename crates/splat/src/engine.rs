@@ -6,9 +6,12 @@
 
 use crate::densify::mcmc;
 use crate::regularize::{self, Regularized, Regularizers};
-use crate::render::{CameraGradient, FramePlanes, OutputGradient, RenderOptions, Renderer, SplatGradients, ViewParams};
+use crate::render::{
+    CameraGradient, ChunkBounds, FramePlanes, OutputGradient, RenderOptions, Renderer, SplatGradients, ViewParams,
+};
 use crate::{Optimizer, Rates, SplatState, Splats, Statistics, Surface};
 use irradia_scene::{Camera, sh};
+use rayon::prelude::*;
 
 /// The state of splats in training with the renderer and the gradients of the last frame, on the CPU.
 pub struct Engine {
@@ -17,6 +20,10 @@ pub struct Engine {
     gradients: SplatGradients,
     /// The splats of the last frame, if they were not the state's.
     moved: Option<Splats>,
+    /// Bounds of the state's splats, unless `edited`.
+    bounds: ChunkBounds,
+    /// Whether the state may have been edited since the bounds were updated.
+    edited: bool,
 }
 
 /// The camera and the splats of a frame.
@@ -78,6 +85,8 @@ impl Engine {
             renderer: Renderer::new(),
             gradients: SplatGradients::default(),
             moved: None,
+            bounds: ChunkBounds::default(),
+            edited: true,
         }
     }
 
@@ -98,6 +107,7 @@ impl Engine {
 
     /// Parameters, moments and statistics, to be edited or replaced between two steps.
     pub fn state_mut(&mut self) -> &mut SplatState {
+        self.edited = true;
         &mut self.state
     }
 
@@ -105,22 +115,33 @@ impl Engine {
     pub fn use_filter(&mut self, on: bool) {
         let filter = if on { self.state.filter.plane(0) } else { &[] };
         self.renderer.set_filter(filter);
+        self.edited = true;
     }
 
     /// Renders a frame.
     pub fn render(&mut self, placement: Placement, options: &RenderOptions) {
-        self.moved = placement.moved;
-        let splats = self.moved.as_ref().unwrap_or(&self.state.splats);
+        self.place(placement.moved);
+        let (splats, bounds) = placed(&self.state, self.moved.as_ref(), &self.bounds);
         self.renderer
-            .render(splats, &ViewParams::new(&placement.camera), options);
+            .render_within(splats, bounds, &ViewParams::new(&placement.camera), options);
     }
 
     /// The first half of a frame with added colours; [`Self::composite`] is the second.
     pub fn project(&mut self, placement: Placement, options: &RenderOptions) {
-        self.moved = placement.moved;
-        let splats = self.moved.as_ref().unwrap_or(&self.state.splats);
+        self.place(placement.moved);
+        let (splats, bounds) = placed(&self.state, self.moved.as_ref(), &self.bounds);
         self.renderer
-            .project(splats, &ViewParams::new(&placement.camera), options);
+            .project_within(splats, bounds, &ViewParams::new(&placement.camera), options);
+    }
+
+    /// Takes the splats of a frame, and brings the state's bounds up to date if those are not its own.
+    fn place(&mut self, moved: Option<Splats>) {
+        self.moved = moved;
+        if self.moved.is_none() && std::mem::take(&mut self.edited) {
+            let renderer = &self.renderer;
+            self.bounds
+                .update(renderer.level, &self.state.splats, renderer.filter(), |_| true);
+        }
     }
 
     /// The surfaces in view of the last [`Self::project`], in ascending order of splats.
@@ -176,7 +197,7 @@ impl Engine {
         let planes = [0, 1, 2].map(|c| self.gradients.splats.sh.plane(c));
         let v_of = |i: u32| planes.map(|plane| plane[i as usize] / sh::C0 as f32);
         let with_gradient = |i: &u32| self.gradients.active[*i as usize] > 0.0 && v_of(*i) != [0.0; 3];
-        let seen = self.renderer.in_view().iter().copied().filter(with_gradient);
+        let seen = self.renderer.in_view().par_iter().copied().filter(with_gradient);
         let (seen, v_colors): (Vec<u32>, Vec<[f32; 3]>) = seen.map(|i| (i, v_of(i))).unzip();
         (self.rendered().surfaces(&seen), v_colors)
     }
@@ -220,10 +241,31 @@ impl Engine {
         if let Some(limit) = update.condition_cap {
             regularize::cap_condition(&mut self.state.splats, limit);
         }
+        let only_active = !update.optimizer.dense
+            && regularized == Regularized::Visible
+            && update.noise.is_none()
+            && update.condition_cap.is_none();
+        let (renderer, counts) = (&self.renderer, &self.gradients.counts);
+        self.bounds
+            .update(renderer.level, &self.state.splats, renderer.filter(), |chunk| {
+                !only_active || counts[chunk] > 0
+            });
     }
 
     /// The splats of the last frame.
     fn rendered(&self) -> &Splats {
         self.moved.as_ref().unwrap_or(&self.state.splats)
+    }
+}
+
+/// The splats of a frame, and their bounds if they have any.
+fn placed<'a>(
+    state: &'a SplatState,
+    moved: Option<&'a Splats>,
+    bounds: &'a ChunkBounds,
+) -> (&'a Splats, Option<&'a ChunkBounds>) {
+    match moved {
+        Some(moved) => (moved, None),
+        None => (&state.splats, Some(bounds)),
     }
 }

@@ -4,9 +4,11 @@
 //! all: `opacity o + opacity_square o^2 + scale mean(s) + covariance |Sigma|_F^2`. The first and third are those of 3DGS-MCMC
 //! (Kheradmand et al. 2024, eq. 10), the others CurriculumGS's (`|Sigma|_F^2` is the sum of `s^4`).
 
+use crate::render::CHUNK;
 use crate::{SplatGradients, Splats};
 use irradia_compute::simd::{Kernel, Lanes, Level, Mask, Simd};
 use irradia_compute::unroll;
+use rayon::prelude::*;
 
 /// Weights of the terms.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -50,29 +52,53 @@ pub fn add_gradients(
     gradients: &mut SplatGradients,
 ) {
     let counted = match of {
-        Regularized::Visible => gradients.active.iter().filter(|a| **a != 0.0).count(),
+        Regularized::Visible => gradients.counts.iter().map(|n| *n as usize).sum(),
         Regularized::All => splats.len(),
     };
     if counted == 0 {
         return;
     }
-    level.run(AddGradients {
-        splats,
-        weights,
-        of,
-        unit,
-        per_splat: 1.0 / counted as f64,
-        gradients,
-    });
+    let SplatGradients {
+        splats: v_splats,
+        active,
+        counts,
+        ..
+    } = gradients;
+    let [x, y, z] = v_splats.log_scales.planes_mut();
+    x.par_chunks_mut(CHUNK)
+        .zip(y.par_chunks_mut(CHUNK))
+        .zip(z.par_chunks_mut(CHUNK))
+        .zip(v_splats.opacity_logits.plane_mut(0).par_chunks_mut(CHUNK))
+        .zip(counts)
+        .enumerate()
+        .filter(|(_, (_, count))| **count > 0 || of == Regularized::All)
+        .for_each(|(chunk, ((((x, y), z), v_logits), _))| {
+            level.run(AddGradients {
+                splats,
+                weights,
+                all: of == Regularized::All,
+                unit,
+                per_splat: 1.0 / counted as f64,
+                active,
+                first: chunk * CHUNK,
+                v_log_scales: [x, y, z],
+                v_logits,
+            });
+        });
 }
 
+/// Of one chunk of splats.
 struct AddGradients<'a> {
     splats: &'a Splats,
     weights: &'a Regularizers,
-    of: Regularized,
+    /// Whether splats that are not active are included.
+    all: bool,
     unit: f32,
     per_splat: f64,
-    gradients: &'a mut SplatGradients,
+    active: &'a [f32],
+    first: usize,
+    v_log_scales: [&'a mut [f32]; 3],
+    v_logits: &'a mut [f32],
 }
 
 impl Kernel for AddGradients<'_> {
@@ -85,20 +111,20 @@ impl Kernel for AddGradients<'_> {
     {
         let weights = WeightLanes::new(simd, self.weights, f64::from(self.unit), self.per_splat);
         let zero = simd.splat(0.0);
-        let all = self.of == Regularized::All;
-        for at in (0..self.splats.len()).step_by(S::LANES) {
-            let active = zero.lt(simd.load(&self.gradients.active[at..]));
-            if active.none() && !all {
+        for at in (0..self.v_logits.len()).step_by(S::LANES) {
+            let i = self.first + at;
+            let active = zero.lt(simd.load(&self.active[i..]));
+            if active.none() && !self.all {
                 continue;
             }
-            let log_scale = unroll!(c in 3 => simd.load(&self.splats.log_scales.plane(c)[at..]));
-            let logit = simd.load(&self.splats.opacity_logits.plane(0)[at..]);
+            let log_scale = unroll!(c in 3 => simd.load(&self.splats.log_scales.plane(c)[i..]));
+            let logit = simd.load(&self.splats.opacity_logits.plane(0)[i..]);
             let (_, v_log_scale, v_logit) = regularizer(&weights, log_scale, logit);
             for c in 0..3 {
-                let to = &mut self.gradients.splats.log_scales.plane_mut(c)[at..];
+                let to = &mut self.v_log_scales[c][at..];
                 (simd.load(to).masked(active) + v_log_scale[c]).store(to);
             }
-            let to = &mut self.gradients.splats.opacity_logits.plane_mut(0)[at..];
+            let to = &mut self.v_logits[at..];
             (simd.load(to).masked(active) + v_logit).store(to);
         }
     }
@@ -142,24 +168,37 @@ fn regularizer<F: Lanes>(w: &WeightLanes<F>, log_scale: [F; 3], logit: F) -> (F,
 pub fn cap_condition(splats: &mut Splats, limit: f32) {
     // The condition number of the covariance is the squared ratio of the standard deviations.
     let span = 0.5 * limit.max(1.0).ln();
-    for i in 0..splats.len() {
-        let s: [f32; 3] = std::array::from_fn(|c| splats.log_scales.get(c, i));
-        let low = s.into_iter().fold(f32::MIN, f32::max) - span;
-        for (c, v) in s.into_iter().enumerate() {
-            if v < low {
-                splats.log_scales.set(c, i, low);
+    let n = splats.len();
+    let [x, y, z] = splats.log_scales.planes_mut().map(|plane: &mut [f32]| &mut plane[..n]);
+    x.par_chunks_mut(CHUNK)
+        .zip(y.par_chunks_mut(CHUNK))
+        .zip(z.par_chunks_mut(CHUNK))
+        .with_min_len(8)
+        .for_each(|((x, y), z)| {
+            for ((x, y), z) in x.iter_mut().zip(y).zip(z) {
+                let low = f32::MIN.max(*x).max(*y).max(*z) - span;
+                for v in [x, y, z] {
+                    if *v < low {
+                        *v = low;
+                    }
+                }
             }
-        }
-    }
+        });
 }
 
 /// Freezes position and shape of all but the largest `fraction` of the visible splats. Their opacity and colour are still
 /// trained: floaters in front of the cameras must be able to fade (fern without points, 800 steps: 23.9 dB with everything frozen).
 pub fn freeze_small(splats: &Splats, fraction: f32, gradients: &mut SplatGradients) {
-    let size = |i: usize| (0..3).map(|c| splats.log_scales.get(c, i)).fold(f32::MIN, f32::max);
-    let mut sizes: Vec<f32> = (0..splats.len())
-        .filter(|i| gradients.active[*i] != 0.0)
-        .map(size)
+    let n = splats.len();
+    let [x, y, z] = [0, 1, 2].map(|c| splats.log_scales.plane(c));
+    let size = |i: usize| f32::MIN.max(x[i]).max(y[i]).max(z[i]);
+    let active_chunks = gradients.counts.par_iter().enumerate().filter(|(_, count)| **count > 0);
+    let active = &gradients.active;
+    let mut sizes: Vec<f32> = active_chunks
+        .flat_map_iter(|(chunk, _)| {
+            let range = chunk * CHUNK..n.min((chunk + 1) * CHUNK);
+            range.filter(|i| active[*i] != 0.0).map(size)
+        })
         .collect();
     let frozen = ((1.0 - fraction) * sizes.len() as f32).round() as usize;
     if frozen == 0 || sizes.is_empty() {
@@ -167,12 +206,23 @@ pub fn freeze_small(splats: &Splats, fraction: f32, gradients: &mut SplatGradien
     }
     let at = frozen.min(sizes.len() - 1);
     let limit = *sizes.select_nth_unstable_by(at, f32::total_cmp).1;
-    let small: Vec<usize> = (0..splats.len()).filter(|i| size(*i) < limit).collect();
+    let counts = &gradients.counts;
     let shape = &mut gradients.splats;
     for column in [&mut shape.means, &mut shape.quats, &mut shape.log_scales] {
-        for c in 0..column.count() {
-            small.iter().for_each(|i| column.set(c, *i, 0.0));
-        }
+        let stride = column.stride();
+        column.as_mut_slice().par_chunks_mut(stride).for_each(|plane| {
+            plane[..n]
+                .par_chunks_mut(CHUNK)
+                .enumerate()
+                .filter(|(chunk, _)| counts[*chunk] > 0)
+                .for_each(|(chunk, gradients)| {
+                    for (at, gradient) in gradients.iter_mut().enumerate() {
+                        if size(chunk * CHUNK + at) < limit {
+                            *gradient = 0.0;
+                        }
+                    }
+                });
+        });
     }
 }
 
@@ -228,6 +278,7 @@ mod tests {
                 let mut gradients = SplatGradients {
                     splats: Splats::zeros(n, 0),
                     active: vec![0.0; splats.stride()],
+                    counts: vec![7],
                     ..Default::default()
                 };
                 // Invisible splats hold the values of an earlier frame.
@@ -274,6 +325,7 @@ mod tests {
         let mut gradients = SplatGradients {
             splats: Splats::zeros(10, 0),
             active: vec![1.0; splats.stride()],
+            counts: vec![9],
             ..Default::default()
         };
         for i in 0..10 {

@@ -1,6 +1,7 @@
 use glam::{Quat, Vec3};
 use irradia_compute::Planes;
 use irradia_scene::{GaussianCloud, sh};
+use rayon::prelude::*;
 
 /// The surface element that a splat represents.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -135,10 +136,15 @@ impl Splats {
         }
     }
 
-    /// Appends `other`.
-    pub fn append(&mut self, other: &Self) {
-        for (to, from) in self.columns_mut().into_iter().zip(other.columns()) {
-            to.append(from);
+    /// A copy, made by all threads.
+    pub fn copied(&self) -> Self {
+        let [means, quats, log_scales, opacity_logits, sh] = self.columns().map(Planes::copied);
+        Self {
+            means,
+            quats,
+            log_scales,
+            opacity_logits,
+            sh,
         }
     }
 
@@ -162,7 +168,7 @@ impl Splats {
             mean: self.mean(*i as usize),
             normal: self.shortest_axis(*i as usize),
         };
-        indices.iter().map(surface).collect()
+        indices.par_iter().with_min_len(1024).map(surface).collect()
     }
 
     /// Allocated bytes.

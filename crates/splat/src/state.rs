@@ -1,8 +1,10 @@
 use crate::regularize::Regularized;
-use crate::{SplatGradients, Splats};
+use crate::render::CHUNK;
+use crate::{COLUMN_NAMES, SplatGradients, Splats};
 use irradia_compute::Planes;
 use irradia_compute::adam::{Active, AdamStep, adam};
 use irradia_compute::simd::Level;
+use irradia_compute::sort::{Pair, pair, payload, sort_by_key};
 use rayon::prelude::*;
 
 /// Splats in training, with all per-splat arrays that must stay consistent with them.
@@ -110,32 +112,80 @@ impl SplatState {
 
     /// Keeps the splats `indices`, in that order, with their moments and statistics.
     pub fn gather(&mut self, indices: &[u32]) {
-        self.splats = self.splats.gather(indices);
-        self.moments = [self.moments[0].gather(indices), self.moments[1].gather(indices)];
-        self.statistics = self.statistics.gather(indices);
-        self.filter = self.filter.gather(indices);
+        let mut scratch = Vec::new();
+        for column in self.all_columns_mut() {
+            column.rearrange(indices, &[], &mut scratch);
+        }
     }
 
     /// Appends `splats` with moments and statistics of zero.
     pub fn append(&mut self, splats: &Splats) {
-        let zeros = Splats::zeros(splats.len(), splats.sh_degree());
-        self.splats.append(splats);
-        for moment in &mut self.moments {
-            moment.append(&zeros);
+        let order: Vec<u32> = (0..(self.len() + splats.len()) as u32).collect();
+        let mut scratch = Vec::new();
+        for (to, from) in self.splats.columns_mut().into_iter().zip(splats.columns()) {
+            to.rearrange(&order, &[from], &mut scratch);
         }
-        self.statistics.append(&Planes::zeros(Self::STATISTICS, splats.len()));
-        self.filter.append(&Planes::zeros(1, splats.len()));
+        for column in self.columns_beside_mut() {
+            column.rearrange(&order, &[], &mut scratch);
+        }
     }
 
-    /// Resets the moments of splat `i` to zero.
-    pub fn reset_moments(&mut self, i: usize) {
-        for moment in &mut self.moments {
-            for column in moment.columns_mut() {
-                for c in 0..column.count() {
-                    column.set(c, i, 0.0);
-                }
-            }
+    /// Keeps the splats `kept`, adds `added` with moments of zero, resets the moments of the splats `reset` (ascending), clears the
+    /// statistics, and puts all into Morton order: a round of density control in one pass over the state, column by column, so that
+    /// it needs hardly more memory than the state itself.
+    pub fn rebuild(&mut self, kept: Vec<u32>, added: &[&Splats], reset: &[u32]) {
+        let n = self.len() as u32;
+        let new = added.iter().map(|splats| splats.len() as u32).sum::<u32>();
+        let mut order = kept;
+        order.extend(n..n + new);
+        let mut scratch = Vec::new();
+        let mut means = self.splats.means.gather(&[]);
+        // Positions in the new order: all that the Morton order needs.
+        let parts: Vec<&Planes> = [&self.splats].iter().chain(added).map(|splats| &splats.means).collect();
+        means.rearrange(&order, &parts, &mut scratch);
+        let order: Vec<u32> = morton_order(&means).par_iter().map(|i| order[*i as usize]).collect();
+        drop(means);
+        for (c, column) in self.splats.columns_mut().into_iter().enumerate() {
+            let added: Vec<&Planes> = added.iter().map(|splats| splats.columns()[c]).collect();
+            column.rearrange(&order, &added, &mut scratch);
         }
+        self.filter.rearrange(&order, &[], &mut scratch);
+        let kept_moment = |i: &u32| if reset.binary_search(i).is_ok() { u32::MAX } else { *i };
+        let order: Vec<u32> = order.par_iter().map(kept_moment).collect();
+        for column in self.moments.iter_mut().flat_map(Splats::columns_mut) {
+            column.rearrange(&order, &[], &mut scratch);
+        }
+        self.statistics.reset(order.len());
+    }
+
+    /// Every column with an item for each splat.
+    fn all_columns_mut(&mut self) -> Vec<&mut Planes> {
+        let [first, second] = &mut self.moments;
+        let splats = [&mut self.splats, first, second]
+            .into_iter()
+            .flat_map(Splats::columns_mut);
+        splats.chain([&mut self.statistics, &mut self.filter]).collect()
+    }
+
+    /// Every column but the parameters.
+    fn columns_beside_mut(&mut self) -> Vec<&mut Planes> {
+        self.all_columns_mut().split_off(COLUMN_NAMES.len())
+    }
+
+    /// A copy, made by all threads.
+    pub fn copied(&self) -> Self {
+        Self {
+            splats: self.splats.copied(),
+            moments: [self.moments[0].copied(), self.moments[1].copied()],
+            statistics: self.statistics.copied(),
+            filter: self.filter.copied(),
+        }
+    }
+
+    /// Allocated bytes.
+    pub fn bytes(&self) -> usize {
+        let splats = [&self.splats, &self.moments[0], &self.moments[1]];
+        splats.iter().map(|splats| splats.bytes()).sum::<usize>() + self.statistics.bytes() + self.filter.bytes()
     }
 
     /// Statistics plane `plane` of splat `i`, averaged over the frames in which it was visible.
@@ -169,12 +219,15 @@ impl SplatState {
         {
             *rate = if plane < 3 { rates.sh_dc } else { rates.sh_rest };
         }
-        let active = &gradients.active[..];
-        let all: Vec<f32> = match regularized {
-            Regularized::Visible => Vec::new(),
-            Regularized::All => (0..active.len()).map(|i| f32::from(u8::from(i < self.len()))).collect(),
+        let active = if optimizer.dense {
+            Active::Dense(&gradients.active)
+        } else {
+            Active::Sparse(&gradients.active, &gradients.counts)
         };
-        let shape_active = if all.is_empty() { active } else { &all[..] };
+        let shape_active = match regularized {
+            Regularized::Visible => active,
+            Regularized::All => Active::All,
+        };
         let rules = [
             (vec![rates.means; 3], active),
             (vec![rates.quats; 4], active),
@@ -192,11 +245,6 @@ impl SplatState {
         for (((parameters, first), second), (g, (rates, active))) in
             columns.zip(gradients.splats.columns().into_iter().zip(rules))
         {
-            let active = if optimizer.dense {
-                Active::Dense(active)
-            } else {
-                Active::Sparse(active)
-            };
             adam(level, parameters, g, [first, second], &rates, active, optimizer.step);
         }
     }
@@ -212,7 +260,6 @@ impl SplatState {
         extent: impl Fn(usize) -> f32 + Sync,
     ) {
         let n = self.len();
-        let stride = self.statistics.stride();
         let screen = match what {
             Statistics::AbsoluteGradient => &gradients.gathered,
             Statistics::Gradient | Statistics::Error => &gradients.screen,
@@ -221,27 +268,33 @@ impl SplatState {
         let (error, weight) = (gradients.gathered.plane(0), gradients.gathered.plane(1));
         // Pixels to normalised device coordinates, whose range has length 2.
         let scale = [0.5 * width as f32, 0.5 * height as f32];
-        let mut planes = self.statistics.as_mut_slice().chunks_mut(stride.max(1));
-        let mut plane = || &mut planes.next().expect("a plane for each statistic")[..n];
-        let (gradient, seen, extents, errors, weights) = (plane(), plane(), plane(), plane(), plane());
-        gradient
-            .par_iter_mut()
-            .zip(seen)
-            .zip(extents)
-            .zip(errors.par_iter_mut().zip(weights))
-            .with_min_len(4096)
-            .enumerate()
-            .filter(|(i, _)| gradients.active[*i] != 0.0)
-            .for_each(|(i, (((gradient, seen), largest), (errors, weights)))| {
-                let (gx, gy) = (x[i] * scale[0], y[i] * scale[1]);
-                *gradient += (gx * gx + gy * gy).sqrt();
-                *seen += 1.0;
-                *largest = largest.max(extent(i));
-                if what == Statistics::Error {
-                    *errors += error[i];
-                    *weights += weight[i];
+        let planes = self.statistics.planes_mut::<{ Self::STATISTICS }>();
+        let [gradient, seen, extents, errors, weights] = planes.map(|plane| &mut plane[..n]);
+        let chunks = gradient
+            .par_chunks_mut(CHUNK)
+            .zip(seen.par_chunks_mut(CHUNK))
+            .zip(extents.par_chunks_mut(CHUNK))
+            .zip(errors.par_chunks_mut(CHUNK).zip(weights.par_chunks_mut(CHUNK)))
+            .zip(&gradients.counts)
+            .enumerate();
+        chunks.filter(|(_, (_, active))| **active > 0).for_each(
+            |(chunk, ((((gradient, seen), extents), (errors, weights)), _))| {
+                for at in 0..gradient.len() {
+                    let i = chunk * CHUNK + at;
+                    if gradients.active[i] == 0.0 {
+                        continue;
+                    }
+                    let (gx, gy) = (x[i] * scale[0], y[i] * scale[1]);
+                    gradient[at] += (gx * gx + gy * gy).sqrt();
+                    seen[at] += 1.0;
+                    extents[at] = extents[at].max(extent(i));
+                    if what == Statistics::Error {
+                        errors[at] += error[i];
+                        weights[at] += weight[i];
+                    }
                 }
-            });
+            },
+        );
     }
 }
 
@@ -249,28 +302,29 @@ impl SplatState {
 /// a few outliers would compress the scene into one cell).
 fn morton_order(means: &Planes) -> Vec<u32> {
     let n = means.len();
-    let mut codes = vec![0u32; n];
-    for axis in 0..3 {
-        let values = &means.plane(axis)[..n];
-        let mut sample: Vec<f32> = values
-            .iter()
-            .copied()
-            .step_by((n / 4096).max(1))
-            .filter(|v| v.is_finite())
-            .collect();
-        sample.sort_unstable_by(f32::total_cmp);
-        let Some(last) = sample.len().checked_sub(1) else {
-            continue;
-        };
-        let (low, high) = (sample[last / 100], sample[last - last / 100]);
-        let scale = 1023.0 / (high - low).max(1e-20);
-        for (code, value) in codes.iter_mut().zip(values) {
-            *code |= spread(((value - low) * scale).clamp(0.0, 1023.0) as u32) << axis;
-        }
-    }
-    let mut order: Vec<u32> = (0..n as u32).collect();
-    order.par_sort_by_key(|i| codes[*i as usize]);
-    order
+    let axes: Vec<(&[f32], f32, f32)> = (0..3)
+        .filter_map(|axis| {
+            let values = &means.plane(axis)[..n];
+            let mut sample: Vec<f32> = values
+                .iter()
+                .copied()
+                .step_by((n / 4096).max(1))
+                .filter(|v| v.is_finite())
+                .collect();
+            sample.sort_unstable_by(f32::total_cmp);
+            let last = sample.len().checked_sub(1)?;
+            let (low, high) = (sample[last / 100], sample[last - last / 100]);
+            Some((values, low, 1023.0 / (high - low).max(1e-20)))
+        })
+        .collect();
+    let code = |i: usize| {
+        axes.iter().enumerate().fold(0, |code, (axis, (values, low, scale))| {
+            code | spread(((values[i] - low) * scale).clamp(0.0, 1023.0) as u32) << axis
+        })
+    };
+    let mut items: Vec<Pair> = (0..n).into_par_iter().map(|i| pair(code(i), i as u32)).collect();
+    sort_by_key(&mut items, &mut Vec::new());
+    items.par_iter().map(payload).collect()
 }
 
 /// Spreads ten bits to every third bit of thirty.
@@ -304,6 +358,57 @@ mod tests {
         assert_eq!(column(&state.splats.means, 0), [2.0, 0.0, 0.0, 1.0, 2.0]);
         assert_eq!(column(&state.moments[1].means, 0), [20.0, 0.0, 0.0, 0.0, 0.0]);
         assert_eq!(column(&state.statistics, SplatState::SEEN), [200.0, 0.0, 0.0, 0.0, 0.0]);
+    }
+
+    /// A round against its definition, one splat at a time, with 1 and with 2 threads.
+    #[test]
+    fn a_round_in_place_gives_what_splat_by_splat_gives_with_any_number_of_threads() {
+        let (n, degree) = (40_000, 1);
+        let mut rng = irradia_scene::Rng::new(4, 4);
+        let mut random = |n: usize| {
+            let mut splats = Splats::zeros(n, degree);
+            for column in splats.columns_mut() {
+                for c in 0..column.count() {
+                    (0..n).for_each(|i| column.set(c, i, rng.normal()));
+                }
+            }
+            splats
+        };
+        let mut before = SplatState::new(random(n));
+        before.moments = [random(n), random(n)];
+        before.filter.plane_mut(0)[..n].fill(0.5);
+        before.statistics.plane_mut(1)[..n].fill(3.0);
+        let added = [random(700), random(90)];
+        let kept: Vec<u32> = (0..n as u32).filter(|i| i % 7 != 3).collect();
+        let reset: Vec<u32> = (0..n as u32).step_by(70).collect();
+
+        // Source of each new splat: part and index; Morton codes as `morton_order` has them.
+        let mut sources: Vec<(usize, usize)> = kept.iter().map(|i| (0, *i as usize)).collect();
+        sources.extend((0..700).map(|i| (1, i)).chain((0..90).map(|i| (2, i))));
+        let parts = [&before.splats, &added[0], &added[1]];
+        let means: Vec<f32> = sources.iter().flat_map(|(part, i)| parts[*part].mean(*i)).collect();
+        let order = morton_order(&Planes::from_interleaved(3, &means));
+        for threads in [1, 2] {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            let mut state = before.clone();
+            pool.install(|| state.rebuild(kept.clone(), &[&added[0], &added[1]], &reset));
+            assert_eq!(state.len(), sources.len());
+            assert!(state.statistics.as_slice().iter().all(|v| *v == 0.0));
+            for (to, from) in order.iter().enumerate() {
+                let (part, i) = sources[*from as usize];
+                let stays = part == 0 && reset.binary_search(&(i as u32)).is_err();
+                for (column, old) in state.splats.columns().into_iter().zip(parts[part].columns()) {
+                    assert!((0..column.count()).all(|c| column.get(c, to) == old.get(c, i)));
+                }
+                for (now, then) in state.moments.iter().zip(&before.moments) {
+                    for (column, old) in now.columns().into_iter().zip(then.columns()) {
+                        let old = |c: usize| if stays { old.get(c, i) } else { 0.0 };
+                        assert!((0..column.count()).all(|c| column.get(c, to) == old(c)));
+                    }
+                }
+                assert_eq!(state.filter.get(0, to), if part == 0 { 0.5 } else { 0.0 });
+            }
+        }
     }
 
     #[test]

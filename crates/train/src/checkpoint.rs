@@ -15,8 +15,11 @@ use crate::trainer::{TrainError, TrainOptions, Trainer};
 use irradia_compute::Planes;
 use irradia_scene::Dataset;
 use irradia_splat::{COLUMN_NAMES, SplatState, Splats};
-use safetensors::tensor::{Dtype, SafeTensors, TensorView};
+use rayon::prelude::*;
+use safetensors::tensor::{Dtype, Metadata, SafeTensors, TensorInfo};
+use std::borrow::Cow;
 use std::collections::HashMap;
+use std::io::{self, Write};
 use std::sync::Arc;
 
 const FORMAT: &str = "irradia-checkpoint-5";
@@ -28,97 +31,183 @@ const FIELD: &str = "field.";
 const TIMES: &str = "times";
 const OWNERS: [&str; 3] = ["splats", "first_moments", "second_moments"];
 
-/// `trainer` as a safetensors file: columns `[components, N]` of splats and moments, statistics, and the clock.
-pub fn to_bytes(trainer: &Trainer) -> Vec<u8> {
-    let state = trainer.engine.state();
-    let mut arrays: Vec<(String, Dtype, Vec<usize>, Vec<u8>)> = Vec::new();
-    for (owner, splats) in OWNERS.iter().zip([&state.splats, &state.moments[0], &state.moments[1]]) {
-        for (name, planes) in COLUMN_NAMES.iter().zip(splats.columns()) {
-            arrays.push((
-                format!("{owner}.{name}"),
-                Dtype::F32,
-                vec![planes.count(), planes.len()],
-                plane_bytes(planes),
-            ));
+/// A training run between two steps, as it is written: the splats' columns are borrowed, or copied to be written while training
+/// continues.
+pub struct Checkpoint<'a> {
+    /// Steps made.
+    pub step: u64,
+    state: Cow<'a, SplatState>,
+    others: Vec<NamedTensor>,
+    metadata: HashMap<String, String>,
+}
+
+impl<'a> Checkpoint<'a> {
+    /// Of `trainer` as it is.
+    pub fn of(trainer: &'a Trainer) -> Self {
+        let mut others: Vec<NamedTensor> = Vec::new();
+        let mut keep = |prefix: &str, owned: Vec<NamedTensor>| {
+            others.extend(owned.into_iter().map(|tensor| tensor.prefixed(prefix)));
+        };
+        if let Some(field) = &trainer.field {
+            keep(FIELD, field_file::state_tensors(field));
+        }
+        for occupant in trainer.sockets.occupants() {
+            keep(&format!("{}.", occupant.name()), occupant.tensors());
+        }
+        let clock = &trainer.clock;
+        let whole = [
+            clock.step,
+            clock.stage as u64,
+            clock.stage_step,
+            u64::from(clock.was_reset),
+            clock.monitor.steps,
+        ];
+        let real = [
+            clock.time,
+            clock.stage_time,
+            clock.progress,
+            clock.stretch,
+            clock.monitor.mean,
+            clock.monitor.start,
+            clock.monitor.best,
+            clock.monitor.best_time,
+            trainer.pace,
+            trainer.seconds,
+            trainer.cpu_seconds,
+        ];
+        others.push(NamedTensor::whole("clock.whole", &whole));
+        others.push(NamedTensor::double("clock.real", &real));
+        others.push(NamedTensor::double(TIMES, &trainer.times.to_array()));
+        let carried = carried::named(&clock.carried);
+        others.extend(carried.map(|(name, value)| NamedTensor::double(name, &[value])));
+        Self {
+            step: clock.step,
+            state: Cow::Borrowed(trainer.engine.state()),
+            others,
+            metadata: HashMap::from([
+                ("format".to_owned(), FORMAT.to_owned()),
+                ("recipe".to_owned(), trainer.recipe.to_toml()),
+                ("seed".to_owned(), trainer.options.seed.to_string()),
+            ]),
         }
     }
-    let statistics = &state.statistics;
-    arrays.push((
-        "statistics".into(),
-        Dtype::F32,
-        vec![statistics.count(), statistics.len()],
-        plane_bytes(statistics),
-    ));
-    arrays.push((
-        "filter".into(),
-        Dtype::F32,
-        vec![1, state.filter.len()],
-        plane_bytes(&state.filter),
-    ));
-    let mut tensors: Vec<NamedTensor> = Vec::new();
-    let mut keep = |prefix: &str, owned: Vec<NamedTensor>| {
-        tensors.extend(owned.into_iter().map(|tensor| tensor.prefixed(prefix)));
-    };
-    if let Some(field) = &trainer.field {
-        keep(FIELD, field_file::state_tensors(field));
+
+    /// Memory that a copy of the splats takes, bytes.
+    pub fn bytes(&self) -> u64 {
+        self.state.bytes() as u64
     }
-    for occupant in trainer.sockets.occupants() {
-        keep(&format!("{}.", occupant.name()), occupant.tensors());
+
+    /// With a copy of the splats.
+    pub fn copied(&self) -> Checkpoint<'static> {
+        Checkpoint {
+            step: self.step,
+            state: Cow::Owned(self.state.copied()),
+            others: self.others.clone(),
+            metadata: self.metadata.clone(),
+        }
     }
-    let clock = &trainer.clock;
-    let whole = [
-        clock.step,
-        clock.stage as u64,
-        clock.stage_step,
-        u64::from(clock.was_reset),
-        clock.monitor.steps,
-    ];
-    let real = [
-        clock.time,
-        clock.stage_time,
-        clock.progress,
-        clock.stretch,
-        clock.monitor.mean,
-        clock.monitor.start,
-        clock.monitor.best,
-        clock.monitor.best_time,
-        trainer.pace,
-        trainer.seconds,
-        trainer.cpu_seconds,
-    ];
-    arrays.push((
-        "clock.whole".into(),
-        Dtype::U64,
-        vec![whole.len()],
-        whole.iter().flat_map(|v| v.to_le_bytes()).collect(),
-    ));
-    arrays.push((
-        "clock.real".into(),
-        Dtype::F64,
-        vec![real.len()],
-        real.iter().flat_map(|v| v.to_le_bytes()).collect(),
-    ));
-    let times = trainer.times.to_array();
-    arrays.push((
-        TIMES.into(),
-        Dtype::F64,
-        vec![times.len()],
-        times.iter().flat_map(|v| v.to_le_bytes()).collect(),
-    ));
-    for (name, value) in carried::named(&clock.carried) {
-        arrays.push((name, Dtype::F64, vec![1], value.to_le_bytes().to_vec()));
+
+    /// Writes a safetensors file: columns `[components, N]` of splats and moments, statistics, and the clock. Columns are encoded
+    /// piece by piece as they are written.
+    ///
+    /// # Errors
+    /// Those of `out`.
+    pub fn write(&self, out: &mut (impl Write + ?Sized)) -> io::Result<()> {
+        let state = &*self.state;
+        let mut tensors: Vec<Tensor> = Vec::new();
+        for (owner, splats) in OWNERS.iter().zip([&state.splats, &state.moments[0], &state.moments[1]]) {
+            let columns = COLUMN_NAMES.iter().zip(splats.columns());
+            tensors.extend(columns.map(|(name, planes)| Tensor::of_planes(format!("{owner}.{name}"), planes)));
+        }
+        tensors.push(Tensor::of_planes("statistics".into(), &state.statistics));
+        tensors.push(Tensor::of_planes("filter".into(), &state.filter));
+        tensors.extend(self.others.iter().map(|tensor| Tensor {
+            name: tensor.name.clone(),
+            dtype: tensor.dtype(),
+            shape: tensor.shape.clone(),
+            content: Content::Bytes(tensor.bytes()),
+        }));
+        // Larger types first, so that all are aligned (the format's own order).
+        tensors.sort_by(|a, b| b.dtype.cmp(&a.dtype).then(a.name.cmp(&b.name)));
+        let mut at = 0;
+        let infos = tensors.iter().map(|tensor| {
+            let from = at;
+            at += tensor.content.len();
+            let info = TensorInfo {
+                dtype: tensor.dtype,
+                shape: tensor.shape.clone(),
+                data_offsets: (from, at),
+            };
+            (tensor.name.clone(), info)
+        });
+        let header = Metadata::new(Some(self.metadata.clone()), infos.collect()).map_err(io::Error::other)?;
+        let mut header = serde_json::to_vec(&header)?;
+        header.resize(header.len().next_multiple_of(8), b' ');
+        out.write_all(&(header.len() as u64).to_le_bytes())?;
+        out.write_all(&header)?;
+        let mut encoded = Vec::new();
+        for tensor in &tensors {
+            match tensor.content {
+                Content::Bytes(bytes) => out.write_all(bytes)?,
+                Content::Planes(planes) => {
+                    for c in 0..planes.count() {
+                        for piece in planes.plane(c)[..planes.len()].chunks(PIECE) {
+                            encoded.resize(4 * piece.len(), 0);
+                            for (to, value) in encoded.as_chunks_mut().0.iter_mut().zip(piece) {
+                                *to = value.to_le_bytes();
+                            }
+                            out.write_all(&encoded)?;
+                        }
+                    }
+                }
+            }
+        }
+        Ok(())
     }
-    let views = arrays.iter().map(|(name, dtype, shape, bytes)| {
-        let view = TensorView::new(*dtype, shape.clone(), bytes).expect("shape and bytes agree");
-        (name.as_str(), view)
-    });
-    let views = views.chain(tensors.iter().map(NamedTensor::view));
-    let metadata = HashMap::from([
-        ("format".to_owned(), FORMAT.to_owned()),
-        ("recipe".to_owned(), trainer.recipe.to_toml()),
-        ("seed".to_owned(), trainer.options.seed.to_string()),
-    ]);
-    safetensors::serialize(views, Some(metadata)).expect("in memory")
+}
+
+/// Numbers that are encoded at a time: they stay in cache on their way to the system.
+const PIECE: usize = 1 << 16;
+
+/// A tensor of the file.
+struct Tensor<'a> {
+    name: String,
+    dtype: Dtype,
+    shape: Vec<usize>,
+    content: Content<'a>,
+}
+
+enum Content<'a> {
+    Planes(&'a Planes),
+    Bytes(&'a [u8]),
+}
+
+impl Content<'_> {
+    /// Encoded, bytes.
+    fn len(&self) -> usize {
+        match self {
+            Content::Planes(planes) => 4 * planes.count() * planes.len(),
+            Content::Bytes(bytes) => bytes.len(),
+        }
+    }
+}
+
+impl<'a> Tensor<'a> {
+    fn of_planes(name: String, planes: &'a Planes) -> Self {
+        Self {
+            name,
+            dtype: Dtype::F32,
+            shape: vec![planes.count(), planes.len()],
+            content: Content::Planes(planes),
+        }
+    }
+}
+
+/// A [`Checkpoint`] in memory.
+pub fn to_bytes(trainer: &Trainer) -> Vec<u8> {
+    let mut bytes = Vec::new();
+    Checkpoint::of(trainer).write(&mut bytes).expect("in memory");
+    bytes
 }
 
 /// The recipe and the seed of a checkpoint.
@@ -163,14 +252,10 @@ pub fn from_bytes(bytes: &[u8], dataset: Arc<Dataset>, options: TrainOptions) ->
             return Err(wrong(format!("{name} has {} dimensions", shape.len())));
         };
         let mut planes = Planes::zeros(count, len);
-        let values = bytes
-            .as_chunks()
-            .0
-            .iter()
-            .map(|b| f32::from_le_bytes(*b))
-            .collect::<Vec<_>>();
         for c in 0..count {
-            planes.plane_mut(c)[..len].copy_from_slice(&values[c * len..(c + 1) * len]);
+            let from = bytes[4 * c * len..4 * (c + 1) * len].as_chunks().0;
+            let to = planes.plane_mut(c)[..len].par_iter_mut().with_min_len(PIECE);
+            to.zip(from).for_each(|(to, from)| *to = f32::from_le_bytes(*from));
         }
         Ok(planes)
     };
@@ -279,11 +364,4 @@ fn words(bytes: &[u8]) -> Vec<u64> {
 /// Little-endian double-precision numbers.
 fn reals(bytes: &[u8]) -> Vec<f64> {
     bytes.as_chunks().0.iter().map(|b| f64::from_le_bytes(*b)).collect()
-}
-
-fn plane_bytes(planes: &Planes) -> Vec<u8> {
-    (0..planes.count())
-        .flat_map(|c| &planes.plane(c)[..planes.len()])
-        .flat_map(|v| v.to_le_bytes())
-        .collect()
 }

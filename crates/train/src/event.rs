@@ -177,7 +177,14 @@ pub trait Observer {
         None
     }
 
-    /// Writes a checkpoint, if this observer is responsible for it; returns its path, relative to the run's folder.
+    /// A checkpoint that was completed in the background since the last call: its step, and its path relative to the run's folder;
+    /// polled after every event and forwarded as [`Event::Saved`].
+    fn saved(&mut self) -> Option<(u64, String)> {
+        None
+    }
+
+    /// Writes a checkpoint, if this observer is responsible for it; returns its path, relative to the run's folder, or nothing if
+    /// it is still being written.
     ///
     /// # Errors
     /// One line, which is forwarded as [`Event::Warned`]; training continues.

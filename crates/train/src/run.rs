@@ -180,8 +180,10 @@ fn tell(trainer: &Trainer, events: &mut Vec<Event>, observers: &mut [&mut dyn Ob
             requests.add(observer.on_event(&event, trainer));
         }
     }
-    let warnings = observers.iter_mut().filter_map(|observer| observer.warning());
-    events.extend(warnings.map(|message| Event::Warned { message }));
+    for observer in observers.iter_mut() {
+        events.extend(observer.saved().map(|(step, path)| Event::Saved { step, path }));
+        events.extend(observer.warning().map(|message| Event::Warned { message }));
+    }
     requests
 }
 

@@ -25,6 +25,16 @@ impl NamedTensor {
         }
     }
 
+    /// Double-precision numbers, one-dimensional.
+    pub(crate) fn double(name: impl Into<String>, values: &[f64]) -> Self {
+        Self {
+            name: name.into(),
+            shape: vec![values.len()],
+            dtype: Dtype::F64,
+            bytes: values.iter().flat_map(|v| v.to_le_bytes()).collect(),
+        }
+    }
+
     /// Integers, one-dimensional.
     pub fn whole(name: impl Into<String>, values: &[u64]) -> Self {
         Self {
@@ -39,6 +49,16 @@ impl NamedTensor {
     pub fn prefixed(self, prefix: &str) -> Self {
         let name = format!("{prefix}{}", self.name);
         Self { name, ..self }
+    }
+
+    /// The type of its numbers.
+    pub(crate) fn dtype(&self) -> Dtype {
+        self.dtype
+    }
+
+    /// Its numbers, little-endian.
+    pub(crate) fn bytes(&self) -> &[u8] {
+        &self.bytes
     }
 
     /// Its name, and its view for the safetensors crate.

@@ -98,6 +98,11 @@ macro_rules! float_lanes {
                 $vector(unsafe { $loadu(from.as_ptr()) })
             }
             #[inline(always)]
+            fn prefetch<T>(self, place: &T) {
+                // SAFETY: SSE is part of x86-64; a prefetch of any address has no effect but on caches.
+                unsafe { _mm_prefetch::<_MM_HINT_T0>((&raw const *place).cast()) }
+            }
+            #[inline(always)]
             fn transpose(self, from: &[f32], stride: usize, to: &mut [f32], to_stride: usize) {
                 let mut square = [self.splat(0.0); $lanes];
                 for i in 0..$lanes {

@@ -2,9 +2,10 @@
 //! an insufficiently covered region: small splats are cloned there, large ones split; faint and oversized ones are removed.
 
 use super::DensityChange;
-use super::split::{is_finite, largest_scale, random_halves, rebuild, without};
+use super::split::{indices, is_finite, largest_scale, random_halves, without};
 use crate::{SplatState, logit};
 use irradia_scene::Rng;
+use rayon::prelude::*;
 
 /// Options; docs give the Inria code's names and defaults.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -32,14 +33,15 @@ pub fn densify(state: &mut SplatState, options: &ClassicOptions, rng: &mut Rng) 
     let mean_gradient = |i: usize| state.mean_statistic(SplatState::GRADIENT, i);
 
     let mut wanted: Vec<(f32, u32)> = (0..n)
+        .into_par_iter()
         .map(|i| (mean_gradient(i), i as u32))
         .filter(|(g, _)| *g >= options.gradient_threshold)
         .collect();
     let room = options.max_splats.saturating_sub(n);
     if wanted.len() > room {
-        wanted.sort_unstable_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
+        wanted.par_sort_unstable_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
         wanted.truncate(room);
-        wanted.sort_unstable_by_key(|(_, i)| *i);
+        wanted.par_sort_unstable_by_key(|(_, i)| *i);
     }
     let (clone, split): (Vec<u32>, Vec<u32>) = wanted
         .iter()
@@ -48,19 +50,16 @@ pub fn densify(state: &mut SplatState, options: &ClassicOptions, rng: &mut Rng) 
 
     let halves = random_halves(splats, &split, rng);
     let mut clones = splats.gather(&clone);
-    let shared: Vec<f32> = clone
-        .iter()
-        .map(|i| logit((1.0 - (1.0 - splats.opacity(*i as usize)).sqrt()).max(1e-4)))
-        .collect();
-
     if options.revised_opacity {
-        for (copy, (i, logit)) in clone.iter().zip(&shared).enumerate() {
-            clones.opacity_logits.set(0, copy, *logit);
-            state.splats.opacity_logits.set(0, *i as usize, *logit);
+        for (copy, i) in clone.iter().enumerate() {
+            let opacity = state.splats.opacity(*i as usize);
+            let shared = logit((1.0 - (1.0 - opacity).sqrt()).max(1e-4));
+            clones.opacity_logits.set(0, copy, shared);
+            state.splats.opacity_logits.set(0, *i as usize, shared);
         }
     }
-    let left = without(n, &split);
-    rebuild(state, &left, &[&clones, &halves]);
+    let left = without((0..n as u32).collect(), &split);
+    state.rebuild(left, &[&clones, &halves], &[]);
     DensityChange {
         cloned: clone.len(),
         split: split.len(),
@@ -75,7 +74,7 @@ fn prune(state: &mut SplatState, options: &ClassicOptions) -> usize {
         let oversized = options.max_scale.is_some_and(|limit| largest_scale(splats, i) > limit);
         splats.opacity(i) >= options.min_opacity && !oversized && is_finite(splats, i)
     };
-    let kept: Vec<u32> = (0..n as u32).filter(|i| stays(*i as usize)).collect();
+    let kept = indices(n, stays);
     if kept.len() < n {
         state.gather(&kept);
     }
@@ -86,9 +85,8 @@ fn prune(state: &mut SplatState, options: &ClassicOptions) -> usize {
 /// recover within a few hundred steps, those of floaters in front of the cameras do not.
 pub fn reset_opacity(state: &mut SplatState, ceiling: f32) {
     let ceiling = logit(ceiling);
-    for value in state.splats.opacity_logits.as_mut_slice() {
-        *value = value.min(ceiling);
-    }
+    let logits = state.splats.opacity_logits.as_mut_slice();
+    logits.par_iter_mut().for_each(|value| *value = value.min(ceiling));
     for moment in &mut state.moments {
         moment.opacity_logits.clear();
     }

@@ -7,8 +7,9 @@
 //! (DashGaussian, Chen et al. 2025). Halves preserve the image, so that no step is spent on recovery, and opacities are never reset.
 
 use super::DensityChange;
-use super::split::{is_finite, long_axis_halves, rebuild, without};
+use super::split::{indices, is_finite, long_axis_halves, without};
 use crate::SplatState;
+use rayon::prelude::*;
 
 /// Options.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -38,19 +39,21 @@ pub fn densify(state: &mut SplatState, options: &FastOptions) -> DensityChange {
         let shows = seen < FRAMES || state.mean_statistic(SplatState::WEIGHT, i) >= options.min_weight;
         shows && state.splats.opacity(i) >= options.min_opacity && is_finite(&state.splats, i)
     };
-    let mut kept: Vec<u32> = (0..n as u32).filter(|i| stays(*i as usize)).collect();
+    let mut kept = indices(n, stays);
     if kept.len() < options.floor.min(n) {
         kept = most_shown(state, options.floor);
     }
-    state.gather(&kept);
+    let left = kept.len();
 
-    let room = options.target.saturating_sub(state.len());
-    let mut wanted: Vec<(f32, u32)> = (0..state.len())
+    let room = options.target.saturating_sub(left);
+    let mut wanted: Vec<(f32, u32)> = kept
+        .par_iter()
         .filter(|i| {
-            state.statistics.get(SplatState::SEEN, *i) >= FRAMES
-                && state.statistics.get(SplatState::EXTENT, *i) >= options.min_extent
+            let i = **i as usize;
+            state.statistics.get(SplatState::SEEN, i) >= FRAMES
+                && state.statistics.get(SplatState::EXTENT, i) >= options.min_extent
         })
-        .map(|i| (state.mean_statistic(SplatState::ERROR, i), i as u32))
+        .map(|i| (state.mean_statistic(SplatState::ERROR, *i as usize), *i))
         .filter(|(error, _)| *error >= options.error_threshold)
         .collect();
     if wanted.len() > room {
@@ -58,14 +61,13 @@ pub fn densify(state: &mut SplatState, options: &FastOptions) -> DensityChange {
         wanted.truncate(room);
     }
     let mut split: Vec<u32> = wanted.into_iter().map(|(_, i)| i).collect();
-    split.sort_unstable();
+    split.par_sort_unstable();
     let halves = long_axis_halves(&state.splats, &split);
-    let left = without(state.len(), &split);
-    rebuild(state, &left, &[&halves]);
+    state.rebuild(without(kept, &split), &[&halves], &[]);
     DensityChange {
         cloned: 0,
         split: split.len(),
-        pruned: n - kept.len(),
+        pruned: n - left,
     }
 }
 

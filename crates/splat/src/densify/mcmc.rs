@@ -2,9 +2,8 @@
 //! splats are relocated to live ones, the number grows to a fixed budget, and noise explores.
 
 use super::DensityChange;
-use super::split::{draw, is_finite, rebuild};
-use crate::{SplatState, logit, sigmoid};
-use irradia_compute::Planes;
+use super::split::{draw, indices, is_finite};
+use crate::{SplatState, Splats, logit, sigmoid};
 use irradia_scene::Rng;
 use rayon::prelude::*;
 
@@ -23,22 +22,23 @@ pub struct McmcOptions {
 pub fn densify(state: &mut SplatState, options: &McmcOptions, rng: &mut Rng) -> DensityChange {
     let n = state.len();
     let opacities: Vec<f32> = (0..n)
+        .into_par_iter()
         .map(|i| {
             let opacity = state.splats.opacity(i);
             let alive = opacity > options.min_opacity && is_finite(&state.splats, i);
             if alive { opacity } else { 0.0 }
         })
         .collect();
-    let alive: Vec<u32> = (0..n as u32).filter(|i| opacities[*i as usize] > 0.0).collect();
+    let alive = indices(n, |i| opacities[i] > 0.0);
     if alive.is_empty() {
         return DensityChange::default(); // No live splat to relocate to.
     }
     let dead = n - alive.len();
     let target = ((n as f32 * options.growth) as usize).clamp(n, options.max_splats.max(n));
     let sources = draw(&opacities, target - alive.len(), rng);
-    replicate(state, &sources);
+    let replicated = replicate(&mut state.splats, &sources);
     let copies = state.splats.gather(&sources);
-    rebuild(state, &alive, &[&copies]);
+    state.rebuild(alive, &[&copies], &replicated);
     DensityChange {
         cloned: sources.len(),
         split: 0,
@@ -47,18 +47,22 @@ pub fn densify(state: &mut SplatState, options: &McmcOptions, rng: &mut Rng) -> 
 }
 
 /// Reduces opacity and size of each splat that occurs k times in `sources` (ascending) so that it and k copies of it together
-/// render like the original (eq. 9), and resets its moments.
-fn replicate(state: &mut SplatState, sources: &[u32]) {
-    for group in sources.chunk_by(|a, b| a == b) {
+/// render like the original (eq. 9). Returns these splats, whose moments are to be reset.
+fn replicate(splats: &mut Splats, sources: &[u32]) -> Vec<u32> {
+    let groups: Vec<&[u32]> = sources.chunk_by(|a, b| a == b).collect();
+    let replicas: Vec<(f32, f32)> = groups
+        .par_iter()
+        .map(|group| replica(splats.opacity(group[0] as usize), group.len() + 1))
+        .collect();
+    for (group, (opacity, factor)) in groups.iter().zip(replicas) {
         let i = group[0] as usize;
-        let (opacity, factor) = replica(state.splats.opacity(i), group.len() + 1);
-        state.splats.opacity_logits.set(0, i, logit(opacity));
+        splats.opacity_logits.set(0, i, logit(opacity));
         for c in 0..3 {
-            let log_scale = state.splats.log_scales.get(c, i);
-            state.splats.log_scales.set(c, i, log_scale + factor.ln());
+            let log_scale = splats.log_scales.get(c, i);
+            splats.log_scales.set(c, i, log_scale + factor.ln());
         }
-        state.reset_moments(i);
     }
+    groups.iter().map(|group| group[0]).collect()
 }
 
 /// Maximum number of copies for which eq. 9 is evaluated: its alternating sum loses precision beyond.
@@ -119,15 +123,23 @@ pub fn add_noise(state: &mut SplatState, rate: f32, seed: u64, step: u64) {
                 .collect()
         })
         .collect();
-    let means: &mut Planes = &mut state.splats.means;
-    for (i, offset) in offsets.into_iter().flatten() {
-        for c in 0..3 {
-            let moved = means.get(c, i as usize) + offset[c];
-            if moved.is_finite() {
-                means.set(c, i as usize, moved);
-            }
-        }
-    }
+    let means = &mut state.splats.means;
+    let stride = means.stride().max(1);
+    means
+        .as_mut_slice()
+        .par_chunks_mut(stride)
+        .enumerate()
+        .for_each(|(c, plane)| {
+            plane.par_chunks_mut(CHUNK).zip(&offsets).for_each(|(means, offsets)| {
+                for (i, offset) in offsets {
+                    let mean = &mut means[*i as usize % CHUNK];
+                    let moved = *mean + offset[c];
+                    if moved.is_finite() {
+                        *mean = moved;
+                    }
+                }
+            });
+        });
 }
 
 /// Random stream of the noise, derived from the run's seed.
@@ -136,7 +148,6 @@ const STREAM_NOISE: u64 = 4;
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::Splats;
 
     fn state(opacities: &[f32]) -> SplatState {
         let mut splats = Splats::zeros(opacities.len(), 0);

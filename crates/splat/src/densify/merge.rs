@@ -2,7 +2,7 @@
 //! regulariser that reverses excessive densification.
 
 use super::DensityChange;
-use super::split::is_finite;
+use super::split::{indices, is_finite, without};
 use crate::nearest::Nearest;
 use crate::{SplatState, logit};
 use glam::{Mat3, Quat, Vec3};
@@ -20,13 +20,10 @@ pub struct MergeOptions {
 /// Merges pairs that are mutual nearest neighbours, adjacent and similar; clears the statistics.
 pub fn merge(state: &mut SplatState, options: &MergeOptions) -> DensityChange {
     let pairs = pairs(state, options);
-    let mut gone = vec![false; state.len()];
-    for (a, b) in &pairs {
-        unite(state, *a as usize, *b as usize);
-        gone[*b as usize] = true;
-    }
-    let kept: Vec<u32> = (0..state.len() as u32).filter(|i| !gone[*i as usize]).collect();
-    state.gather(&kept);
+    unite(state, &pairs);
+    let mut gone: Vec<u32> = pairs.iter().map(|(_, b)| *b).collect();
+    gone.sort_unstable();
+    state.gather(&without((0..state.len() as u32).collect(), &gone));
     state.statistics.clear();
     DensityChange {
         pruned: pairs.len(),
@@ -40,13 +37,11 @@ fn mean(state: &SplatState, i: usize) -> Vec3 {
 
 fn pairs(state: &SplatState, options: &MergeOptions) -> Vec<(u32, u32)> {
     let splats = &state.splats;
-    let whole: Vec<u32> = (0..state.len() as u32)
-        .filter(|i| is_finite(splats, *i as usize))
-        .collect();
+    let whole = indices(state.len(), |i| is_finite(splats, i));
     if whole.len() < 2 {
         return Vec::new();
     }
-    let positions: Vec<[f32; 3]> = whole.iter().map(|i| mean(state, *i as usize).to_array()).collect();
+    let positions: Vec<[f32; 3]> = whole.par_iter().map(|i| mean(state, *i as usize).to_array()).collect();
     let tree = Nearest::new(&positions);
     let nearest: Vec<u32> = positions
         .par_iter()
@@ -59,6 +54,7 @@ fn pairs(state: &SplatState, options: &MergeOptions) -> Vec<(u32, u32)> {
         })
         .collect();
     (0..whole.len() as u32)
+        .into_par_iter()
         .filter(|i| {
             let other = nearest[*i as usize];
             *i < other && nearest[other as usize] == *i
@@ -88,10 +84,20 @@ fn covariance(state: &SplatState, i: usize) -> Mat3 {
     rotation * Mat3::from_diagonal(variance) * rotation.transpose()
 }
 
-/// Replaces a by the union of a and b.
-fn unite(state: &mut SplatState, a: usize, b: usize) {
-    let volume = |s: &SplatState, i: usize| (0..3).map(|c| s.splats.log_scales.get(c, i)).sum::<f32>().exp();
-    let masses = [a, b].map(|i| state.splats.opacity(i) * volume(state, i));
+/// The union of two splats.
+struct Union {
+    /// Of each of the two in the sum of their masses.
+    fractions: [f32; 2],
+    mean: Vec3,
+    rotation: Quat,
+    log_scales: [f32; 3],
+    opacity_logit: f32,
+}
+
+fn union(state: &SplatState, a: usize, b: usize) -> Union {
+    let volume = |log_scales: [f32; 3]| log_scales.into_iter().sum::<f32>().exp();
+    let own_volume = |i: usize| volume(std::array::from_fn(|c| state.splats.log_scales.get(c, i)));
+    let masses = [a, b].map(|i| state.splats.opacity(i) * own_volume(i));
     let total = (masses[0] + masses[1]).max(f32::MIN_POSITIVE);
     let fractions = masses.map(|m| m / total);
     let (ma, mb) = (mean(state, a), mean(state, b));
@@ -100,21 +106,47 @@ fn unite(state: &mut SplatState, a: usize, b: usize) {
     let cov = (covariance(state, a) + outer(ma - center)) * fractions[0]
         + (covariance(state, b) + outer(mb - center)) * fractions[1];
     let (rotation, variances) = eigen(cov);
+    let log_scales = variances.to_array().map(|v| 0.5 * v.max(1e-30).ln());
+    let opacity = total / volume(log_scales).max(f32::MIN_POSITIVE);
+    Union {
+        fractions,
+        mean: center,
+        rotation,
+        log_scales,
+        opacity_logit: logit(opacity.clamp(1e-4, 0.999)),
+    }
+}
+
+/// Replaces the first splat of each pair by the union of the two, and resets its moments.
+fn unite(state: &mut SplatState, pairs: &[(u32, u32)]) {
+    let unions: Vec<Union> = pairs
+        .par_iter()
+        .map(|(a, b)| union(state, *a as usize, *b as usize))
+        .collect();
     let splats = &mut state.splats;
-    for c in 0..3 {
-        splats.means.set(c, a, center[c]);
-        splats.log_scales.set(c, a, 0.5 * variances[c].max(1e-30).ln());
+    for ((a, _), union) in pairs.iter().zip(&unions) {
+        let (a, q) = (*a as usize, union.rotation);
+        for c in 0..3 {
+            splats.means.set(c, a, union.mean[c]);
+            splats.log_scales.set(c, a, union.log_scales[c]);
+        }
+        for (c, v) in [q.w, q.x, q.y, q.z].into_iter().enumerate() {
+            splats.quats.set(c, a, v);
+        }
+        splats.opacity_logits.set(0, a, union.opacity_logit);
     }
-    for (c, v) in [rotation.w, rotation.x, rotation.y, rotation.z].into_iter().enumerate() {
-        splats.quats.set(c, a, v);
+    let stride = splats.stride().max(1);
+    splats.sh.as_mut_slice().par_chunks_mut(stride).for_each(|plane| {
+        for ((a, b), union) in pairs.iter().zip(&unions) {
+            let (a, b) = (*a as usize, *b as usize);
+            plane[a] = union.fractions[0] * plane[a] + union.fractions[1] * plane[b];
+        }
+    });
+    for column in state.moments.iter_mut().flat_map(|moment| moment.columns_mut()) {
+        column.as_mut_slice().par_chunks_mut(stride).for_each(|plane| {
+            pairs.iter().for_each(|(a, _)| plane[*a as usize] = 0.0);
+        });
     }
-    for c in 0..splats.sh.count() {
-        let v = fractions[0] * splats.sh.get(c, a) + fractions[1] * splats.sh.get(c, b);
-        splats.sh.set(c, a, v);
-    }
-    let opacity = total / volume(state, a).max(f32::MIN_POSITIVE);
-    state.splats.opacity_logits.set(0, a, logit(opacity.clamp(1e-4, 0.999)));
-    state.reset_moments(a);
 }
 
 /// Rotation to the principal axes and the variances along them, of a symmetric matrix: cyclic Jacobi rotations, which at

@@ -1,8 +1,9 @@
 //! Shared by the strategies: drawing splats by weight, and replacing one splat by two.
 
-use crate::{SplatState, Splats, logit, sigmoid};
+use crate::{Splats, logit};
 use glam::{Quat, Vec3};
 use irradia_scene::Rng;
+use rayon::prelude::*;
 
 /// Factor by which the two halves of a split splat are smaller: 0.8 times 2 (Inria code).
 const RANDOM_SHRINK: f32 = 1.6;
@@ -28,64 +29,98 @@ fn rotation(splats: &Splats, i: usize) -> Quat {
     Quat::from_xyzw(q(1), q(2), q(3), q(0)).normalize()
 }
 
-fn shift(splats: &mut Splats, i: usize, offset: Vec3) {
+/// The indices below `count` for which `keep` holds, ascending.
+pub(super) fn indices(count: usize, keep: impl Fn(usize) -> bool + Sync) -> Vec<u32> {
+    (0..count as u32)
+        .into_par_iter()
+        .filter(|i| keep(*i as usize))
+        .collect()
+}
+
+/// All of `kept` except `gone` (ascending).
+pub(super) fn without(kept: Vec<u32>, gone: &[u32]) -> Vec<u32> {
+    if gone.is_empty() {
+        return kept;
+    }
+    kept.into_par_iter()
+        .filter(|i| gone.binary_search(i).is_err())
+        .collect()
+}
+
+/// What splitting changes of a splat: offset of the mean, ln scales, opacity logit.
+type Half = (Vec3, [f32; 3], f32);
+
+/// Splats of a parallel task.
+const PIECE: usize = 4096;
+
+/// Each of `indices` twice, adjacent, changed as `half` tells. The result does not depend on the number of threads.
+fn halves(splats: &Splats, indices: &[u32], half: impl Fn(&Splats, usize, usize) -> Half + Sync) -> Splats {
+    let mut halves = twice(splats, indices);
+    let changes: Vec<Half> = (0..halves.len())
+        .into_par_iter()
+        .with_min_len(PIECE)
+        .map(|i| half(splats, indices[i / 2] as usize, i))
+        .collect();
     for c in 0..3 {
-        splats.means.set(c, i, splats.means.get(c, i) + offset[c]);
+        let planes = [halves.means.plane_mut(c), halves.log_scales.plane_mut(c)];
+        let [means, log_scales] = planes;
+        means
+            .par_iter_mut()
+            .zip(log_scales)
+            .zip(&changes)
+            .with_min_len(PIECE)
+            .for_each(|((mean, log_scale), (offset, log_scales, _))| {
+                *mean += offset[c];
+                *log_scale = log_scales[c];
+            });
     }
-}
-
-/// All indices below `count` except `gone` (ascending).
-pub(super) fn without(count: usize, gone: &[u32]) -> Vec<u32> {
-    (0..count as u32).filter(|i| gone.binary_search(i).is_err()).collect()
-}
-
-/// Ends a round: keeps `kept`, appends `added`, clears the statistics and restores Morton order.
-pub(super) fn rebuild(state: &mut SplatState, kept: &[u32], added: &[&Splats]) {
-    state.gather(kept);
-    for splats in added {
-        state.append(splats);
-    }
-    state.statistics.clear();
-    state.sort_morton();
+    let logits = halves.opacity_logits.plane_mut(0);
+    logits
+        .iter_mut()
+        .zip(&changes)
+        .for_each(|(to, (.., logit))| *to = *logit);
+    halves
 }
 
 /// Two random samples of each of `indices`, smaller, adjacent in the result (3DGS).
 pub(super) fn random_halves(splats: &Splats, indices: &[u32], rng: &mut Rng) -> Splats {
-    let mut halves = twice(splats, indices);
-    for i in 0..halves.len() {
-        let offset = Vec3::from_array(std::array::from_fn(|c| {
-            halves.log_scales.get(c, i).exp() * rng.normal()
-        }));
-        let offset = rotation(&halves, i) * offset;
-        shift(&mut halves, i, offset);
-        for c in 0..3 {
-            halves
-                .log_scales
-                .set(c, i, halves.log_scales.get(c, i) - RANDOM_SHRINK.ln());
-        }
-    }
-    halves
+    /// Draws of 32 bits that a half takes: three normal variates of two each.
+    const DRAWS: u64 = 6;
+    let start = *rng;
+    rng.advance(DRAWS * 2 * indices.len() as u64);
+    halves(splats, indices, |splats, i, half| {
+        let mut rng = start;
+        rng.advance(DRAWS * half as u64);
+        let log_scales = log_scales(splats, i);
+        let offset = Vec3::from_array(log_scales.map(|s| s.exp() * rng.normal()));
+        let smaller = log_scales.map(|s| s - RANDOM_SHRINK.ln());
+        (rotation(splats, i) * offset, smaller, splats.opacity_logits.get(0, i))
+    })
 }
 
 /// Splits each of `indices` in two across its longest axis, adjacent in the result: together they have its mass, mean and
 /// covariance, so that the image hardly changes when they replace it.
 pub(super) fn long_axis_halves(splats: &Splats, indices: &[u32]) -> Splats {
-    let mut halves = twice(splats, indices);
-    for i in 0..halves.len() {
+    halves(splats, indices, |splats, i, half| {
+        let mut log_scales = log_scales(splats, i);
         let axis = (0..3)
-            .max_by(|a, b| halves.log_scales.get(*a, i).total_cmp(&halves.log_scales.get(*b, i)))
+            .max_by(|a, b| log_scales[*a].total_cmp(&log_scales[*b]))
             .expect("three axes");
-        let log_scale = halves.log_scales.get(axis, i);
-        let distance = log_scale.exp() * (1.0 - HALF * HALF).sqrt();
+        let distance = log_scales[axis].exp() * (1.0 - HALF * HALF).sqrt();
         let mut offset = Vec3::ZERO;
-        offset[axis] = if i % 2 == 0 { distance } else { -distance };
-        let offset = rotation(&halves, i) * offset;
-        shift(&mut halves, i, offset);
-        halves.log_scales.set(axis, i, log_scale + HALF.ln());
-        let opacity = sigmoid(halves.opacity_logits.get(0, i)) / (2.0 * HALF);
-        halves.opacity_logits.set(0, i, logit(opacity.clamp(1e-4, 0.999)));
-    }
-    halves
+        offset[axis] = if half % 2 == 0 { distance } else { -distance };
+        log_scales[axis] += HALF.ln();
+        let opacity = splats.opacity(i) / (2.0 * HALF);
+        (
+            rotation(splats, i) * offset,
+            log_scales,
+            logit(opacity.clamp(1e-4, 0.999)),
+        )
+    })
+}
+
+fn log_scales(splats: &Splats, i: usize) -> [f32; 3] {
+    std::array::from_fn(|c| splats.log_scales.get(c, i))
 }
 
 fn twice(splats: &Splats, indices: &[u32]) -> Splats {
@@ -106,26 +141,34 @@ pub(super) fn draw(weights: &[f32], count: usize, rng: &mut Rng) -> Vec<u32> {
     if !(sum > 0.0 && sum.is_finite()) {
         return Vec::new();
     }
-    let mut drawn: Vec<u32> = (0..count)
-        .map(|_| {
-            let at = f64::from(rng.uniform()) * sum;
+    let uniforms: Vec<f32> = (0..count).map(|_| rng.uniform()).collect();
+    let mut drawn: Vec<u32> = uniforms
+        .into_par_iter()
+        .map(|u| {
+            let at = f64::from(u) * sum;
             cumulative.partition_point(|c| *c <= at).min(weights.len() - 1) as u32
         })
         .collect();
-    drawn.sort_unstable();
+    drawn.par_sort_unstable();
     drawn
 }
 
 /// At most `count` distinct indices, with probability proportional to `weights`, ascending: the largest of `u^(1/w)`
 /// (Efraimidis and Spirakis 2006). Weights of zero are never drawn.
 pub(super) fn draw_distinct(weights: &[f32], count: usize, rng: &mut Rng) -> Vec<u32> {
+    let start = *rng;
+    rng.advance(weights.len() as u64);
     let mut keys: Vec<(f32, u32)> = weights
-        .iter()
+        .par_chunks(PIECE)
         .enumerate()
-        .filter_map(|(i, w)| {
-            // The logarithm of the key; one random number per item, so that a weight does not affect other items' keys.
-            let u = rng.uniform().max(f32::MIN_POSITIVE).ln();
-            (*w > 0.0 && w.is_finite()).then(|| (u / w, i as u32))
+        .flat_map_iter(|(piece, weights)| {
+            let mut rng = start;
+            rng.advance((piece * PIECE) as u64);
+            weights.iter().enumerate().filter_map(move |(i, w)| {
+                // The logarithm of the key; one random number per item, so that a weight does not affect other items' keys.
+                let u = rng.uniform().max(f32::MIN_POSITIVE).ln();
+                (*w > 0.0 && w.is_finite()).then(|| (u / w, (piece * PIECE + i) as u32))
+            })
         })
         .collect();
     if keys.len() > count {
@@ -133,13 +176,14 @@ pub(super) fn draw_distinct(weights: &[f32], count: usize, rng: &mut Rng) -> Vec
         keys.truncate(count);
     }
     let mut chosen: Vec<u32> = keys.into_iter().map(|(_, i)| i).collect();
-    chosen.sort_unstable();
+    chosen.par_sort_unstable();
     chosen
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::sigmoid;
 
     #[test]
     fn halves_preserve_mass_mean_and_variance() {
@@ -167,6 +211,41 @@ mod tests {
             .sum();
         assert!((mass - 0.6 * 2.0).abs() < 1e-4);
         assert_eq!(halves.log_scales.get(0, 0), splats.log_scales.get(0, 0));
+    }
+
+    /// Against one splat, and one random number, after the other.
+    #[test]
+    fn random_halves_and_draws_are_those_of_one_thread() {
+        let n = 3 * PIECE + 7;
+        let mut splats = Splats::zeros(n, 0);
+        let mut rng = Rng::new(2, 2);
+        for i in 0..n {
+            (0..4).for_each(|c| splats.quats.set(c, i, rng.normal()));
+            (0..3).for_each(|c| splats.log_scales.set(c, i, rng.normal()));
+        }
+        let indices: Vec<u32> = (0..n as u32).step_by(2).collect();
+        let mut serial = Rng::new(7, 3);
+        let mut expected = Vec::new();
+        for i in indices.iter().flat_map(|i| [*i as usize; 2]) {
+            let local = Vec3::from_array(log_scales(&splats, i).map(|s| s.exp() * serial.normal()));
+            expected.push((rotation(&splats, i) * local).to_array());
+        }
+        let weights: Vec<f32> = (0..n).map(|i| (i % 5) as f32).collect();
+        let mut keys: Vec<(f32, u32)> = (0..n)
+            .map(|i| (serial.uniform().max(f32::MIN_POSITIVE).ln() / weights[i], i as u32))
+            .filter(|(_, i)| weights[*i as usize] > 0.0)
+            .collect();
+        keys.sort_by(|a, b| b.0.total_cmp(&a.0));
+        let mut drawn: Vec<u32> = keys[..500].iter().map(|(_, i)| *i).collect();
+        drawn.sort_unstable();
+        for threads in [1, 2] {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            let mut rng = Rng::new(7, 3);
+            let halves = pool.install(|| random_halves(&splats, &indices, &mut rng));
+            assert!((0..halves.len()).all(|i| halves.mean(i) == expected[i]));
+            assert_eq!(pool.install(|| draw_distinct(&weights, 500, &mut rng)), drawn);
+            assert_eq!(rng, serial, "as many random numbers are used");
+        }
     }
 
     #[test]

@@ -2,9 +2,10 @@
 //! training. Each round adds the number of splats that the count curve prescribes, where the scores are high.
 
 use super::DensityChange;
-use super::split::{draw_distinct, is_finite, largest_scale, random_halves, rebuild, without};
+use super::split::{draw_distinct, indices, is_finite, largest_scale, random_halves, without};
 use crate::SplatState;
 use irradia_scene::Rng;
+use rayon::prelude::*;
 
 /// Options.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -58,10 +59,10 @@ pub fn next_count(now: usize, last: usize, completed: [f64; 2]) -> usize {
 /// Morton order. Splats that are not finite are always removed.
 pub fn densify(state: &mut SplatState, options: &TamingOptions, rng: &mut Rng) -> DensityChange {
     let n = state.len();
-    let finite: Vec<u32> = (0..n as u32)
-        .filter(|i| is_finite(&state.splats, *i as usize))
-        .collect();
-    state.gather(&finite);
+    let finite = indices(n, |i| is_finite(&state.splats, i));
+    if finite.len() < n {
+        state.gather(&finite);
+    }
     let scores = scores(state, &options.weights);
     let [clone, split] = select(state, options, &scores, rng);
     let mut removed = removed(state, options, &scores, rng);
@@ -71,8 +72,8 @@ pub fn densify(state: &mut SplatState, options: &TamingOptions, rng: &mut Rng) -
     let clones = state.splats.gather(&clone);
     let mut gone = [&split[..], &removed[..]].concat();
     gone.sort_unstable();
-    let left = without(state.len(), &gone);
-    rebuild(state, &left, &[&clones, &halves]);
+    let left = without((0..state.len() as u32).collect(), &gone);
+    state.rebuild(left, &[&clones, &halves], &[]);
     DensityChange {
         cloned: clone.len(),
         split: split.len(),
@@ -119,17 +120,20 @@ fn removed(state: &SplatState, options: &TamingOptions, scores: &[f32], rng: &mu
 fn scores(state: &SplatState, weights: &ScoreWeights) -> Vec<f32> {
     let n = state.len();
     let mut scores = vec![0.0f32; n];
-    let mut add = |weight: f32, part: &dyn Fn(usize) -> f32| {
-        let values: Vec<f32> = (0..n).map(part).collect();
-        let mut positive: Vec<f32> = values.iter().copied().filter(|v| *v > 0.0 && v.is_finite()).collect();
+    let mut add = |weight: f32, part: &(dyn Fn(usize) -> f32 + Sync)| {
+        let values: Vec<f32> = (0..n).into_par_iter().map(part).collect();
+        let mut positive: Vec<f32> = values
+            .par_iter()
+            .copied()
+            .filter(|v| *v > 0.0 && v.is_finite())
+            .collect();
         if weight == 0.0 || positive.is_empty() {
             return;
         }
         let middle = positive.len() / 2;
         let median = *positive.select_nth_unstable_by(middle, f32::total_cmp).1;
-        for (score, value) in scores.iter_mut().zip(values) {
-            *score += weight * value / median;
-        }
+        let add = |(score, value): (&mut f32, f32)| *score += weight * value / median;
+        scores.par_iter_mut().zip(values).for_each(add);
     };
     add(weights.gradient, &|i| state.mean_statistic(SplatState::GRADIENT, i));
     add(weights.error, &|i| state.mean_statistic(SplatState::ERROR, i));

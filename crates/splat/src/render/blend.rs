@@ -32,6 +32,8 @@ pub(super) struct Footprint2d {
     pub depth: f32,
     /// Half sizes of the bounding box outside which alpha < 1/255, pixels.
     pub extent: [f32; 2],
+    /// First of its hits and their number, in its part.
+    pub hits: [u32; 2],
 }
 
 /// Pixels of a block.
@@ -98,17 +100,17 @@ pub(super) fn fragment_vjp<F: Lanes>(at: &Fragment<F>, transmittance: F, g: F, r
 }
 
 /// Blends one tile front to back into `out [CHANNELS, blocks, BLOCK]`.
-pub(super) struct BlendTile<'a, I> {
+pub(super) struct BlendTile<'a> {
     pub footprints: &'a [Footprint2d],
     /// The tile's splats, front to back.
-    pub entries: I,
+    pub entries: &'a [Entry],
     /// Pixel coordinates of the tile's corner.
     pub corner: [f32; 2],
     pub with_depth: bool,
     pub out: &'a mut [f32; CHANNELS * TILE_PIXELS],
 }
 
-impl<I: Iterator<Item = Entry>> Kernel for BlendTile<'_, I> {
+impl Kernel for BlendTile<'_> {
     type Output = ();
 
     #[inline(always)]
@@ -124,7 +126,7 @@ impl<I: Iterator<Item = Entry>> Kernel for BlendTile<'_, I> {
     }
 }
 
-impl<I: Iterator<Item = Entry>> BlendTile<'_, I> {
+impl BlendTile<'_> {
     #[inline(always)]
     fn blend<S: Simd, const DEPTH: bool>(self, simd: S)
     where
@@ -138,7 +140,10 @@ impl<I: Iterator<Item = Entry>> BlendTile<'_, I> {
         let (blue, depths) = colors.split_at_mut(TILE_PIXELS);
         // Bit b: some pixel of block b has not terminated.
         let mut live = u64::MAX;
-        for entry in self.entries {
+        for (i, entry) in self.entries.iter().enumerate() {
+            if let Some(later) = self.entries.get(i + AHEAD) {
+                simd.prefetch(&self.footprints[later.splat as usize]);
+            }
             let blocks = entry.blocks & live;
             if blocks == 0 {
                 if live == 0 {
@@ -185,6 +190,9 @@ impl<I: Iterator<Item = Entry>> BlendTile<'_, I> {
         }
     }
 }
+
+/// How many entries ahead footprints are fetched: in depth order they are far apart in memory.
+const AHEAD: usize = 8;
 
 /// The bits of `blocks` in `band`, from bit 0.
 #[inline(always)]
@@ -265,9 +273,9 @@ const BLOCK_TOP: [f32; BAND_BLOCKS] = [
 ///
 /// Front to back, as in the forward pass: every test then has exactly the same operands. The light from behind a splat follows
 /// from the pixel's total: `rest` starts at the total and loses each splat's contribution.
-pub(super) struct BlendTileVjp<'a, I> {
+pub(super) struct BlendTileVjp<'a> {
     pub footprints: &'a [Footprint2d],
-    pub entries: I,
+    pub entries: &'a [Entry],
     pub corner: [f32; 2],
     /// Gradients of red, green, blue and depth over the tile, then its error, `[CHANNELS, blocks, BLOCK]`; zero outside the
     /// image.
@@ -281,7 +289,7 @@ pub(super) struct BlendTileVjp<'a, I> {
     pub sums: &'a mut [[f32; SUMS]],
 }
 
-impl<I: Iterator<Item = Entry>> Kernel for BlendTileVjp<'_, I> {
+impl Kernel for BlendTileVjp<'_> {
     type Output = ();
 
     #[inline(always)]
@@ -300,7 +308,7 @@ impl<I: Iterator<Item = Entry>> Kernel for BlendTileVjp<'_, I> {
     }
 }
 
-impl<I: Iterator<Item = Entry>> BlendTileVjp<'_, I> {
+impl BlendTileVjp<'_> {
     #[inline(always)]
     fn backward<S: Simd, const DEPTH: bool, const GATHER: u8>(self, simd: S)
     where
@@ -311,7 +319,10 @@ impl<I: Iterator<Item = Entry>> BlendTileVjp<'_, I> {
             std::array::from_fn(|c| &self.v_out[c * TILE_PIXELS..][..TILE_PIXELS]);
         let zero = simd.splat(0.0);
         let mut live = u64::MAX;
-        for (entry, out) in self.entries.zip(self.sums) {
+        for (i, (entry, out)) in self.entries.iter().zip(self.sums).enumerate() {
+            if let Some(later) = self.entries.get(i + AHEAD) {
+                simd.prefetch(&self.footprints[later.splat as usize]);
+            }
             let blocks = entry.blocks & live;
             if blocks == 0 {
                 *out = [0.0; SUMS];

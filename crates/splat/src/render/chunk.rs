@@ -1,10 +1,13 @@
 //! Projection of a chunk of splats, and its vector-Jacobian product: connects the planar columns in memory to the arithmetic
 //! of [`super::project`] and [`super::sh`].
 
+use super::bin::Part;
 use super::blend::{Footprint2d, SUMS};
 use super::harmonics::{CHUNK, Harmonics};
 use super::project::{Footprint, Geometry, footprint_gradient, project, project_vjp, quadratic};
-use super::{CameraGradient, RenderOptions, Renderer, ViewParams};
+use super::sh::MAX_COEFFICIENTS;
+use super::touch::{Outline, Spans};
+use super::{CameraGradient, RenderOptions, Renderer, SplatGradients, ViewParams};
 use crate::Splats;
 use irradia_compute::simd::{Kernel, Lanes, Mask, Simd};
 use irradia_compute::unroll;
@@ -22,6 +25,21 @@ where
     }
 }
 
+/// How many splats ahead geometry is fetched.
+const AHEAD: usize = 64;
+
+/// Fetches what [`load_geometry`] will read.
+#[inline(always)]
+fn prefetch_geometry<S: Simd>(simd: S, splats: &Splats, at: usize) {
+    let at = at.min(splats.stride() - 1);
+    let [means, quats, log_scales, opacity_logits, _] = splats.columns();
+    for column in [means, quats, log_scales, opacity_logits] {
+        for c in 0..column.count() {
+            simd.prefetch(&column.plane(c)[at]);
+        }
+    }
+}
+
 /// The filter's variances from splat `at` on, if there is a filter.
 #[inline(always)]
 fn load_filter<S: Simd>(simd: S, filter: &[f32], at: usize) -> Option<S::F>
@@ -35,7 +53,17 @@ where
     }
 }
 
-pub(super) struct ProjectChunk<'a> {
+/// A chunk of splats to project.
+pub(super) struct ChunkJob<'a> {
+    pub chunk: usize,
+    pub footprints: &'a mut [Footprint2d],
+    pub depth_keys: &'a mut [u32],
+    /// Number of its visible splats, to be written.
+    pub visible: &'a mut u32,
+}
+
+/// Projects chunks and lists the tiles that their splats touch.
+pub(super) struct ProjectPart<'a, 'b> {
     pub splats: &'a Splats,
     /// As passed to [`Renderer::set_filter`].
     pub filter: &'a [f32],
@@ -43,37 +71,58 @@ pub(super) struct ProjectChunk<'a> {
     pub options: &'a RenderOptions,
     /// Whether colours are final: clamped at 0.
     pub clamp: bool,
-    pub first: usize,
-    pub footprints: &'a mut [Footprint2d],
-    pub depth_keys: &'a mut [u32],
+    /// Columns and rows of tiles.
+    pub tiles: [usize; 2],
+    /// In ascending order.
+    pub jobs: &'a mut [ChunkJob<'b>],
+    pub part: &'a mut Part,
 }
 
-impl Kernel for ProjectChunk<'_> {
+impl Kernel for ProjectPart<'_, '_> {
     type Output = ();
 
     #[inline(always)]
-    fn run<S: Simd>(self, simd: S)
+    fn run<S: Simd>(mut self, simd: S)
+    where
+        S::F: Lanes<Scalar = f32>,
+    {
+        self.part.clear();
+        for i in 0..self.jobs.len() {
+            self.project_chunk(simd, i);
+        }
+        self.part.group(self.tiles[0] * self.tiles[1]);
+    }
+}
+
+impl ProjectPart<'_, '_> {
+    #[inline(always)]
+    fn project_chunk<S: Simd>(&mut self, simd: S, job: usize)
     where
         S::F: Lanes<Scalar = f32>,
     {
         let view = self.view.lanes(simd);
         let degree = self.options.sh_degree.min(self.splats.sh_degree());
         let n = self.splats.len();
+        let job = &mut self.jobs[job];
+        let base = job.chunk * CHUNK;
         let mut harmonics = Harmonics::new(degree);
-        for at in (0..self.footprints.len()).step_by(S::LANES) {
-            let first = self.first + at;
+        // The footprints' numbers, each in a row.
+        let mut columns = [[0.0f32; CHUNK]; 9];
+        let mut shown = [0u32; CHUNK / 4];
+        job.depth_keys.fill(u32::MAX);
+        for at in (0..job.footprints.len()).step_by(S::LANES) {
+            let first = base + at;
+            prefetch_geometry(simd, self.splats, first + AHEAD);
             let geometry = load_geometry(simd, self.splats, first);
             let filter = load_filter(simd, self.filter, first);
             let (footprint, visible) = project(&view, &geometry, filter, self.options.antialias);
             let inside = (1u32 << S::LANES.min(n.saturating_sub(first))) - 1;
-            let visible = visible.bits() & inside;
-            let keys = &mut self.depth_keys[at..at + S::LANES];
-            keys.fill(u32::MAX);
-            if visible == 0 {
+            let bits = visible.bits() & inside;
+            if bits == 0 {
                 continue;
             }
+            shown[at / S::LANES] = bits;
             harmonics.evaluate_basis(at, geometry.mean, view.center);
-            let mut columns = [[0.0f32; 16]; 9];
             let Footprint {
                 xy,
                 depth,
@@ -85,46 +134,173 @@ impl Kernel for ProjectChunk<'_> {
             let log2_opacity = opacity.map(f32::log2);
             let values = [xy[0], xy[1], a, b, c, log2_opacity, depth, extent[0], extent[1]];
             for (to, value) in columns.iter_mut().zip(values) {
-                value.store(to);
+                value.store(&mut to[at..]);
             }
-            for lane in (0..S::LANES).filter(|lane| visible >> lane & 1 == 1) {
-                let v = unroll!(i in 9 => columns[i][lane]);
-                if v.iter().any(|v| !v.is_finite()) {
-                    continue; // Splats that are not finite are not drawn; the file reader and the optimiser report them.
-                }
-                keys[lane] = v[6].to_bits();
-                self.footprints[at + lane] = Footprint2d {
+        }
+        let colors = harmonics.colors(simd, self.splats, base, self.clamp);
+        let [tiles_x, tiles_y] = self.tiles;
+        let largest = simd.splat(f64::from(f32::MAX));
+        let mut count = 0;
+        for at in harmonics.starts() {
+            // Splats that are not finite are not drawn; the file reader and the optimiser report them.
+            let mut finite = simd.splat(0.0).le(simd.splat(0.0));
+            for column in columns.iter().chain(&colors) {
+                finite = finite.and(simd.load(&column[at..]).abs().le(largest));
+            }
+            let [x, y, a, b, c, log2_opacity, _, ex, ey] = unroll!(i in 9 => simd.load(&columns[i][at..]));
+            let outline = Outline {
+                xy: [x, y],
+                extent: [ex, ey],
+                quadratic: [a, b, c],
+                log2_opacity,
+            };
+            let spans = Spans::new(&outline, finite, tiles_x, tiles_y);
+            let mut bits = shown[at / S::LANES] & finite.bits();
+            count += bits.count_ones();
+            while bits != 0 {
+                let lane = bits.trailing_zeros() as usize;
+                bits &= bits - 1;
+                let i = at + lane;
+                let v = unroll!(k in 9 => columns[k][i]);
+                let mut footprint = Footprint2d {
                     xy: [v[0], v[1]],
                     quadratic: [v[2], v[3], v[4]],
                     log2_opacity: v[5],
-                    color: [0.0; 3],
+                    color: unroll!(c in 3 => colors[c][i]),
                     depth: v[6],
                     extent: [v[7], v[8]],
+                    hits: [self.part.len() as u32, 0],
                 };
+                let splat = (base + i) as u32;
+                spans.tiles(lane, &footprint, tiles_x, tiles_y, |tile, blocks| {
+                    self.part.push(splat, tile, blocks);
+                });
+                footprint.hits[1] = self.part.len() as u32 - footprint.hits[0];
+                job.depth_keys[i] = v[6].to_bits();
+                job.footprints[i] = footprint;
             }
         }
-        let colors = harmonics.colors(simd, self.splats, self.first, self.clamp);
-        for at in harmonics.starts() {
-            for i in at..at + S::LANES {
-                let color = unroll!(c in 3 => colors[c][i]);
-                self.footprints[i].color = color;
-                if color.iter().any(|v| !v.is_finite()) {
-                    self.depth_keys[i] = u32::MAX;
-                }
-            }
+        *job.visible = count;
+    }
+}
+
+/// What a chunk's backward pass leaves beside the columns.
+#[derive(Clone, Copy, Default)]
+pub(super) struct ChunkOutcome {
+    /// Splats skipped because a gradient was not finite.
+    pub non_finite: usize,
+    /// The chunk's contribution to the camera's gradient.
+    pub camera: CameraGradient,
+}
+
+/// Runs of splats of all planes of [`SplatGradients`], and of what is kept chunk by chunk; can be split among threads.
+pub(super) struct GradientRun<'a> {
+    pub active: &'a mut [f32],
+    pub screen: [&'a mut [f32]; 2],
+    pub gathered: [&'a mut [f32]; 2],
+    pub means: [&'a mut [f32]; 3],
+    pub quats: [&'a mut [f32]; 4],
+    pub log_scales: [&'a mut [f32]; 3],
+    pub opacity_logits: [&'a mut [f32]; 1],
+    /// As many as there are; the others are empty.
+    pub sh: [&'a mut [f32]; 3 * MAX_COEFFICIENTS],
+    /// Number of active splats, chunk by chunk.
+    pub counts: &'a mut [u32],
+    pub outcomes: &'a mut [ChunkOutcome],
+}
+
+impl<'a> GradientRun<'a> {
+    /// All splats.
+    pub fn new(gradients: &'a mut SplatGradients, outcomes: &'a mut [ChunkOutcome]) -> Self {
+        let SplatGradients {
+            splats,
+            active,
+            counts,
+            screen,
+            gathered,
+            ..
+        } = gradients;
+        Self {
+            active,
+            screen: screen.planes_mut(),
+            gathered: gathered.planes_mut(),
+            means: splats.means.planes_mut(),
+            quats: splats.quats.planes_mut(),
+            log_scales: splats.log_scales.planes_mut(),
+            opacity_logits: splats.opacity_logits.planes_mut(),
+            sh: splats.sh.planes_mut(),
+            counts,
+            outcomes,
+        }
+    }
+
+    /// The first `chunks` chunks, and the others.
+    fn split_at(self, chunks: usize) -> (Self, Self) {
+        let at = chunks * CHUNK;
+        let (active, active_rest) = self.active.split_at_mut(at);
+        let (counts, counts_rest) = self.counts.split_at_mut(chunks);
+        let (outcomes, outcomes_rest) = self.outcomes.split_at_mut(chunks);
+        let [screen, gathered] = [self.screen, self.gathered].map(|planes| split_planes(planes, at));
+        let [means, log_scales] = [self.means, self.log_scales].map(|planes| split_planes(planes, at));
+        let (quats, opacity_logits) = (split_planes(self.quats, at), split_planes(self.opacity_logits, at));
+        let sh = split_planes(self.sh, at);
+        let left = Self {
+            active,
+            screen: screen.0,
+            gathered: gathered.0,
+            means: means.0,
+            quats: quats.0,
+            log_scales: log_scales.0,
+            opacity_logits: opacity_logits.0,
+            sh: sh.0,
+            counts,
+            outcomes,
+        };
+        let right = Self {
+            active: active_rest,
+            screen: screen.1,
+            gathered: gathered.1,
+            means: means.1,
+            quats: quats.1,
+            log_scales: log_scales.1,
+            opacity_logits: opacity_logits.1,
+            sh: sh.1,
+            counts: counts_rest,
+            outcomes: outcomes_rest,
+        };
+        (left, right)
+    }
+
+    /// Calls `work` in parallel for each chunk that has visible splats, and clears the flags of the others. `visible` counts them,
+    /// and `first` is the number of the first chunk.
+    pub fn for_each_chunk(self, first: usize, visible: &[u32], work: &(impl Fn(usize, GradientRun<'_>) + Sync)) {
+        if visible.iter().all(|n| *n == 0) && self.counts.iter().all(|n| *n == 0) {
+            return;
+        }
+        if visible.len() > 1 {
+            let half = visible.len() / 2;
+            let (left, right) = self.split_at(half);
+            rayon::join(
+                || left.for_each_chunk(first, &visible[..half], work),
+                || right.for_each_chunk(first + half, &visible[half..], work),
+            );
+        } else if visible[0] > 0 {
+            work(first, self);
+        } else {
+            self.active.fill(0.0);
+            self.counts[0] = 0;
         }
     }
 }
 
-/// The columns of [`SplatGradients`] for one chunk of splats.
-pub(super) struct GradientChunk<'a> {
-    pub active: &'a mut [f32],
-    pub screen: Vec<&'a mut [f32]>,
-    pub gathered: Vec<&'a mut [f32]>,
-    pub columns: [Vec<&'a mut [f32]>; 5],
-    pub non_finite: usize,
-    /// This chunk's contribution to the camera's gradient.
-    pub camera: CameraGradient,
+fn split_planes<const N: usize>(planes: [&mut [f32]; N], at: usize) -> ([&mut [f32]; N], [&mut [f32]; N]) {
+    let mut left: [&mut [f32]; N] = std::array::from_fn(|_| Default::default());
+    let mut right: [&mut [f32]; N] = std::array::from_fn(|_| Default::default());
+    for (i, plane) in planes.into_iter().enumerate() {
+        let at = at.min(plane.len());
+        (left[i], right[i]) = plane.split_at_mut(at);
+    }
+    (left, right)
 }
 
 pub(super) struct ProjectChunkVjp<'a, 'b> {
@@ -134,8 +310,9 @@ pub(super) struct ProjectChunkVjp<'a, 'b> {
     pub degree: u32,
     /// Whether the camera's gradient is requested.
     pub camera: bool,
-    pub first: usize,
-    pub chunk: &'a mut GradientChunk<'b>,
+    /// The chunk's number.
+    pub chunk: usize,
+    pub to: GradientRun<'b>,
 }
 
 impl Kernel for ProjectChunkVjp<'_, '_> {
@@ -161,7 +338,10 @@ impl ProjectChunkVjp<'_, '_> {
         S::F: Lanes<Scalar = f32>,
     {
         let view = self.view.lanes(simd);
-        let chunk = self.chunk;
+        let mut chunk = self.to;
+        let base = self.chunk * CHUNK;
+        let part = self.renderer.part_of[self.chunk] as usize;
+        let mut count = 0;
         let renderer = self.renderer;
         let antialias = renderer.options.antialias;
         let mut harmonics = Harmonics::new(self.degree);
@@ -172,7 +352,7 @@ impl ProjectChunkVjp<'_, '_> {
         let mut v_translation = [simd.splat(0.0); 3];
         let mut v_center = [simd.splat(0.0); 3];
         for at in (0..chunk.active.len()).step_by(S::LANES) {
-            let first = self.first + at;
+            let first = base + at;
             // Sum each visible splat's entries, in their order; [sum, lane]. Invisible lanes are masked below.
             let mut sums = [[0.0f32; 16]; SUMS];
             let mut image = [[1.0f32; 16]; 7];
@@ -182,8 +362,9 @@ impl ProjectChunkVjp<'_, '_> {
                     continue;
                 }
                 visible[lane] = 1.0;
+                let s = &renderer.footprints[first + lane];
                 let mut total = [0.0f32; SUMS];
-                for position in renderer.bins.positions(first + lane) {
+                for position in renderer.bins.positions(part, s.hits) {
                     for (total, from) in total.iter_mut().zip(&renderer.sums[position]) {
                         *total += from;
                     }
@@ -191,7 +372,6 @@ impl ProjectChunkVjp<'_, '_> {
                 for (to, total) in sums.iter_mut().zip(total) {
                     to[lane] = total;
                 }
-                let s = &renderer.footprints[first + lane];
                 let [a, b, c] = s.quadratic;
                 for (to, value) in image
                     .iter_mut()
@@ -248,26 +428,26 @@ impl ProjectChunkVjp<'_, '_> {
             for (value, to) in v_footprint.xy.iter().zip(&mut chunk.screen) {
                 value.store(&mut to[at..]);
             }
-            let [means, quats, log_scales, opacity_logits, _] = &mut chunk.columns;
-            for (value, to) in v.mean.iter().zip(means) {
+            for (value, to) in v.mean.iter().zip(&mut chunk.means) {
                 value.store(&mut to[at..]);
             }
-            for (value, to) in v.quat.iter().zip(quats) {
+            for (value, to) in v.quat.iter().zip(&mut chunk.quats) {
                 value.store(&mut to[at..]);
             }
-            for (value, to) in v.log_scale.iter().zip(log_scales) {
+            for (value, to) in v.log_scale.iter().zip(&mut chunk.log_scales) {
                 value.store(&mut to[at..]);
             }
-            v.opacity_logit.store(&mut opacity_logits[0][at..]);
+            v.opacity_logit.store(&mut chunk.opacity_logits[0][at..]);
         }
 
-        harmonics.vjp(simd, self.splats, self.first, &v_colors, &mut chunk.columns[4]);
+        harmonics.vjp(simd, self.splats, base, &v_colors, &mut chunk.sh);
+        let mut non_finite = 0;
         for at in harmonics.starts() {
             let visible = simd.load(&chunk.active[at..]);
             let shown = simd.splat(0.0).lt(visible);
             let mut magnitude = simd.load(&magnitudes[at..]);
             if self.degree > 0 {
-                let mean = load_geometry(simd, self.splats, self.first + at).mean;
+                let mean = load_geometry(simd, self.splats, base + at).mean;
                 let v_mean = harmonics.v_mean(at, mean, view.center);
                 if CAMERA {
                     for c in 0..3 {
@@ -275,17 +455,21 @@ impl ProjectChunkVjp<'_, '_> {
                         v_center[c] -= v_mean[c].masked(shown.and(finite));
                     }
                 }
-                for (v, to) in v_mean.iter().zip(&mut chunk.columns[0]) {
+                for (v, to) in v_mean.iter().zip(&mut chunk.means) {
                     (simd.load(&to[at..]) + *v).store(&mut to[at..]);
                     magnitude += v.abs();
                 }
             }
             let finite = magnitude.lt(simd.splat(f64::from(f32::MAX)));
-            chunk.non_finite += shown.and_not(finite).bits().count_ones() as usize;
+            non_finite += shown.and_not(finite).bits().count_ones() as usize;
+            count += shown.and(finite).bits().count_ones();
             visible.masked(shown.and(finite)).store(&mut chunk.active[at..]);
         }
+        chunk.counts[0] = count;
+        let outcome = &mut chunk.outcomes[0];
+        outcome.non_finite = non_finite;
         if CAMERA {
-            chunk.camera = self.view.gradient(
+            outcome.camera = self.view.gradient(
                 unroll!(i in 3 => unroll!(j in 3 => f64::from(v_rotation[i][j].sum()))),
                 unroll!(i in 3 => f64::from(v_translation[i].sum())),
                 unroll!(i in 3 => f64::from(v_center[i].sum())),

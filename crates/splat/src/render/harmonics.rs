@@ -10,7 +10,14 @@ use irradia_compute::simd::{Lanes, Simd};
 use irradia_scene::sh::coefficients;
 
 /// Splats per task of projection: a multiple of every vector length, and small enough for the buffers to stay in cache.
-pub(super) const CHUNK: usize = 512;
+pub const CHUNK: usize = irradia_compute::adam::RUN;
+
+/// The plane after `plane` from splat `first` on, to be fetched while that one is read: a chunk reads more planes in turn than the
+/// processor's prefetchers follow.
+#[inline(always)]
+fn next_plane(splats: &Splats, plane: usize, first: usize) -> &[f32] {
+    &splats.sh.plane((plane + 1).min(splats.sh.count() - 1))[first..]
+}
 
 /// A chunk's harmonics.
 pub(super) struct Harmonics {
@@ -63,8 +70,10 @@ impl Harmonics {
         for k in 0..coefficients(self.degree) {
             for c in 0..3 {
                 let plane = &splats.sh.plane(3 * k + c)[first..];
+                let next = next_plane(splats, 3 * k + c, first);
                 for start in &self.starts[..self.count] {
                     let at = usize::from(*start);
+                    simd.prefetch(&next[at]);
                     let color = simd
                         .load(&self.basis[k][at..])
                         .mul_add(simd.load(&plane[at..]), simd.load(&colors[c][at..]));
@@ -109,8 +118,10 @@ impl Harmonics {
             }
             for c in 0..3 {
                 let plane = &splats.sh.plane(3 * k + c)[first..];
+                let next = next_plane(splats, 3 * k + c, first);
                 for start in &self.starts[..self.count] {
                     let at = usize::from(*start);
+                    simd.prefetch(&next[at]);
                     let v = simd
                         .load(&plane[at..])
                         .mul_add(simd.load(&v_colors[c][at..]), simd.load(&v_basis[at..]));

@@ -6,23 +6,28 @@
 mod bin;
 mod blend;
 mod chunk;
+mod cull;
+mod develop;
 mod harmonics;
 mod project;
 mod sh;
+mod touch;
 mod view;
 
 #[cfg(test)]
 mod gradients;
 
 pub use blend::{ALPHA_MAX, TRANSMITTANCE_MIN};
+pub use cull::ChunkBounds;
+pub use harmonics::CHUNK;
 pub use project::{ALPHA_MIN, DILATION};
 pub use view::ViewParams;
 
 use crate::Splats;
-use bin::{BAND_BLOCKS, BLOCK_HEIGHT, BLOCK_WIDTH, Bins, TILE};
+use bin::{Bins, Part, TILE};
 use blend::{BLOCK, BlendTile, BlendTileVjp, CHANNELS, Footprint2d, SUMS, TILE_PIXELS, gather};
-use chunk::{GradientChunk, ProjectChunk, ProjectChunkVjp};
-use harmonics::CHUNK;
+use chunk::{ChunkJob, ChunkOutcome, GradientRun, ProjectChunkVjp, ProjectPart};
+use develop::{Content, DevelopLine, GatherTile, Tiles};
 use irradia_compute::Planes;
 use irradia_compute::simd::Level;
 use rayon::prelude::*;
@@ -119,6 +124,8 @@ pub struct SplatGradients {
     pub splats: Splats,
     /// `[stride]`: 1 where the splat was visible and its gradient is finite, else 0.
     pub active: Vec<f32>,
+    /// Number of active splats in each run of [`CHUNK`].
+    pub counts: Vec<u32>,
     /// Gradient of the projected centre, pixels: 2 planes.
     pub screen: Planes,
     /// As [`OutputGradient::gather`] requests, 2 planes: absolute screen gradients, or error and weight.
@@ -139,7 +146,14 @@ pub struct Renderer {
     options: RenderOptions,
     footprints: Vec<Footprint2d>,
     depth_keys: Vec<u32>,
+    /// Number of visible splats in each chunk; where it is 0, all depth keys are `u32::MAX`.
+    visible: Vec<u32>,
+    /// Whether the last view may see each chunk.
+    seen: Vec<bool>,
     in_view: Vec<u32>,
+    parts: Vec<Part>,
+    /// The part of each chunk with visible splats.
+    part_of: Vec<u32>,
     bins: Bins,
     /// Tile-major `[tiles, CHANNELS, blocks, BLOCK]`.
     tiles: Vec<f32>,
@@ -171,7 +185,11 @@ impl Renderer {
             options: RenderOptions::default(),
             footprints: Vec::new(),
             depth_keys: Vec::new(),
+            visible: Vec::new(),
+            seen: Vec::new(),
             in_view: Vec::new(),
+            parts: Vec::new(),
+            part_of: Vec::new(),
             bins: Bins::default(),
             tiles: Vec::new(),
             color: Vec::new(),
@@ -186,6 +204,11 @@ impl Renderer {
     pub fn set_filter(&mut self, variances: &[f32]) {
         self.filter.clear();
         self.filter.extend_from_slice(variances);
+    }
+
+    /// The filter's variances, as passed to [`Self::set_filter`].
+    pub(crate) fn filter(&self) -> &[f32] {
+        &self.filter
     }
 
     /// Colour of the last frame, `[3, H, W]`, not clamped.
@@ -215,7 +238,7 @@ impl Renderer {
 
     /// Splats that touched the last frame.
     pub fn visible(&self) -> usize {
-        self.bins.visible()
+        self.visible.iter().map(|n| *n as usize).sum()
     }
 
     /// Splat-tile pairs of the last frame.
@@ -236,24 +259,51 @@ impl Renderer {
     /// Splat-pixel pairs visited by blending in the last frame (whole blocks of 16): a frame's cost.
     pub fn pairs(&self) -> u64 {
         (0..self.bins.tile_count())
-            .flat_map(|tile| self.bins.tile(tile))
+            .into_par_iter()
+            .flat_map_iter(|tile| self.bins.tile(tile))
             .map(|entry| u64::from(entry.blocks.count_ones()) * BLOCK as u64)
             .sum()
     }
 
     /// Renders `splats` into this renderer's buffers.
     pub fn render(&mut self, splats: &Splats, view: &ViewParams, options: &RenderOptions) {
-        self.project_chunks(splats, view, options, true);
+        self.render_within(splats, None, view, options);
+    }
+
+    /// As [`Self::render`], skipping chunks that are out of view by their `bounds`, which must be those of `splats`.
+    pub fn render_within(
+        &mut self,
+        splats: &Splats,
+        bounds: Option<&ChunkBounds>,
+        view: &ViewParams,
+        options: &RenderOptions,
+    ) {
+        self.project_chunks(splats, bounds, view, options, true);
         self.composite();
     }
 
     /// The first half of a frame with added colours: projects `splats`, without clamping colours. [`Self::add_colors`] and
     /// [`Self::composite`] must follow.
     pub fn project(&mut self, splats: &Splats, view: &ViewParams, options: &RenderOptions) {
-        self.project_chunks(splats, view, options, false);
+        self.project_within(splats, None, view, options);
+    }
+
+    /// As [`Self::project`], with `bounds` as in [`Self::render_within`].
+    pub fn project_within(
+        &mut self,
+        splats: &Splats,
+        bounds: Option<&ChunkBounds>,
+        view: &ViewParams,
+        options: &RenderOptions,
+    ) {
+        self.project_chunks(splats, bounds, view, options, false);
+        let keys = &self.depth_keys;
+        let chunks = self.visible.par_iter().enumerate().filter(|(_, visible)| **visible > 0);
         self.in_view.clear();
-        let seen = |i: &u32| self.depth_keys[*i as usize] != u32::MAX;
-        self.in_view.extend((0..splats.len() as u32).filter(seen));
+        self.in_view.par_extend(chunks.flat_map_iter(|(chunk, _)| {
+            let range = chunk * CHUNK..keys.len().min((chunk + 1) * CHUNK);
+            range.filter(|i| keys[*i] != u32::MAX).map(|i| i as u32)
+        }));
     }
 
     /// Splats in view of the last [`Self::project`], ascending.
@@ -281,12 +331,18 @@ impl Renderer {
     pub fn composite(&mut self) {
         let view = self.view.clone().expect("projection comes first");
         let options = self.options;
-        self.bins
-            .build(self.level, view.width, view.height, &self.footprints, &self.depth_keys);
+        self.bins.build(&self.parts, &self.depth_keys);
         self.blend(&view, &options);
     }
 
-    fn project_chunks(&mut self, splats: &Splats, view: &ViewParams, options: &RenderOptions, clamp: bool) {
+    fn project_chunks(
+        &mut self,
+        splats: &Splats,
+        bounds: Option<&ChunkBounds>,
+        view: &ViewParams,
+        options: &RenderOptions,
+        clamp: bool,
+    ) {
         let stride = splats.stride();
         assert!(
             self.filter.is_empty() || self.filter.len() == stride,
@@ -294,23 +350,65 @@ impl Renderer {
         );
         self.view = Some(view.clone());
         self.options = *options;
-        self.footprints.resize(stride, Footprint2d::default());
-        self.depth_keys.resize(stride, u32::MAX);
-        let (level, filter) = (self.level, &self.filter);
-        self.footprints
-            .par_chunks_mut(CHUNK)
-            .zip(self.depth_keys.par_chunks_mut(CHUNK))
+        let chunks = stride.div_ceil(CHUNK);
+        if self.depth_keys.len() != stride {
+            self.footprints.resize(stride, Footprint2d::default());
+            // Every chunk is now either projected or invisible.
+            self.depth_keys.resize(stride, u32::MAX);
+            self.visible.clear();
+            self.visible.resize(chunks, 1);
+            self.part_of.resize(chunks, 0);
+        }
+        if let Some(bounds) = bounds {
+            bounds.seen(view, &mut self.seen);
+            assert_eq!(self.seen.len(), chunks, "bounds of these splats");
+        } else {
+            self.seen.clear();
+            self.seen.resize(chunks, true);
+        }
+        let footprints = self.footprints.chunks_mut(CHUNK);
+        let depth_keys = self.depth_keys.chunks_mut(CHUNK);
+        let mut jobs: Vec<ChunkJob> = footprints
+            .zip(depth_keys)
+            .zip(&mut self.visible)
+            .zip(&self.seen)
             .enumerate()
-            .for_each(|(chunk, (footprints, depth_keys))| {
-                level.run(ProjectChunk {
+            .filter_map(|(chunk, (((footprints, depth_keys), visible), seen))| {
+                if !seen && *visible > 0 {
+                    depth_keys.fill(u32::MAX);
+                    *visible = 0;
+                }
+                seen.then_some(ChunkJob {
+                    chunk,
+                    footprints,
+                    depth_keys,
+                    visible,
+                })
+            })
+            .collect();
+        let of_part = jobs
+            .len()
+            .div_ceil(PARTS_PER_THREAD * rayon::current_num_threads())
+            .max(1);
+        let parts = jobs.len().div_ceil(of_part);
+        self.parts.resize_with(parts, Part::default);
+        for (i, job) in jobs.iter().enumerate() {
+            self.part_of[job.chunk] = (i / of_part) as u32;
+        }
+        self.bins.begin(view.width, view.height);
+        let (level, filter, tiles) = (self.level, &self.filter, [self.bins.tiles_x, self.bins.tiles_y]);
+        jobs.par_chunks_mut(of_part)
+            .zip(&mut self.parts)
+            .for_each(|(jobs, part)| {
+                level.run(ProjectPart {
                     splats,
                     filter,
                     view,
                     options,
                     clamp,
-                    first: chunk * CHUNK,
-                    footprints,
-                    depth_keys,
+                    tiles,
+                    jobs,
+                    part,
                 });
             });
     }
@@ -338,35 +436,34 @@ impl Renderer {
         self.color.resize(3 * pixels, 0.0);
         self.alpha.resize(pixels, 0.0);
         self.depth.resize(if options.depth { pixels } else { 0 }, 0.0);
-        let tiles = &self.tiles;
-        // The eight pixels of a channel in row y starting at column x, a multiple of eight.
-        let run = |channel: usize, y: usize, x: usize| {
-            let tile = (y / TILE) * bins.tiles_x + x / TILE;
-            let at = (tile * CHANNELS + channel) * TILE_PIXELS + pixel_in_tile(x % TILE, y % TILE);
-            &tiles[at..at + BLOCK_WIDTH]
+        let tiles = Tiles {
+            values: &self.tiles,
+            tiles_x: bins.tiles_x,
         };
         self.color.par_chunks_mut(width).enumerate().for_each(|(line, to)| {
             let (channel, y) = (line / height, line % height);
-            let background = options.background[channel];
-            for (i, to) in to.chunks_mut(BLOCK_WIDTH).enumerate() {
-                let (color, t) = (run(channel, y, i * BLOCK_WIDTH), run(CHANNELS - 1, y, i * BLOCK_WIDTH));
-                for ((to, color), t) in to.iter_mut().zip(color).zip(t) {
-                    *to = color + t.abs() * background;
-                }
-            }
+            level.run(DevelopLine {
+                tiles,
+                y,
+                content: Content::Color(channel, options.background[channel]),
+                to,
+            });
         });
         self.alpha.par_chunks_mut(width).enumerate().for_each(|(y, to)| {
-            for (i, to) in to.chunks_mut(BLOCK_WIDTH).enumerate() {
-                for (to, t) in to.iter_mut().zip(run(CHANNELS - 1, y, i * BLOCK_WIDTH)) {
-                    *to = 1.0 - t.abs();
-                }
-            }
+            level.run(DevelopLine {
+                tiles,
+                y,
+                content: Content::Alpha,
+                to,
+            });
         });
         self.depth.par_chunks_mut(width).enumerate().for_each(|(y, to)| {
-            for (i, to) in to.chunks_mut(BLOCK_WIDTH).enumerate() {
-                let len = to.len();
-                to.copy_from_slice(&run(3, y, i * BLOCK_WIDTH)[..len]);
-            }
+            level.run(DevelopLine {
+                tiles,
+                y,
+                content: Content::Depth,
+                to,
+            });
         });
     }
 
@@ -410,10 +507,10 @@ impl Renderer {
             })
             .collect();
         let background = self.options.background;
-        let (gather, error) = match v_out.gather {
-            Gather::Nothing => (gather::NOTHING, None),
-            Gather::Absolute => (gather::ABSOLUTE, None),
-            Gather::Error(error) => (gather::ERROR, Some(error)),
+        let gather = match v_out.gather {
+            Gather::Nothing => gather::NOTHING,
+            Gather::Absolute => gather::ABSOLUTE,
+            Gather::Error(_) => gather::ERROR,
         };
         self.tiles
             .as_chunks::<{ CHANNELS * TILE_PIXELS }>()
@@ -424,47 +521,15 @@ impl Renderer {
             .for_each(|(tile, (state, sums))| {
                 let mut v_tile = [0.0f32; CHANNELS * TILE_PIXELS];
                 let mut rest = [0.0f32; TILE_PIXELS];
-                let (x0, y0) = ((tile % bins.tiles_x) * TILE, (tile / bins.tiles_x) * TILE);
-                let columns = TILE.min(width - x0);
-                for row in 0..TILE.min(height - y0) {
-                    let image = (y0 + row) * width + x0;
-                    for column in (0..columns).step_by(BLOCK_WIDTH) {
-                        let (at, from) = (pixel_in_tile(column, row), image + column);
-                        let v = |plane: &[f32], offset: usize| run_of(&plane[offset..], columns - column);
-                        let state_at = |channel: usize| -> &[f32; BLOCK_WIDTH] {
-                            state[channel * TILE_PIXELS + at..].first_chunk().expect("a run")
-                        };
-                        let t = state_at(CHANNELS - 1).map(f32::abs);
-                        let mut total = [0.0f32; BLOCK_WIDTH];
-                        let mut put = |channel: usize, v: [f32; BLOCK_WIDTH]| {
-                            v_tile[channel * TILE_PIXELS + at..][..BLOCK_WIDTH].copy_from_slice(&v);
-                        };
-                        for c in 0..3 {
-                            let (v, color) = (v(v_out.color, c * width * height + from), state_at(c));
-                            for i in 0..BLOCK_WIDTH {
-                                total[i] += (color[i] + t[i] * background[c]) * v[i];
-                            }
-                            put(c, v);
-                        }
-                        if let Some(v_depth) = v_out.depth {
-                            let (v, depth) = (v(v_depth, from), state_at(3));
-                            for i in 0..BLOCK_WIDTH {
-                                total[i] += depth[i] * v[i];
-                            }
-                            put(3, v);
-                        }
-                        if let Some(error) = error {
-                            put(4, v(error, from));
-                        }
-                        if let Some(v_alpha) = v_out.alpha {
-                            let v = v(v_alpha, from);
-                            for i in 0..BLOCK_WIDTH {
-                                total[i] -= t[i] * v[i];
-                            }
-                        }
-                        rest[at..at + BLOCK_WIDTH].copy_from_slice(&total);
-                    }
-                }
+                level.run(GatherTile {
+                    state,
+                    v_out,
+                    background,
+                    size: [width, height],
+                    corner: [(tile % bins.tiles_x) * TILE, (tile / bins.tiles_x) * TILE],
+                    v_tile: &mut v_tile,
+                    rest: &mut rest,
+                });
                 level.run(BlendTileVjp {
                     footprints,
                     entries: bins.tile(tile),
@@ -485,55 +550,31 @@ impl Renderer {
         }
         gradients.screen.reshape(2, n);
         gradients.gathered.reshape(2, n);
-        gradients.active.resize(stride, 0.0);
-        let degree = self.options.sh_degree.min(splats.sh_degree());
-        let mut chunks: Vec<GradientChunk> = gradients
-            .active
-            .chunks_mut(CHUNK)
-            .map(|active| GradientChunk {
-                active,
-                screen: Vec::with_capacity(2),
-                gathered: Vec::with_capacity(2),
-                columns: Default::default(),
-                non_finite: 0,
-                camera: CameraGradient::default(),
-            })
-            .collect();
-        if stride > 0 {
-            for plane in gradients.screen.as_mut_slice().chunks_mut(stride) {
-                for (chunk, part) in chunks.iter_mut().zip(plane.chunks_mut(CHUNK)) {
-                    chunk.screen.push(part);
-                }
-            }
-            for plane in gradients.gathered.as_mut_slice().chunks_mut(stride) {
-                for (chunk, part) in chunks.iter_mut().zip(plane.chunks_mut(CHUNK)) {
-                    chunk.gathered.push(part);
-                }
-            }
-            for (c, column) in gradients.splats.columns_mut().into_iter().enumerate() {
-                for plane in column.as_mut_slice().chunks_mut(stride) {
-                    for (chunk, part) in chunks.iter_mut().zip(plane.chunks_mut(CHUNK)) {
-                        chunk.columns[c].push(part);
-                    }
-                }
-            }
+        let chunks = stride.div_ceil(CHUNK);
+        if (gradients.active.len(), gradients.counts.len()) != (stride, chunks) {
+            gradients.active.clear();
+            gradients.active.resize(stride, 0.0);
+            gradients.counts.clear();
+            gradients.counts.resize(chunks, 0);
         }
+        let degree = self.options.sh_degree.min(splats.sh_degree());
+        let mut outcomes = vec![ChunkOutcome::default(); chunks];
         let (level, this) = (self.level, &*self);
-        chunks.par_iter_mut().enumerate().for_each(|(i, chunk)| {
+        GradientRun::new(gradients, &mut outcomes).for_each_chunk(0, &self.visible, &|chunk, to| {
             level.run(ProjectChunkVjp {
                 renderer: this,
                 splats,
                 view,
                 degree,
                 camera,
-                first: i * CHUNK,
                 chunk,
+                to,
             });
         });
-        gradients.non_finite = chunks.iter().map(|chunk| chunk.non_finite).sum();
+        gradients.non_finite = outcomes.iter().map(|chunk| chunk.non_finite).sum();
         gradients.camera = camera.then(|| {
             let mut sum = CameraGradient::default();
-            for chunk in &chunks {
+            for chunk in &outcomes {
                 for i in 0..3 {
                     sum.translation[i] += chunk.camera.translation[i];
                     for j in 0..3 {
@@ -546,21 +587,8 @@ impl Renderer {
     }
 }
 
-/// The first eight of `values`, with zeros from index `len` on.
-#[inline(always)]
-fn run_of(values: &[f32], len: usize) -> [f32; BLOCK_WIDTH] {
-    match values.first_chunk() {
-        Some(whole) if len >= BLOCK_WIDTH => *whole,
-        _ => std::array::from_fn(|i| if i < len { values[i] } else { 0.0 }),
-    }
-}
-
-/// Index of pixel (x, y) of a tile in its block-wise order.
-#[inline(always)]
-fn pixel_in_tile(x: usize, y: usize) -> usize {
-    let block = (x / BLOCK_WIDTH) * BAND_BLOCKS + y / BLOCK_HEIGHT;
-    block * BLOCK + (y % BLOCK_HEIGHT) * BLOCK_WIDTH + x % BLOCK_WIDTH
-}
+/// Parts of a frame's projection for each thread: more balance better, and cost a count for every tile.
+const PARTS_PER_THREAD: usize = 4;
 
 fn corner(bins: &Bins, tile: usize) -> [f32; 2] {
     [

@@ -93,6 +93,25 @@ fn a_checkpoint_round_trips() {
 }
 
 #[test]
+fn a_streamed_checkpoint_has_the_bytes_of_the_format_and_a_copy_is_that_of_its_moment() {
+    let mut trainer = trainer();
+    let bytes = to_bytes(&trainer);
+    // Metadata are a map without order: compared with the library's own file tensor by tensor, in its order.
+    let theirs = rewritten(&bytes, FORMAT, |_| ());
+    let (ours, theirs) = [&bytes, &theirs]
+        .map(|bytes| SafeTensors::read_metadata(bytes).unwrap())
+        .into();
+    assert_eq!(ours.1.offset_keys(), theirs.1.offset_keys());
+    assert_eq!(ours.1.tensors(), theirs.1.tensors());
+    let copy = Checkpoint::of(&trainer).copied();
+    trainer.step(&mut Vec::new()).unwrap();
+    let mut later = Vec::new();
+    copy.write(&mut later).unwrap();
+    let data = |bytes: &[u8]| bytes[8 + u64::from_le_bytes(*bytes.first_chunk().unwrap()) as usize..].to_vec();
+    assert!(data(&later) == data(&bytes) && data(&to_bytes(&trainer)) != data(&bytes));
+}
+
+#[test]
 fn socket_occupants_resume_exactly() {
     let overrides = ["exposure=true", "refine_poses=true", "params.rate_poses=0.001"].map(str::to_owned);
     let recipe = Recipe::parse("shiny", Recipe::built_in("shiny").unwrap(), &overrides).unwrap();

@@ -54,7 +54,7 @@ impl<const N: usize> PerViewAdam<N> {
             &gradient,
             [&mut first, &mut second],
             &rates,
-            Active::Sparse(&active),
+            Active::Sparse(&active, &[1]),
             step,
         );
         for (moments, new) in self.moments.iter_mut().zip([&first, &second]) {

@@ -4,9 +4,13 @@
 //! cargo run --release -p irradia --example speed -- steps DATA [STEPS]   a training step and its parts
 //! cargo run --release -p irradia --example speed -- blend                the inner loop of blending
 //! cargo run --release -p irradia --example speed -- frame SCENE.ply      a frame of a million splats, and how its cost scales
+//! cargo run --release -p irradia --example speed -- scale [SPLATS ..]    every stage at 0.1, 1 and 5 million splats
 //! ```
 //!
 //! CPU time is given beside wall time: on a shared machine it is more stable.
+
+mod machine;
+mod scale;
 
 use anyhow::{Context, Result, bail};
 use cpu_time::ProcessTime;
@@ -25,7 +29,9 @@ fn main() -> Result<()> {
         ["steps", data, count] => steps(data, count.parse()?),
         ["blend"] => blend(),
         ["frame", scene] => frame(scene),
-        _ => bail!("usage: steps DATA [STEPS], blend, or frame SCENE.ply"),
+        ["scale"] => scale::run(&[100_000, 1_000_000, 5_000_000]),
+        ["scale", ..] => scale::run(&args[1..].iter().map(|n| n.parse()).collect::<Result<Vec<_>, _>>()?),
+        _ => bail!("usage: steps DATA [STEPS], blend, frame SCENE.ply, or scale [SPLATS ..]"),
     }
 }
 

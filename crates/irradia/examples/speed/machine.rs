@@ -1,0 +1,100 @@
+//! What the machine allows: the rate of multiply-adds, the bandwidth of memory, and the memory that the process holds.
+
+use cpu_time::ProcessTime;
+use irradia_compute::Level;
+use irradia_compute::simd::{Kernel, Lanes, Simd};
+use rayon::prelude::*;
+
+/// Measured limits of all threads together, each with a core of its own.
+#[derive(Clone, Copy)]
+pub struct Limits {
+    /// Arithmetic in registers, 10^9 operations per second; a multiply-add counts as two.
+    pub gflops: f64,
+    /// Memory read and written by a sequential update of an array, 10^9 bytes per second.
+    pub gbytes: f64,
+}
+
+/// Measures in CPU time; the best of several rounds, since other load can only slow one down.
+pub fn limits() -> Limits {
+    let level = Level::detect();
+    let threads = rayon::current_num_threads() as f64;
+    let best = |round: &mut dyn FnMut() -> f64| (0..5).map(|_| round()).fold(f64::INFINITY, f64::min);
+    let arithmetic = best(&mut || {
+        let began = ProcessTime::now();
+        (0..threads as u32).into_par_iter().for_each(|_| level.run(Peak));
+        began.elapsed().as_secs_f64()
+    });
+    // Beyond every cache that belongs to a core; 512 MiB.
+    let mut values = vec![1.0f32; 1 << 27];
+    let memory = best(&mut || {
+        let began = ProcessTime::now();
+        values.par_chunks_mut(1 << 16).for_each(|part| {
+            for value in part {
+                *value = *value * 0.999 + 0.001;
+            }
+        });
+        began.elapsed().as_secs_f64()
+    });
+    Limits {
+        gflops: threads * threads * f64::from(ROUNDS) * 12.0 * 2.0 * level.run(Width) as f64 / arithmetic / 1e9,
+        gbytes: threads * 8.0 * values.len() as f64 / memory / 1e9,
+    }
+}
+
+const ROUNDS: u32 = 4_000_000;
+
+/// Independent multiply-adds in registers.
+struct Peak;
+
+impl Kernel for Peak {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<S: Simd>(self, simd: S)
+    where
+        S::F: Lanes<Scalar = f32>,
+    {
+        let (a, b) = (
+            simd.set(std::hint::black_box(0.999)),
+            simd.set(std::hint::black_box(0.001)),
+        );
+        let mut sums = [simd.splat(1.0); 12];
+        for _ in 0..ROUNDS {
+            for sum in &mut sums {
+                *sum = sum.mul_add(a, b);
+            }
+        }
+        std::hint::black_box(sums);
+    }
+}
+
+/// Lanes of a vector.
+struct Width;
+
+impl Kernel for Width {
+    type Output = usize;
+
+    #[inline(always)]
+    fn run<S: Simd>(self, _: S) -> usize
+    where
+        S::F: Lanes<Scalar = f32>,
+    {
+        S::LANES
+    }
+}
+
+/// Resident memory of this process now and at its highest since [`reset_peak`], bytes; zeros where the system does not tell.
+pub fn resident() -> [u64; 2] {
+    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
+    ["VmRSS:", "VmHWM:"].map(|key| {
+        let line = status.lines().find_map(|line| line.strip_prefix(key));
+        let kib = line.and_then(|line| line.trim().strip_suffix("kB")?.trim().parse::<u64>().ok());
+        1024 * kib.unwrap_or(0)
+    })
+}
+
+/// Lets the highest resident memory begin again at the present one; Linux.
+pub fn reset_peak() {
+    // Without it the figure is that of the whole process so far.
+    let _ = std::fs::write("/proc/self/clear_refs", "5");
+}

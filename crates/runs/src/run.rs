@@ -92,6 +92,7 @@ impl Run {
         folder.write("recipe.toml", trainer.recipe.to_toml().as_bytes())?;
         folder.write_cameras(&trainer)?;
         folder.write_views(&trainer.dataset)?;
+        folder.write_world(&trainer.dataset.world_from_dataset)?;
         // Last: a folder with this file has everything needed to resume.
         folder.write_record(&RunRecord {
             input: request.input.clone(),
@@ -121,7 +122,8 @@ impl Run {
         folder.remove_leftovers()?;
         let options = train_options(&request)?;
         let paces = request.paces()?;
-        let dataset = Arc::new(dataset);
+        // The world of the steps made, which an earlier version may have chosen otherwise.
+        let dataset = Arc::new(dataset.in_world(folder.world_from_dataset()?));
         let trainer = match folder.newest_checkpoint()? {
             Some(path) => {
                 let differences = folder.changed_views(&dataset)?;

@@ -37,7 +37,7 @@ pub fn from_points(points: &PointCloud, options: &InitOptions) -> Splats {
         opacity_logits: vec![logit(options.opacity); n],
         sh: harmonics,
         sh_degree: options.sh_degree,
-        antialiased: false,
+        ..GaussianCloud::default()
     })
 }
 

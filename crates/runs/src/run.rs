@@ -8,6 +8,7 @@ use crate::{RunError, RunFolder, TrainRequest, background};
 use irradia_measure::Lpips;
 use irradia_scene::Dataset;
 use irradia_train::event::Observer;
+use irradia_train::memory::usual_limit;
 use irradia_train::paces::Paces;
 use irradia_train::report::Report;
 use irradia_train::{RunLimits, TrainOptions, Trainer, checkpoint};
@@ -270,8 +271,8 @@ fn train_options(request: &TrainRequest) -> Result<TrainOptions, RunError> {
     Ok(TrainOptions {
         seed: input.seed,
         steps: input.steps,
+        memory: input.memory.or_else(usual_limit),
         lpips: input.lpips.as_ref().map(Lpips::load).transpose()?.map(Arc::new),
-        ..TrainOptions::default()
     })
 }
 

@@ -71,6 +71,25 @@ pub trait PhotoSource: Send + Sync {
     /// # Errors
     /// One line that names the file and the remedy.
     fn load(&self) -> Result<Photo, LoadError>;
+
+    /// The photograph at `width` x `height`, at most those of [`Self::load`].
+    ///
+    /// # Errors
+    /// Those of [`Self::load`].
+    fn load_at(&self, width: u32, height: u32) -> Result<Photo, LoadError> {
+        Ok(self.load()?.resized(width, height))
+    }
+
+    /// Whether [`Self::load_at`] returns the result of [`Self::load`] resized, so that the latter can replace the file; otherwise it
+    /// decodes fewer pixels.
+    fn is_shrunk_from_full(&self, _width: u32, _height: u32) -> bool {
+        true
+    }
+
+    /// Memory used by [`Self::load`] beyond its result, bytes.
+    fn working_bytes(&self) -> usize {
+        0
+    }
 }
 
 impl PhotoSource for Photo {

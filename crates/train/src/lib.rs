@@ -10,6 +10,7 @@ pub mod field_file;
 mod field_step;
 mod forecast;
 pub mod half_fit;
+pub mod memory;
 pub mod model;
 mod objective;
 pub mod paces;

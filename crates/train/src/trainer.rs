@@ -3,14 +3,16 @@
 use crate::event::{Event, StepReport};
 use crate::field_step::{first_field, is_field};
 use crate::half_fit::HalfFit;
+use crate::memory::{MemoryPlan, Needs};
 use crate::model::Model;
 use crate::objective::{Objective, Reference};
-use crate::photos::{PhotoCache, Prepared};
+use crate::photos::PhotoCache;
 use crate::recipe::{AdamKind, DensityControl, LengthUnit, Param, Recipe};
 use crate::schedule::{Clock, Round, StepMetrics, StepPlan, plan, upcoming_views};
 use crate::socket::{Residual, Sockets};
 use crate::times::Times;
 use cpu_time::ProcessTime;
+use glam::Vec2;
 use irradia_compute::adam::AdamStep;
 use irradia_field::{FieldError, FieldState, KnownDepth};
 use irradia_measure::{DepthSample, Lpips};
@@ -49,6 +51,20 @@ pub enum TrainError {
     /// The field configuration is invalid.
     #[error(transparent)]
     Field(#[from] FieldError),
+    /// The first splats and a few photographs do not fit into memory.
+    #[error(
+        "{limit} of memory are too little for {splats} splats and a few photographs; --memory {needed} would do{otherwise}"
+    )]
+    Memory {
+        /// All memory of the process, with its unit.
+        limit: String,
+        /// What would suffice, with its unit.
+        needed: String,
+        /// Splats to begin with.
+        splats: usize,
+        /// What else would do.
+        otherwise: String,
+    },
     /// A checkpoint does not fit.
     #[error("{0}")]
     Checkpoint(String),
@@ -61,28 +77,36 @@ pub struct TrainOptions {
     pub seed: u64,
     /// Steps of the run; the recipe's own number when `None`.
     pub steps: Option<u64>,
-    /// Memory budget for photographs, bytes.
-    pub photo_budget: usize,
+    /// Memory of the whole process, bytes; `None`: photographs get 2 GiB, and splats have the recipe's limit only.
+    pub memory: Option<usize>,
     /// Weights of the perceptual loss; without them a recipe's perceptual loss is skipped.
     pub lpips: Option<Arc<Lpips>>,
 }
 
 impl Default for TrainOptions {
-    /// Seed 0, the recipe's steps, 2 GiB of photographs (5,500 of 360 x 360: what remains on an 8 GiB machine).
+    /// Seed 0, the recipe's steps, and no limit on memory.
     fn default() -> Self {
         Self {
             seed: 0,
             steps: None,
-            photo_budget: 2 << 30,
+            memory: None,
             lpips: None,
         }
     }
 }
 
+/// Fewer points than these are not used as first splats.
+const FEWEST_POINTS: usize = 10;
+
 /// Random streams derived from the run's seed, one per use.
 const STREAM_INIT: u64 = 1;
 const STREAM_DENSIFY: u64 = 2;
 const STREAM_STEP: u64 = 5;
+
+/// Maximum number of training views from which random first splats get their colours, evenly spaced.
+const FIRST_VIEWS: usize = 256;
+/// Scale at which photographs that take less time then are read for these colours.
+const FIRST_SCALE: f32 = 0.25;
 
 /// Training views over which the convergence error is measured.
 const MEASURED_VIEWS: usize = 8;
@@ -113,8 +137,10 @@ pub struct Trainer {
     pub cpu_seconds: f64,
     /// Wall time between the first step and the last, and its breakdown.
     pub times: Times,
-    /// Maximum number of splats: the recipe's limits for this dataset.
+    /// Maximum number of splats: the recipe's limits for this dataset, and that of the memory.
     pub cap: usize,
+    /// The distribution of the memory.
+    pub memory: MemoryPlan,
     pub(crate) photos: PhotoCache,
     /// Known depths of the views on which a field is trained, by view, width and height.
     pub(crate) depths: HashMap<(usize, u32, u32), Arc<[KnownDepth]>>,
@@ -127,7 +153,12 @@ impl Trainer {
     /// # Errors
     /// When there are no training views or no initial points, or photographs needed for colours cannot be read.
     pub fn new(dataset: Arc<Dataset>, recipe: Recipe, options: TrainOptions) -> Result<Self, TrainError> {
-        let mut trainer = Self::unfilled(dataset, recipe, options)?;
+        let first = first_count(&dataset, &recipe);
+        let mut trainer = Self::unfilled(dataset, recipe, options, first)?;
+        if trainer.memory.splats < trainer.memory.wanted_splats {
+            // In the recipe, so that a resumed run has the same limit.
+            trainer.recipe.max_splats = trainer.memory.splats;
+        }
         if is_field(&trainer.recipe, 0) {
             trainer.field = Some(trainer.first_field()?);
         } else {
@@ -138,13 +169,24 @@ impl Trainer {
         Ok(trainer)
     }
 
-    /// A trainer whose state is yet to be filled in, by a checkpoint for example.
-    pub(crate) fn unfilled(dataset: Arc<Dataset>, recipe: Recipe, options: TrainOptions) -> Result<Self, TrainError> {
+    /// A trainer whose state is yet to be filled in with `first_splats` splats, by a checkpoint for example.
+    pub(crate) fn unfilled(
+        dataset: Arc<Dataset>,
+        recipe: Recipe,
+        options: TrainOptions,
+        first_splats: usize,
+    ) -> Result<Self, TrainError> {
         if dataset.train.is_empty() {
             return Err(TrainError::NoViews(0));
         }
         let cameras = train_cameras(&dataset);
         let total = recipe.total_steps() as f64;
+        let needs = Needs {
+            first_splats,
+            most_splats: cap(&recipe, &cameras).max(first_splats),
+            ..Needs::of(&dataset, &recipe, options.lpips.as_ref().map(|lpips| lpips.net()))
+        };
+        let memory = MemoryPlan::new(&needs, options.memory)?;
         Ok(Self {
             clock: Clock::new(&recipe),
             pace: options.steps.map_or(1.0, |steps| total / steps.max(1) as f64),
@@ -152,8 +194,9 @@ impl Trainer {
             cpu_seconds: 0.0,
             times: Times::default(),
             extent: init::camera_extent(&cameras),
-            photos: PhotoCache::new(dataset.clone(), recipe.render.background, options.photo_budget),
-            cap: cap(&recipe, &cameras),
+            photos: PhotoCache::new(dataset.clone(), recipe.render.background, memory.photos),
+            cap: cap(&recipe, &cameras).min(memory.splats),
+            memory,
             depths: HashMap::new(),
             objective: Objective::new(options.lpips.clone()),
             engine: Engine::new(SplatState::new(Splats::zeros(0, sh::MAX_DEGREE))),
@@ -202,7 +245,7 @@ impl Trainer {
         let options = self.init_options();
         let dataset = self.dataset.clone();
         let most = self.recipe.max_splats;
-        let splats = match dataset.points.as_ref().filter(|points| points.len() >= 10) {
+        let splats = match dataset.points.as_ref().filter(|points| points.len() >= FEWEST_POINTS) {
             // Evenly over the file: SfM writes points in the order in which it finds them, region by region.
             Some(points) if points.len() > most => {
                 let chosen = (0..most).map(|i| i * points.len() / most);
@@ -211,38 +254,38 @@ impl Trainer {
             }
             Some(points) => init::from_points(points, &options),
             None => {
-                let views: Vec<&View> = dataset.train.iter().map(|i| &dataset.views[*i]).collect();
+                let stride = dataset.train.len().div_ceil(FIRST_VIEWS);
+                let chosen: Vec<usize> = dataset.train.iter().copied().step_by(stride).collect();
+                let views: Vec<&View> = chosen.iter().map(|i| &dataset.views[*i]).collect();
                 let cameras: Vec<Camera> = views.iter().map(|v| v.camera).collect();
                 let bounds: Vec<Option<[f32; 2]>> = views.iter().map(|v| v.depth_bounds).collect();
-                let mut photos: Vec<Option<Arc<Prepared>>> = vec![None; views.len()];
-                // Colours are taken from all photographs in turn: downscaled if they do not fit into memory.
-                let scale = self.photos.scale_that_fits(&dataset.train);
-                for (i, photo) in photos.iter_mut().enumerate() {
-                    let upcoming: Vec<usize> = dataset.train[i..].to_vec();
-                    *photo = Some(self.photos.get(&upcoming, scale)?);
-                }
                 let mut rng = Rng::new(self.options.seed, STREAM_INIT);
                 let points = init::random_points(
                     &cameras,
                     &bounds,
                     self.recipe.init.random_points.min(most),
                     &mut rng,
-                    |view, pixel| {
-                        let photo = photos[view].as_ref().expect("loaded above");
-                        let k = &cameras[view].intrinsics;
-                        let x = pixel.x as usize * photo.width as usize / k.width as usize;
-                        let y = pixel.y as usize * photo.height as usize / k.height as usize;
-                        let at = y * photo.width as usize + x;
-                        let zero = |plane: &Option<Vec<u8>>| plane.as_ref().is_some_and(|plane| plane[at] == 0);
-                        if zero(&photo.mask) {
-                            PixelClass::Masked
-                        } else if zero(&photo.alpha) {
-                            PixelClass::Empty
-                        } else {
-                            PixelClass::Color([0, 1, 2].map(|c| photo.rgb[3 * at + c]))
-                        }
+                    |view| {
+                        let k = cameras[view].intrinsics;
+                        let small = k.scaled(FIRST_SCALE);
+                        let is_quick = !views[view].photo.is_shrunk_from_full(small.width, small.height);
+                        let scale = if is_quick { FIRST_SCALE } else { 1.0 };
+                        let photo = self.photos.get(&chosen[view..], scale)?;
+                        Ok::<_, LoadError>(move |pixel: Vec2| {
+                            let x = pixel.x as usize * photo.width as usize / k.width as usize;
+                            let y = pixel.y as usize * photo.height as usize / k.height as usize;
+                            let at = y * photo.width as usize + x;
+                            let zero = |plane: &Option<Vec<u8>>| plane.as_ref().is_some_and(|plane| plane[at] == 0);
+                            if zero(&photo.mask) {
+                                PixelClass::Masked
+                            } else if zero(&photo.alpha) {
+                                PixelClass::Empty
+                            } else {
+                                PixelClass::Color([0, 1, 2].map(|c| photo.rgb[3 * at + c]))
+                            }
+                        })
                     },
-                );
+                )?;
                 let opacity = self.recipe.init.random_opacity.unwrap_or(options.opacity);
                 init::from_points(&points, &InitOptions { opacity, ..options })
             }
@@ -440,7 +483,11 @@ impl Trainer {
     }
 
     fn densify(&mut self, round: &Round) -> DensityChange {
-        let limit = self.limit(self.clock.stage, round.count_share);
+        let pixels = self.engine.frame().color.len() / 3;
+        let by_memory = self
+            .memory
+            .splats_at(self.engine.intersections(), self.engine.len(), pixels);
+        let limit = self.limit(self.clock.stage, round.count_share).min(by_memory);
         let mut rng = Rng::new(self.options.seed ^ self.clock.step << 20, STREAM_DENSIFY);
         let state = self.engine.state_mut();
         match round.density {
@@ -578,14 +625,15 @@ impl Trainer {
         }
     }
 
-    /// Parts of the dataset that the recipe ignores: one line each.
+    /// Parts of the dataset that the recipe ignores, and splats for which there is no memory: one line each.
     pub fn warnings(&self) -> Vec<String> {
         let moves = self.dataset.train.iter().any(|i| self.dataset.views[*i].time.is_some());
         let line = format!(
             "the photographs were taken at different times, which recipe {} ignores: moving objects become blurred",
             self.recipe.name
         );
-        if moves { vec![line] } else { Vec::new() }
+        let by_memory = self.memory.warning(&self.recipe.name);
+        moves.then_some(line).into_iter().chain(by_memory).collect()
     }
 
     /// The scene as exported and evaluated: with the smoothing filter baked in.
@@ -611,6 +659,21 @@ impl Trainer {
 
 fn train_cameras(dataset: &Dataset) -> Vec<Camera> {
     dataset.train.iter().map(|i| dataset.views[*i].camera).collect()
+}
+
+/// Number of splats with which a training begins.
+fn first_count(dataset: &Dataset, recipe: &Recipe) -> usize {
+    let points = dataset
+        .points
+        .as_ref()
+        .map(PointCloud::len)
+        .filter(|points| *points >= FEWEST_POINTS);
+    let first = points.unwrap_or(recipe.init.random_points);
+    if is_field(recipe, 0) {
+        0
+    } else {
+        first.min(recipe.max_splats)
+    }
 }
 
 /// The recipe's limits on the number of splats, for images of these cameras.

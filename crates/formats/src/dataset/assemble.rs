@@ -44,6 +44,7 @@ impl Skipped {
 /// A view with a readable image file.
 struct Probed {
     orientation: Orientation,
+    jpeg: bool,
     /// At the actual size of the upright image, lens included.
     source: Intrinsics,
     /// Set for distorted cameras by [`plan_undistortion`].
@@ -139,6 +140,7 @@ fn probe(view: &DeclaredView, ignores_exif: bool) -> Result<Probed, Skipped> {
     }
     Ok(Probed {
         orientation,
+        jpeg: header.jpeg,
         source,
         undistortion: None,
     })
@@ -208,6 +210,7 @@ fn finish(
         image: view.image?,
         mask: view.mask,
         orientation: probed.orientation,
+        jpeg: probed.jpeg,
         upright: (probed.source.width, probed.source.height),
         undistortion: probed.undistortion,
         size: (intrinsics.width, intrinsics.height),

@@ -3,6 +3,9 @@
 
 use std::io::{self, BufRead, Seek};
 
+/// The end of a file, bytes, in which its last marker is usually found.
+const TAIL: u64 = 4096;
+
 /// Whether a JPEG in memory has its end-of-image marker after the start of its scan.
 ///
 /// The search starts after the headers, which may contain a thumbnail, itself a JPEG with both markers.
@@ -20,6 +23,35 @@ pub(crate) fn jpeg_is_complete(bytes: &[u8]) -> bool {
             _ => return false,
         }
     }
+}
+
+/// [`jpeg_is_complete`] of a file, of which headers and end are read, and all of it only if the end has no marker.
+pub(crate) fn jpeg_file_is_complete(reader: &mut (impl BufRead + Seek)) -> io::Result<bool> {
+    let length = reader.seek(io::SeekFrom::End(0))?;
+    let mut at = 2;
+    loop {
+        if at + 4 > length {
+            return Ok(false);
+        }
+        reader.seek(io::SeekFrom::Start(at))?;
+        let mut head = [0u8; 4];
+        reader.read_exact(&mut head)?;
+        match head {
+            [0xFF, 0xFF, ..] => at += 1,
+            [0xFF, 0xDA, ..] => break,
+            [0xFF, _, high, low] => at += 2 + u64::from(u16::from_be_bytes([high, low])),
+            _ => return Ok(false),
+        }
+    }
+    for tail in [TAIL, length] {
+        reader.seek(io::SeekFrom::Start((at + 2).max(length.saturating_sub(tail))))?;
+        let mut bytes = Vec::new();
+        reader.read_to_end(&mut bytes)?;
+        if bytes.windows(2).rev().any(|pair| pair == [0xFF, 0xD9]) {
+            return Ok(true);
+        }
+    }
+    Ok(false)
 }
 
 /// Whether a PNG's chunks lead to its `IEND`; the reader is at the start of the file, and anywhere afterwards.

@@ -3,7 +3,8 @@
 use crate::error::read_and_parse;
 use crate::splats::ply::has_splats;
 use crate::{DatasetFormat, DatasetOptions, FormatError, SplatFormat, read_dataset, read_points_ply, read_splats};
-use irradia_scene::{Dataset, GaussianCloud, PointCloud};
+use glam::DVec3;
+use irradia_scene::{Dataset, GaussianCloud, PointCloud, Similarity};
 use std::fmt;
 use std::path::Path;
 
@@ -78,7 +79,10 @@ fn describe_splats(format: SplatFormat, cloud: &GaussianCloud) -> Description {
         facts: vec![
             ("SH degree", cloud.sh_degree.to_string()),
             ("antialiased", if cloud.antialiased { "yes" } else { "no" }.into()),
-            ("centres within", extent(cloud.means.iter().copied())),
+            (
+                "centres within",
+                extent(cloud.means.iter().copied(), &cloud.world_from_dataset),
+            ),
         ],
         warnings: Vec::new(),
     }
@@ -87,7 +91,10 @@ fn describe_splats(format: SplatFormat, cloud: &GaussianCloud) -> Description {
 fn describe_points(points: &PointCloud) -> Description {
     Description {
         title: format!("point cloud with {} points", points.len()),
-        facts: vec![("within", extent(points.positions.iter().map(|p| p.to_array())))],
+        facts: vec![(
+            "within",
+            extent(points.positions.iter().map(|p| p.to_array()), &Similarity::IDENTITY),
+        )],
         warnings: Vec::new(),
     }
 }
@@ -109,23 +116,32 @@ fn describe_dataset(dataset: &Dataset) -> Description {
         .as_ref()
         .map_or("none".to_owned(), |points| points.len().to_string());
     let centres = dataset.views.iter().map(|view| view.camera.pose.position.to_array());
+    let world = dataset.world_from_dataset;
+    let trained_in = (!world.is_identity()).then(|| {
+        let DVec3 { x, y, z } = world.center;
+        let origin = format!("a world about ({x:.3}, {y:.3}, {z:.3})");
+        ("trained in", format!("{origin}, in units of {}", 1.0 / world.scale))
+    });
     Description {
         title: format!("{} dataset with {} views", dataset.kind, dataset.views.len()),
-        facts: vec![
+        facts: [
             (
                 "train, test",
                 format!("{}, {}", dataset.train.len(), dataset.test.len()),
             ),
             ("image size", format!("{size} (undistorted)")),
             ("points", points),
-            ("cameras within", extent(centres)),
-        ],
+            ("cameras within", extent(centres, &world)),
+        ]
+        .into_iter()
+        .chain(trained_in)
+        .collect(),
         warnings: dataset.warnings.clone(),
     }
 }
 
-/// The box around all finite points.
-fn extent(points: impl Iterator<Item = [f32; 3]>) -> String {
+/// The box around all finite points, in the dataset's coordinates.
+fn extent(points: impl Iterator<Item = [f32; 3]>, world_from_dataset: &Similarity) -> String {
     let finite = points.filter(|p| p.iter().all(|v| v.is_finite()));
     let (low, high) = finite.fold(([f32::INFINITY; 3], [f32::NEG_INFINITY; 3]), |(low, high), p| {
         (
@@ -136,6 +152,9 @@ fn extent(points: impl Iterator<Item = [f32; 3]>) -> String {
     if low[0] > high[0] {
         return "nothing".into();
     }
-    let corner = |p: [f32; 3]| format!("({:.3}, {:.3}, {:.3})", p[0], p[1], p[2]);
+    let corner = |p: [f32; 3]| {
+        let p = world_from_dataset.invert(DVec3::from(p.map(f64::from)));
+        format!("({:.3}, {:.3}, {:.3})", p.x, p.y, p.z)
+    };
     format!("{} .. {}", corner(low), corner(high))
 }

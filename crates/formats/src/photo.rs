@@ -1,4 +1,5 @@
-use crate::image_file::{Colour, decode, read_header};
+use crate::DEFAULT_MAX_SIDE;
+use crate::image_file::{Colour, decode, decode_jpeg_at, read_header};
 use crate::undistort::Undistortion;
 use crate::{FormatError, Pixels};
 use image::metadata::Orientation;
@@ -15,6 +16,8 @@ pub(crate) struct PhotoFile {
     pub mask: Option<PathBuf>,
     /// Applied first; [`Orientation::NoTransforms`] when the poses belong to the pixels as stored.
     pub orientation: Orientation,
+    /// Whether `image` is a JPEG.
+    pub jpeg: bool,
     /// Size after orientation, from the header when the dataset was read.
     pub upright: (u32, u32),
     pub undistortion: Option<Undistortion>,
@@ -24,24 +27,68 @@ pub(crate) struct PhotoFile {
 
 impl PhotoSource for PhotoFile {
     fn load(&self) -> Result<Photo, LoadError> {
-        self.read().map_err(|error| LoadError(error.to_string()))
+        self.read(self.size).map_err(|error| LoadError(error.to_string()))
+    }
+
+    fn load_at(&self, width: u32, height: u32) -> Result<Photo, LoadError> {
+        if self.is_shrunk_from_full(width, height) {
+            return Ok(self.load()?.resized(width, height));
+        }
+        self.read((width, height)).map_err(|error| LoadError(error.to_string()))
+    }
+
+    fn is_shrunk_from_full(&self, width: u32, height: u32) -> bool {
+        self.divisor((width, height)) == self.divisor(self.size)
+    }
+
+    fn working_bytes(&self) -> usize {
+        let divisor = self.divisor(self.size) as usize;
+        let pixels = self.upright.0 as usize * self.upright.1 as usize / (divisor * divisor);
+        // The file, the pixels as decoded with their planes, and undistorted.
+        10 * pixels
     }
 }
 
 impl PhotoFile {
-    fn read(&self) -> Result<Photo, FormatError> {
-        let pixels = decode(&self.image, self.orientation, Colour::Keep)?;
-        if (pixels.width, pixels.height) != self.upright {
+    /// The fraction of its size, as a divisor, at which the file is decoded for a photograph of `size`: more than 1 only for JPEG
+    /// above [`DEFAULT_MAX_SIDE`], so that it takes less time. It depends on sizes alone.
+    fn divisor(&self, size: (u32, u32)) -> u32 {
+        if !self.jpeg || self.upright.0.max(self.upright.1) <= DEFAULT_MAX_SIDE {
+            return 1;
+        }
+        let (width, height) = self.undistortion.map_or(self.upright, |plan| {
+            let pinhole = plan.pinhole();
+            (pinhole.width, pinhole.height)
+        });
+        let suffices = |divisor: &u32| width / divisor >= size.0 && height / divisor >= size.1;
+        [8, 4, 2].into_iter().find(suffices).unwrap_or(1)
+    }
+
+    /// The photograph at `size`.
+    fn read(&self, size: (u32, u32)) -> Result<Photo, FormatError> {
+        let divisor = self.divisor(size);
+        let pixels = if divisor == 1 {
+            decode(&self.image, self.orientation, Colour::Keep)?
+        } else {
+            decode_jpeg_at(&self.image, divisor, self.orientation)?
+        };
+        let (width, height) = self.upright;
+        if (pixels.width, pixels.height) != (width.div_ceil(divisor), height.div_ceil(divisor)) {
             return Err(FormatError::malformed(
                 &self.image,
                 format!(
-                    "is now {}x{}, but was {}x{} when the dataset was read; start again",
-                    pixels.width, pixels.height, self.upright.0, self.upright.1
+                    "is now {}x{}, but was {width}x{height} when the dataset was read; start again",
+                    pixels.width * divisor,
+                    pixels.height * divisor
                 ),
             ));
         }
-        let pixels = self.bring_to_size(pixels);
-        let mask = self.mask.as_deref().map(|path| self.read_mask(path)).transpose()?;
+        let pixels = self.bring_to_size(pixels, size);
+        let mask = self
+            .mask
+            .as_deref()
+            .map(|path| self.read_mask(path, size))
+            .transpose()?;
         Ok(Photo {
             width: pixels.width,
             height: pixels.height,
@@ -51,17 +98,17 @@ impl PhotoFile {
         })
     }
 
-    fn bring_to_size(&self, mut pixels: Pixels) -> Pixels {
+    fn bring_to_size(&self, mut pixels: Pixels, size: (u32, u32)) -> Pixels {
         if let Some(undistortion) = &self.undistortion {
             pixels = undistortion.apply(&pixels);
         }
-        if (pixels.width, pixels.height) != self.size {
-            pixels = resized(pixels, self.size);
+        if (pixels.width, pixels.height) != size {
+            pixels = resized(pixels, size);
         }
         pixels
     }
 
-    fn read_mask(&self, path: &Path) -> Result<Vec<u8>, FormatError> {
+    fn read_mask(&self, path: &Path, size: (u32, u32)) -> Result<Vec<u8>, FormatError> {
         // Masks are made from the pixels as displayed by some tool and rarely have EXIF data: one with the aspect of the stored
         // photograph gets the same orientation.
         let header = read_header(path)?;
@@ -75,7 +122,7 @@ impl PhotoFile {
         if (mask.width, mask.height) != self.upright {
             mask = resized(mask, self.upright);
         }
-        let mut mask = self.bring_to_size(mask).data;
+        let mut mask = self.bring_to_size(mask, size).data;
         mask.iter_mut()
             .for_each(|v| *v = if *v >= MASK_THRESHOLD { 255 } else { 0 });
         Ok(mask)

@@ -1,8 +1,9 @@
+use crate::dataset::DeclaredPoints;
 use crate::error::read_and_parse;
 use crate::ply::{Column, Ply, Rows};
 use crate::{FormatError, Malformed, write_atomic};
-use glam::Vec3;
-use irradia_scene::PointCloud;
+use glam::DVec3;
+use irradia_scene::{PointCloud, Similarity};
 use std::path::Path;
 
 /// Reads a point cloud from a PLY file: ASCII or binary of either byte order; `x y z` of any type; `red green blue`
@@ -23,6 +24,15 @@ pub fn read_points_ply(path: &Path) -> Result<PointCloud, FormatError> {
 ///
 /// [`read_points_ply`]: crate::read_points_ply
 pub fn parse_points_ply(bytes: &[u8]) -> Result<PointCloud, Malformed> {
+    Ok(parse_declared(bytes)?.in_world(&Similarity::IDENTITY))
+}
+
+/// [`read_points_ply`] with the coordinates of the file.
+pub(crate) fn read_declared_points(path: &Path) -> Result<DeclaredPoints, FormatError> {
+    read_and_parse(path, parse_declared)
+}
+
+fn parse_declared(bytes: &[u8]) -> Result<DeclaredPoints, Malformed> {
     let ply = Ply::parse(bytes)?;
     let rows = ply.rows("vertex")?;
     let [x, y, z] = rows.columns(["x", "y", "z"])?;
@@ -35,17 +45,14 @@ pub fn parse_points_ply(bytes: &[u8]) -> Result<PointCloud, Malformed> {
     .find_map(|names| rows.columns(names).ok());
     let color_scale = color.map_or(1.0, |columns| color_scale(&rows, columns));
 
-    let mut points = PointCloud::default();
+    let mut points = DeclaredPoints::default();
     for index in 0..rows.len() {
         let row = rows.row(index);
-        let position = Vec3::new(x.f32(row), y.f32(row), z.f32(row));
-        if position.is_finite() {
-            points.positions.push(position);
-            // `as u8` saturates, and maps NaN to 0.
-            points.colors.push(color.map_or([255; 3], |columns| {
-                columns.map(|c| (c.f64(row) * color_scale).round() as u8)
-            }));
-        }
+        // `as u8` saturates, and maps NaN to 0.
+        let color = color.map_or([255; 3], |columns| {
+            columns.map(|c| (c.f64(row) * color_scale).round() as u8)
+        });
+        points.push(DVec3::new(x.f64(row), y.f64(row), z.f64(row)), color);
     }
     Ok(points)
 }
@@ -84,6 +91,7 @@ fn color_scale(rows: &Rows, columns: [Column; 3]) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use glam::Vec3;
 
     #[test]
     fn ascii_with_lists_other_elements_and_float_colours() {

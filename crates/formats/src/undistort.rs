@@ -92,7 +92,7 @@ impl Undistortion {
         }
     }
 
-    /// Undistorts an image of the source's size, bilinearly.
+    /// Undistorts an image of the source's size, or of a fraction of it, bilinearly; the result has the same fraction of the size.
     pub fn apply(&self, from: &Pixels) -> Pixels {
         match from.channels {
             1 => self.apply_channels::<1>(from),
@@ -102,24 +102,31 @@ impl Undistortion {
     }
 
     fn apply_channels<const C: usize>(&self, from: &Pixels) -> Pixels {
-        let grid_columns = self.width.div_ceil(GRID) + 1;
+        // Pixels of the source for each of `from`; 1 at full size.
+        let step = [
+            f64::from(self.source.width) / f64::from(from.width),
+            f64::from(self.source.height) / f64::from(from.height),
+        ];
+        let side = |full: u32, step: f64| ((f64::from(full) / step) as u32).max(1);
+        let (width, height) = (side(self.width, step[0]), side(self.height, step[1]));
+        let grid_columns = width.div_ceil(GRID) + 1;
         let grid_row = |y: u32| -> Vec<[f32; 2]> {
             (0..grid_columns)
-                .map(|column| self.source_index(column * GRID, y))
+                .map(|column| self.source_index(column * GRID, y, step))
                 .collect()
         };
-        let mut data = Vec::with_capacity(self.width as usize * self.height as usize * C);
+        let mut data = Vec::with_capacity(width as usize * height as usize * C);
         let mut upper = grid_row(0);
-        for first in (0..self.height).step_by(GRID as usize) {
+        for first in (0..height).step_by(GRID as usize) {
             let lower = grid_row(first + GRID);
-            for y in first..(first + GRID).min(self.height) {
+            for y in first..(first + GRID).min(height) {
                 let t = (y - first) as f32 / GRID as f32;
                 let mix = |i: usize, axis: usize| upper[i][axis] + (lower[i][axis] - upper[i][axis]) * t;
                 for column in 0..grid_columns as usize - 1 {
                     let start = [mix(column, 0), mix(column, 1)];
                     let end = [mix(column + 1, 0), mix(column + 1, 1)];
                     let slope = [(end[0] - start[0]) / GRID as f32, (end[1] - start[1]) / GRID as f32];
-                    for i in 0..GRID.min(self.width - column as u32 * GRID) {
+                    for i in 0..GRID.min(width - column as u32 * GRID) {
                         let at = [start[0] + slope[0] * i as f32, start[1] + slope[1] * i as f32];
                         data.extend(sample::<C>(from, at));
                     }
@@ -128,21 +135,22 @@ impl Undistortion {
             upper = lower;
         }
         Pixels {
-            width: self.width,
-            height: self.height,
+            width,
+            height,
             channels: from.channels,
             data,
         }
     }
 
-    /// Position in the photograph of the centre of undistorted pixel `(x, y)`, where pixel centres are integers.
-    fn source_index(&self, x: u32, y: u32) -> [f32; 2] {
+    /// Position in the photograph of the centre of undistorted pixel `(x, y)`, where pixel centres are integers; both have one pixel
+    /// for `step` of the source.
+    fn source_index(&self, x: u32, y: u32, step: [f64; 2]) -> [f32; 2] {
         let at = distorted_pixel(
             &self.source,
-            (i64::from(x) + self.left) as f64 + 0.5,
-            (i64::from(y) + self.top) as f64 + 0.5,
+            (f64::from(x) + 0.5) * step[0] + self.left as f64,
+            (f64::from(y) + 0.5) * step[1] + self.top as f64,
         );
-        [(at.x - 0.5) as f32, (at.y - 0.5) as f32]
+        [(at.x / step[0] - 0.5) as f32, (at.y / step[1] - 0.5) as f32]
     }
 }
 

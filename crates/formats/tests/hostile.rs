@@ -102,6 +102,7 @@ fn splat_ply() -> Vec<u8> {
         sh: vec![0.2; 3 * 12],
         sh_degree: 1,
         antialiased: true,
+        ..irradia_scene::GaussianCloud::default()
     };
     irradia_formats::write_splats(&path, &cloud).unwrap();
     std::fs::read(path).unwrap()

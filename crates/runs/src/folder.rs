@@ -3,9 +3,9 @@
 use crate::lock::FolderLock;
 use crate::provenance::ViewList;
 use crate::{RunError, TrainInput};
-use glam::{Quat, Vec3};
+use glam::{DVec3, Quat};
 use irradia_formats::write_atomic;
-use irradia_scene::{Camera, Dataset, Intrinsics, Pose};
+use irradia_scene::{Camera, Dataset, Intrinsics, Pose, Similarity};
 use irradia_train::checkpoint::Checkpoint;
 use irradia_train::paces::Paces;
 use irradia_train::{Trainer, socket};
@@ -22,13 +22,16 @@ pub const RESIDUAL: &str = socket::FILES[1];
 
 /// List of the views of a run's dataset.
 pub(crate) const VIEWS: &str = "views.json";
+/// From the dataset's coordinates to the world in which the run trains.
+const WORLD: &str = "world.json";
 /// The pace of each step.
 pub(crate) const PACES: &str = "pace.txt";
 
 /// The files of a run.
-const FILES: [&str; 13] = [
+const FILES: [&str; 14] = [
     "run.json",
     VIEWS,
+    WORLD,
     PACES,
     "recipe.toml",
     "cameras.json",
@@ -45,7 +48,7 @@ const FILES: [&str; 13] = [
 const FOLDERS: [&str; 2] = ["eval", "checkpoints"];
 
 /// Files written before `run.json`, with which a run has begun.
-const EARLY: [&str; 3] = ["recipe.toml", "cameras.json", VIEWS];
+const EARLY: [&str; 4] = ["recipe.toml", "cameras.json", VIEWS, WORLD];
 
 /// Whether the folder `path` contains a run, or may contain one; not if it contains only the files of a process that died
 /// before its run had begun.
@@ -78,10 +81,22 @@ struct CameraRecord {
     fy: f32,
     cx: f32,
     cy: f32,
-    /// World, camera centre.
-    position: [f32; 3],
+    /// Camera centre, in the dataset's coordinates.
+    position: [f64; 3],
     /// World from camera (x right, y down, z forward): w, x, y, z.
     rotation: [f32; 4],
+}
+
+/// `world.json`, in which `world = scale (dataset - center)`.
+#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
+struct WorldRecord {
+    scale: f64,
+    center: [f64; 3],
+}
+
+/// An `f64` with the digits of an `f32`, so that files do not show digits beyond its precision.
+fn shortest(value: f32) -> f64 {
+    value.to_string().parse().unwrap_or(f64::from(value))
 }
 
 impl RunFolder {
@@ -239,6 +254,7 @@ impl RunFolder {
     /// Writes `cameras.json`: the training views' cameras, with their refinement.
     pub(crate) fn write_cameras(&self, trainer: &Trainer) -> Result<(), RunError> {
         let dataset = &trainer.dataset;
+        let world = dataset.world_from_dataset;
         let records: Vec<CameraRecord> = dataset
             .train
             .iter()
@@ -248,6 +264,11 @@ impl RunFolder {
                     intrinsics: k, pose, ..
                 } = trainer.camera(*i);
                 let q = pose.rotation;
+                let position = if world.is_identity() {
+                    pose.position.to_array().map(shortest)
+                } else {
+                    world.invert(pose.position.as_dvec3()).to_array()
+                };
                 CameraRecord {
                     name: view.name.clone(),
                     width: k.width,
@@ -256,12 +277,46 @@ impl RunFolder {
                     fy: k.fy,
                     cx: k.cx,
                     cy: k.cy,
-                    position: pose.position.to_array(),
+                    position,
                     rotation: [q.w, q.x, q.y, q.z],
                 }
             })
             .collect();
         self.write("cameras.json", &to_json(&records))
+    }
+
+    /// Writes `world.json`.
+    pub(crate) fn write_world(&self, world_from_dataset: &Similarity) -> Result<(), RunError> {
+        let record = WorldRecord {
+            scale: world_from_dataset.scale,
+            center: world_from_dataset.center.to_array(),
+        };
+        self.write(WORLD, &to_json(&record))
+    }
+
+    /// The world in which the run trains: the dataset's own coordinates if the run is older than `world.json`.
+    ///
+    /// # Errors
+    /// When the file is damaged.
+    pub(crate) fn world_from_dataset(&self) -> Result<Similarity, RunError> {
+        let path = self.file(WORLD);
+        let Ok(text) = fs::read_to_string(&path) else {
+            return Ok(Similarity::IDENTITY);
+        };
+        let damaged = |reason: String| RunError::Damaged {
+            path: path.clone(),
+            reason,
+        };
+        let record: WorldRecord = serde_json::from_str(&text).map_err(|error| damaged(error.to_string()))?;
+        let world = Similarity {
+            scale: record.scale,
+            center: record.center.into(),
+        };
+        if world.is_valid() {
+            Ok(world)
+        } else {
+            Err(damaged("the scale must be positive".into()))
+        }
     }
 
     /// The latest checkpoint, if there is one.
@@ -310,8 +365,13 @@ pub(crate) fn to_json(value: &impl Serialize) -> Vec<u8> {
     serde_json::to_vec_pretty(value).expect("plain data")
 }
 
-/// The cameras of the run that contains the file `scene`, if there is one.
-pub(crate) fn cameras_beside(scene: &Path) -> Option<Vec<Camera>> {
+/// The world of the run that contains the file `scene`; the dataset's own coordinates if there is none.
+pub(crate) fn world_beside(scene: &Path) -> Result<Similarity, RunError> {
+    RunFolder(scene.parent().unwrap_or(Path::new("")).to_owned()).world_from_dataset()
+}
+
+/// The cameras, in the world of `world_from_dataset`, of the run that contains the file `scene`, if there is one.
+pub(crate) fn cameras_beside(scene: &Path, world_from_dataset: &Similarity) -> Option<Vec<Camera>> {
     let text = fs::read_to_string(scene.parent()?.join("cameras.json")).ok()?;
     let records: Vec<CameraRecord> = serde_json::from_str(&text).ok()?;
     let camera = |r: &CameraRecord| {
@@ -321,7 +381,7 @@ pub(crate) fn cameras_beside(scene: &Path) -> Option<Vec<Camera>> {
         Camera::new(
             Pose {
                 rotation: Quat::from_xyzw(x, y, z, w),
-                position: Vec3::from_array(r.position),
+                position: world_from_dataset.apply(DVec3::from(r.position)).as_vec3(),
             },
             k,
         )

@@ -152,6 +152,9 @@ pub struct TrainInput {
     pub replay: Option<PathBuf>,
     /// Held-out PSNR at which to stop, dB.
     pub until_psnr: Option<f64>,
+    /// Memory of the whole process, bytes; three quarters of what is free if `None`.
+    #[serde(default)]
+    pub memory: Option<usize>,
     /// Random seed.
     pub seed: u64,
     /// Weights of LPIPS. Without them a recipe's perceptual loss is skipped and reports have no LPIPS.
@@ -188,6 +191,7 @@ impl TrainInput {
             budget: None,
             replay: None,
             until_psnr: None,
+            memory: None,
             seed: 0,
             lpips: None,
             unseen_lpips: None,
@@ -242,6 +246,7 @@ impl TrainInput {
         let started = Instant::now();
         at_least_one("steps", self.steps)?;
         at_least_one("max_splats", self.max_splats)?;
+        at_least_one("memory", self.memory)?;
         if let Some(seconds) = self.budget.filter(|seconds| !(*seconds > 0.0 && seconds.is_finite())) {
             return Err(RunError::setting("budget", seconds, "must be more than 0 seconds"));
         }

@@ -26,6 +26,7 @@ impl Run {
             Model::Splats { splats, .. } => {
                 let mut cloud = splats.to_cloud();
                 cloud.antialiased = self.trainer.recipe.render.antialias;
+                cloud.world_from_dataset = self.trainer.dataset.world_from_dataset;
                 write_splats(&folder.file(SCENE), &cloud)?;
                 for (name, bytes) in self.trainer.sockets.files() {
                     folder.write(&name, &bytes)?;

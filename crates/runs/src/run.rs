@@ -8,6 +8,7 @@ use crate::{RunError, RunFolder, TrainRequest, background};
 use irradia_measure::Lpips;
 use irradia_scene::Dataset;
 use irradia_train::event::Observer;
+use irradia_train::memory::usual_limit;
 use irradia_train::paces::Paces;
 use irradia_train::report::Report;
 use irradia_train::{RunLimits, TrainOptions, Trainer, checkpoint};
@@ -93,6 +94,7 @@ impl Run {
         folder.write("recipe.toml", trainer.recipe.to_toml().as_bytes())?;
         folder.write_cameras(&trainer)?;
         folder.write_views(&trainer.dataset)?;
+        folder.write_world(&trainer.dataset.world_from_dataset)?;
         // Last: a folder with this file has everything needed to resume.
         folder.write_record(&RunRecord {
             input: request.input.clone(),
@@ -122,7 +124,8 @@ impl Run {
         folder.remove_leftovers()?;
         let options = train_options(&request)?;
         let paces = request.paces()?;
-        let dataset = Arc::new(dataset);
+        // The world of the steps made, which an earlier version may have chosen otherwise.
+        let dataset = Arc::new(dataset.in_world(folder.world_from_dataset()?));
         let trainer = match folder.newest_checkpoint()? {
             Some(path) => {
                 let differences = folder.changed_views(&dataset)?;
@@ -275,8 +278,8 @@ fn train_options(request: &TrainRequest) -> Result<TrainOptions, RunError> {
     Ok(TrainOptions {
         seed: input.seed,
         steps: input.steps,
+        memory: input.memory.or_else(usual_limit),
         lpips: input.lpips.as_ref().map(Lpips::load).transpose()?.map(Arc::new),
-        ..TrainOptions::default()
     })
 }
 

@@ -121,6 +121,7 @@ mod tests {
             width: 16,
             height: 12,
             seed: 0,
+            ..SynthOptions::default()
         };
         write_synth_dataset(&photos, &options).unwrap();
         let input = TrainInput {

@@ -1,11 +1,11 @@
 //! A scene that can be rendered: read from a file or a run, or taken from a training.
 
 use crate::RunError;
-use crate::folder::{FIELD, RESIDUAL, SCENE, cameras_beside};
+use crate::folder::{FIELD, RESIDUAL, SCENE, cameras_beside, world_beside};
 use crate::orbit::orbit;
 use irradia_field::{Field, Sampler};
 use irradia_formats::read_splats;
-use irradia_scene::Camera;
+use irradia_scene::{Camera, Dataset, Similarity};
 use irradia_splat::{RenderOptions, Renderer, Splats};
 use irradia_train::model::{Frame, Model};
 use irradia_train::recipe::RenderKnobs;
@@ -23,7 +23,7 @@ use std::sync::Arc;
 /// # let ply = folder.path().join("scene.ply");
 /// # let cloud = GaussianCloud {
 /// #     means: vec![[-1.0, 0.0, 0.0], [0.0; 3], [1.0, 0.0, 0.0]], quats: vec![[1.0, 0.0, 0.0, 0.0]; 3],
-/// #     log_scales: vec![[-1.0; 3]; 3], opacity_logits: vec![4.0; 3], sh: vec![1.0; 9], sh_degree: 0, antialiased: false,
+/// #     log_scales: vec![[-1.0; 3]; 3], opacity_logits: vec![4.0; 3], sh: vec![1.0; 9], sh_degree: 0, ..Default::default()
 /// # };
 /// # irradia_runs::formats::write_splats(&ply, &cloud)?;
 /// use irradia_runs::prelude::*;
@@ -43,6 +43,8 @@ pub struct Scene {
     pub options: RenderOptions,
     /// The training views' cameras, if known.
     pub cameras: Option<Arc<[Camera]>>,
+    /// From the coordinates of the dataset to those of `model` and `cameras`.
+    pub world_from_dataset: Similarity,
 }
 
 impl Scene {
@@ -53,7 +55,7 @@ impl Scene {
     /// When it cannot be read, or is a residual field without its splats.
     pub fn read(path: impl AsRef<Path>) -> Result<Self, RunError> {
         let path = &scene_of(path.as_ref());
-        let (model, antialiased) = read_model(path)?;
+        let (model, antialiased, world_from_dataset) = read_model(path)?;
         let knobs = render_knobs_beside(path);
         Ok(Self {
             model,
@@ -62,11 +64,17 @@ impl Scene {
                 antialias: knobs.antialias || antialiased,
                 ..RenderOptions::default()
             },
-            cameras: cameras_beside(path).map(Into::into),
+            cameras: cameras_beside(path, &world_from_dataset).map(Into::into),
+            world_from_dataset,
         })
     }
 
-    /// Renders the view of `camera`. For many frames, [`Model::render`] with one [`Renderer`] reuses memory.
+    /// `dataset`, whose files have the coordinates of the scene's, in the world of this scene.
+    pub fn place(&self, dataset: Dataset) -> Dataset {
+        dataset.in_world(self.world_from_dataset)
+    }
+
+    /// Renders the view of `camera`, in the world of this scene. For many frames, [`Model::render`] with one [`Renderer`] reuses memory.
     pub fn render(&self, camera: &Camera) -> Frame {
         self.model.render(&mut Renderer::new(), camera, &self.options)
     }
@@ -99,19 +107,20 @@ pub(crate) fn is_field(path: &Path) -> bool {
     path.extension().is_some_and(|extension| extension == "safetensors")
 }
 
-/// The model in a file: a field by its extension, otherwise splats; and whether its opacities require antialiasing.
-fn read_model(path: &Path) -> Result<(Model<'static>, bool), RunError> {
+/// The model in a file: a field by its extension, otherwise splats; whether its opacities require antialiasing; and its world.
+fn read_model(path: &Path) -> Result<(Model<'static>, bool, Similarity), RunError> {
     if is_field(path) {
         let field = read_field(path)?;
         if matches!(field.config.sampler, Sampler::Given { .. }) {
             return Err(RunError::Residual(path.to_owned()));
         }
-        return Ok((Model::Field(Cow::Owned(field)), false));
+        return Ok((Model::Field(Cow::Owned(field)), false, world_beside(path)?));
     }
     let cloud = read_splats(path)?;
     let splats = Cow::Owned(Splats::from_cloud(&cloud));
     let residual = residual_beside(path)?.map(Box::new);
-    Ok((Model::Splats { splats, residual }, cloud.antialiased))
+    let model = Model::Splats { splats, residual };
+    Ok((model, cloud.antialiased, cloud.world_from_dataset))
 }
 
 /// The residual field beside `scene`, if there is one.

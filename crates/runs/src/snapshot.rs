@@ -146,6 +146,7 @@ impl SnapshotServer {
                     model: trainer.scene().into_owned(),
                     options: trainer.render_options(plan(&trainer.recipe, &trainer.clock).sh_degree),
                     cameras: Some(cameras.clone()),
+                    world_from_dataset: trainer.dataset.world_from_dataset,
                 },
                 recipe: recipe.clone(),
                 dataset: trainer.dataset.clone(),

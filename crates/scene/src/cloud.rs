@@ -1,4 +1,4 @@
-use crate::sh;
+use crate::{Similarity, sh};
 
 /// 3D Gaussians on the host, in the parameterisation of splat files. All columns have the same N.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -17,6 +17,8 @@ pub struct GaussianCloud {
     pub sh_degree: u32,
     /// Whether the scene was trained with the Mip-Splatting filters, which rendering must then apply.
     pub antialiased: bool,
+    /// From the coordinates of the dataset, in which files are written, to those of `means` and `log_scales`.
+    pub world_from_dataset: Similarity,
 }
 
 impl GaussianCloud {

@@ -1,4 +1,5 @@
-use crate::{Camera, PointCloud, resize_area};
+use crate::{Camera, PointCloud, Similarity, resize_area};
+use glam::Vec3;
 use std::sync::Arc;
 
 /// Why a photograph could not be loaded, in one line: what, where and what to do.
@@ -70,6 +71,25 @@ pub trait PhotoSource: Send + Sync {
     /// # Errors
     /// One line that names the file and the remedy.
     fn load(&self) -> Result<Photo, LoadError>;
+
+    /// The photograph at `width` x `height`, at most those of [`Self::load`].
+    ///
+    /// # Errors
+    /// Those of [`Self::load`].
+    fn load_at(&self, width: u32, height: u32) -> Result<Photo, LoadError> {
+        Ok(self.load()?.resized(width, height))
+    }
+
+    /// Whether [`Self::load_at`] returns the result of [`Self::load`] resized, so that the latter can replace the file; otherwise it
+    /// decodes fewer pixels.
+    fn is_shrunk_from_full(&self, _width: u32, _height: u32) -> bool {
+        true
+    }
+
+    /// Memory used by [`Self::load`] beyond its result, bytes.
+    fn working_bytes(&self) -> usize {
+        0
+    }
 }
 
 impl PhotoSource for Photo {
@@ -107,10 +127,33 @@ pub struct Dataset {
     pub test: Vec<usize>,
     /// Initial points, if the dataset has any.
     pub points: Option<PointCloud>,
+    /// From the coordinates of the dataset's files to the world of `views` and `points`.
+    pub world_from_dataset: Similarity,
     /// Human-readable kind of dataset: `COLMAP (text)`, `Blender`, ..
     pub kind: String,
     /// One line for each omission or assumption; the reader does not print.
     pub warnings: Vec<String>,
+}
+
+impl Dataset {
+    /// The same dataset in the world of `world_from_dataset`.
+    pub fn in_world(mut self, world_from_dataset: Similarity) -> Self {
+        let old = std::mem::replace(&mut self.world_from_dataset, world_from_dataset);
+        if old == world_from_dataset {
+            return self;
+        }
+        let moved = |point: &mut Vec3| *point = world_from_dataset.apply(old.invert(point.as_dvec3())).as_vec3();
+        let factor = (world_from_dataset.scale / old.scale) as f32;
+        for view in &mut self.views {
+            moved(&mut view.camera.pose.position);
+            view.depth_bounds = view.depth_bounds.map(|bounds| bounds.map(|depth| depth * factor));
+        }
+        self.points
+            .iter_mut()
+            .flat_map(|points| &mut points.positions)
+            .for_each(moved);
+        self
+    }
 }
 
 /// The usual train/test split: of `count` views in name order every 8th is held out (`index % 8 == 0`).

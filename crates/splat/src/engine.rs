@@ -165,6 +165,11 @@ impl Engine {
         self.renderer.visible()
     }
 
+    /// Intersections of splats and tiles in the last frame.
+    pub fn intersections(&self) -> usize {
+        self.renderer.intersections()
+    }
+
     /// Splat-pixel pairs visited by blending in the last frame. Counting walks all tiles: not for every step.
     pub fn pairs(&self) -> u64 {
         self.renderer.pairs()

@@ -37,7 +37,7 @@ pub fn from_points(points: &PointCloud, options: &InitOptions) -> Splats {
         opacity_logits: vec![logit(options.opacity); n],
         sh: harmonics,
         sh_degree: options.sh_degree,
-        antialiased: false,
+        ..GaussianCloud::default()
     })
 }
 
@@ -82,24 +82,24 @@ pub enum PixelClass {
 /// depth of view i's scene, where known; otherwise depths are taken around the point that the cameras focus on.
 ///
 /// Points are drawn along rays of random pixels, uniformly in inverse depth, and kept with a probability that grows with the
-/// fraction of cameras that see them, so that they concentrate where views overlap. `classify(view, pixel)` gives the pixel's
-/// content. A point that is transparent in any camera is outside the visual hull (Laurentini 1994) and is discarded; so is one
+/// fraction of cameras that see them, so that they concentrate where views overlap. `open(view)` opens a photograph and
+/// returns the content of its pixels; photographs are opened one after the other, in one or a few passes over all of them. A point that is transparent in any camera is outside the visual hull (Laurentini 1994) and is discarded; so is one
 /// that is masked in more cameras than not, since training would never remove it. A point's colour is the mean over the
 /// cameras that see it: correct if it lies on a surface, and elsewhere never so dark that the clamp of negative colours
 /// prevents it from learning.
-pub fn random_points(
+///
+/// # Errors
+/// Those of `open`.
+pub fn random_points<E, C: Fn(Vec2) -> PixelClass + Sync>(
     cameras: &[Camera],
     depth_bounds: &[Option<[f32; 2]>],
     count: usize,
     rng: &mut Rng,
-    classify: impl Fn(usize, Vec2) -> PixelClass,
-) -> PointCloud {
+    mut open: impl FnMut(usize) -> Result<C, E>,
+) -> Result<PointCloud, E> {
     let mut cloud = PointCloud::default();
     let focus = focus_point(cameras);
-    for attempt in 0..count * 20 {
-        if cloud.len() == count || cameras.is_empty() {
-            break;
-        }
+    let mut draw = || {
         let view = rng.below(cameras.len() as u32) as usize;
         let camera = &cameras[view];
         let k = &camera.intrinsics;
@@ -111,42 +111,80 @@ pub fn random_points(
         let inverse = rng.range(1.0 / far, 1.0 / near);
         let ray = camera.pose.rotation * Vec3::new((pixel.x - k.cx) / k.fx, (pixel.y - k.cy) / k.fy, 1.0);
         let point = camera.pose.position + ray / inverse;
-        let chance = rng.uniform();
-        let Some((seen, color)) = mean_color(cameras, point, &classify) else {
-            continue;
-        };
-        // Late attempts accept any point: a scene whose cameras overlap little must still get its points.
-        if chance < seen as f32 / cameras.len() as f32 || attempt > count * 15 {
-            cloud.positions.push(point);
-            cloud.colors.push(color);
+        Candidate {
+            point,
+            chance: rng.uniform(),
+            ..Candidate::default()
         }
+    };
+    let attempts = if cameras.is_empty() { 0 } else { 20 * count };
+    let mut made = 0;
+    while made < attempts && cloud.len() < count {
+        // Usually one pass suffices.
+        let batch = (4 * count).min(attempts - made);
+        let mut candidates: Vec<Candidate> = (0..batch).map(|_| draw()).collect();
+        for (view, camera) in cameras.iter().enumerate() {
+            let content = open(view)?;
+            candidates
+                .par_iter_mut()
+                .with_min_len(1024)
+                .for_each(|candidate| candidate.look_from(camera, &content));
+        }
+        for (attempt, candidate) in (made..).zip(&candidates) {
+            let Some((seen, color)) = candidate.mean_color() else {
+                continue;
+            };
+            // Late attempts accept any point: a scene whose cameras overlap little must still get its points.
+            let accepted = candidate.chance < seen as f32 / cameras.len() as f32 || attempt > count * 15;
+            if accepted && cloud.len() < count {
+                cloud.positions.push(candidate.point);
+                cloud.colors.push(color);
+            }
+        }
+        made += batch;
     }
-    cloud
+    Ok(cloud)
 }
 
-/// Number of cameras that see `point`, and its mean colour in them; `None` if it cannot be part of the scene.
-fn mean_color(
-    cameras: &[Camera],
+/// A point that may become part of the scene.
+#[derive(Clone, Copy, Default)]
+struct Candidate {
     point: Vec3,
-    classify: &impl Fn(usize, Vec2) -> PixelClass,
-) -> Option<(u32, [u8; 3])> {
-    let (mut seen, mut masked, mut sum) = (0u32, 0u32, [0u32; 3]);
-    for (view, camera) in cameras.iter().enumerate() {
-        if let Some(pixel) = sees(camera, point) {
-            match classify(view, pixel) {
+    /// In \[0, 1\], compared with the fraction of the cameras that see it.
+    chance: f32,
+    seen: u32,
+    masked: u32,
+    /// Of the colours in the cameras that see it.
+    sum: [u32; 3],
+    /// Whether it is transparent in a camera.
+    is_outside: bool,
+}
+
+impl Candidate {
+    /// Adds what `camera`, whose photograph has `content`, sees of it.
+    fn look_from(&mut self, camera: &Camera, content: &impl Fn(Vec2) -> PixelClass) {
+        if self.is_outside {
+            return;
+        }
+        if let Some(pixel) = sees(camera, self.point) {
+            match content(pixel) {
                 PixelClass::Color(color) => {
-                    seen += 1;
-                    (0..3).for_each(|c| sum[c] += u32::from(color[c]));
+                    self.seen += 1;
+                    (0..3).for_each(|c| self.sum[c] += u32::from(color[c]));
                 }
-                PixelClass::Masked => masked += 1,
-                PixelClass::Empty => return None,
+                PixelClass::Masked => self.masked += 1,
+                PixelClass::Empty => self.is_outside = true,
             }
         }
     }
-    if masked > seen {
-        return None;
+
+    /// Number of cameras that see it, and its mean colour in them; `None` if it cannot be part of the scene.
+    fn mean_color(&self) -> Option<(u32, [u8; 3])> {
+        if self.is_outside || self.masked > self.seen {
+            return None;
+        }
+        Some((self.seen, self.sum.map(|s| (s / self.seen.max(1)) as u8)))
     }
-    Some((seen, sum.map(|s| (s / seen.max(1)) as u8)))
 }
 
 /// The pixel onto which `camera` projects `point`, if inside the image.
@@ -243,15 +281,18 @@ mod tests {
             })
             .collect();
         assert!(focus_point(&cameras).distance(target) < 0.02);
-        let cloud = random_points(&cameras, &[], 500, &mut Rng::new(1, 0), |view, _| {
-            PixelClass::Color([view as u8; 3])
-        });
+        let points = |cameras: &[Camera], count: usize, content: fn(usize) -> PixelClass| -> PointCloud {
+            let open = |view| Ok::<_, ()>(move |_| content(view));
+            random_points(cameras, &[], count, &mut Rng::new(1, 0), open).unwrap()
+        };
+        let cloud = points(&cameras, 500, |view| PixelClass::Color([view as u8; 3]));
         assert_eq!(cloud.len(), 500);
         let mean = cloud.positions.iter().sum::<Vec3>() / 500.0;
         assert!(mean.distance(target) < 0.5, "{mean}");
-        assert!(random_points(&[], &[], 10, &mut Rng::new(1, 0), |_, _| PixelClass::Color([0; 3])).is_empty());
-        for nothing in [PixelClass::Empty, PixelClass::Masked] {
-            assert!(random_points(&cameras, &[], 10, &mut Rng::new(1, 0), |_, _| nothing).is_empty());
-        }
+        assert!(points(&[], 10, |_| PixelClass::Color([0; 3])).is_empty());
+        assert!(points(&cameras, 10, |_| PixelClass::Empty).is_empty());
+        assert!(points(&cameras, 10, |_| PixelClass::Masked).is_empty());
+        let fails = |_| Err::<fn(Vec2) -> PixelClass, _>("not a photograph");
+        assert!(random_points(&cameras, &[], 10, &mut Rng::new(1, 0), fails).is_err());
     }
 }

@@ -76,7 +76,7 @@ impl Splats {
             opacity_logits: self.opacity_logits.to_interleaved(),
             sh: self.sh.to_interleaved(),
             sh_degree: self.sh_degree(),
-            antialiased: false,
+            ..GaussianCloud::default()
         }
     }
 

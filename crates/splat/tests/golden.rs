@@ -28,7 +28,7 @@ fn splats(golden: &Golden) -> Splats {
         opacity_logits: columns("logit_opac"),
         sh: columns("sh"),
         sh_degree: golden.scalar("sh_degree") as u32,
-        antialiased: false,
+        ..GaussianCloud::default()
     })
 }
 

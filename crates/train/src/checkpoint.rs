@@ -308,7 +308,7 @@ pub fn from_bytes(bytes: &[u8], dataset: Arc<Dataset>, options: TrainOptions) ->
         return Err(wrong("its clock has the wrong length".into()));
     };
     let carried = carried::read(&file, unnamed)?;
-    let mut trainer = Trainer::unfilled(dataset, recipe, TrainOptions { seed, ..options })?;
+    let mut trainer = Trainer::unfilled(dataset, recipe, TrainOptions { seed, ..options }, state.len())?;
     *trainer.engine.state_mut() = state;
     let tensors = |prefix| TensorSource::new(&file, prefix);
     if tensors(FIELD).whole("whole").is_some() {

@@ -5,7 +5,11 @@
 //! smoothly from camera to camera: splats reproduce it, by spherical harmonics, in held-out views as well. What remains after a
 //! prediction by the nearest cameras fits no scene; splats explain it by veils before the cameras.
 
+use crate::event::Event;
 use crate::photos::Prepared;
+use crate::schedule::{plan, upcoming_views};
+use crate::socket::Exposure;
+use crate::trainer::{TrainError, Trainer};
 use irradia_scene::Camera;
 
 /// Fraction of a run after which the decision is made.
@@ -67,6 +71,44 @@ pub(crate) fn unpredicted(views: &[(Camera, f64)], unit: f32) -> Option<f64> {
     Some(spread / (1.0 + 1.0 / NEIGHBOURS as f64).sqrt())
 }
 
+impl Trainer {
+    /// Adds an exposure per photograph if the photographs need it, and says so.
+    pub(crate) fn decide_exposure(&mut self) -> Result<Option<Event>, TrainError> {
+        let plan = plan(&self.recipe, &self.clock);
+        let upcoming = upcoming_views(&self.dataset.train, self.options.seed, &self.clock);
+        let train = self.dataset.train.clone();
+        let stride = train.len().div_ceil(VIEWS).max(1);
+        let mut measured = Vec::new();
+        for view in train.into_iter().step_by(stride) {
+            let order: Vec<usize> = std::iter::once(view)
+                .chain(upcoming.iter().copied().filter(|other| *other != view))
+                .collect();
+            let photo = self.photos.get(&order, plan.image_scale)?;
+            let camera = self.scaled_camera(view, plan.image_scale);
+            self.engine.render(camera.into(), &self.render_options(plan.sh_degree));
+            if let Some(log) = log_exposure(self.engine.frame().color, &photo) {
+                measured.push((view, camera, log));
+            }
+        }
+        let views: Vec<(Camera, f64)> = measured.iter().map(|(_, camera, log)| (*camera, *log)).collect();
+        let Some(spread) = unpredicted(&views, self.extent) else {
+            return Ok(None);
+        };
+        if spread < THRESHOLD {
+            return Ok(None);
+        }
+        let logs: Vec<(usize, f64)> = measured.into_iter().map(|(view, _, log)| (view, log)).collect();
+        let exposure = Exposure::new(self.dataset.views.len(), &self.dataset.train).with_gains(&logs);
+        self.sockets.exposure = Some(exposure);
+        Ok(Some(Event::Decided {
+            message: format!(
+                "photographs differ in exposure by {:.0} % beyond what adjacent ones predict: each has its own from here on (--set exposure=false for none)",
+                100.0 * spread
+            ),
+        }))
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -101,7 +143,9 @@ mod tests {
     #[test]
     fn an_exposure_is_the_ratio_of_the_pixels_that_both_show() {
         let pixels = 400;
-        let color: Vec<f32> = (0..3 * pixels).map(|i| 0.2 + 0.3 * (i % pixels) as f32 / 400.0).collect();
+        let color: Vec<f32> = (0..3 * pixels)
+            .map(|i| 0.2 + 0.3 * (i % pixels) as f32 / 400.0)
+            .collect();
         let rgb = (0..3 * pixels).map(|i| (color[i % 3 * pixels + i / 3] * 1.3 * 255.0).round() as u8);
         let mut photo = Prepared {
             width: 20,

@@ -18,7 +18,9 @@ use std::time::Instant;
 /// Random streams, derived from the run's seed.
 const STREAM_FIELD: u64 = 6;
 const STREAM_POINTS: u64 = 7;
-/// Photographs per step if not all of them fit into memory.
+/// Memory of all photographs, bytes, above which a step uses only some of them: 5,500 of 360 x 360.
+pub const ALL_PHOTOS: usize = 2 << 30;
+/// Photographs per step if they exceed it.
 const SHARED: usize = 16;
 /// Whether stage `stage` trains a field.
 pub fn is_field(recipe: &Recipe, stage: usize) -> bool {
@@ -146,7 +148,7 @@ impl Trainer {
         known
     }
 
-    /// All training views if their photographs fit into memory, else the upcoming ones.
+    /// All training views if their photographs take little memory, else the upcoming ones.
     fn field_views(&self) -> Vec<usize> {
         let bytes: usize = self
             .dataset
@@ -157,7 +159,7 @@ impl Trainer {
                 5 * k.width as usize * k.height as usize
             })
             .sum();
-        if bytes <= self.options.photo_budget {
+        if bytes <= ALL_PHOTOS {
             return self.dataset.train.clone();
         }
         let mut upcoming = upcoming_views(&self.dataset.train, self.options.seed, &self.clock);

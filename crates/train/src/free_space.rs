@@ -78,7 +78,11 @@ fn distance_to_points(points: &PointCloud, view: &View) -> f32 {
 
 /// Depth along +Z of the nearest points that a view sees, or of its depth bounds, world units.
 fn nearest_depth(dataset: &Dataset, view: &View) -> Option<f32> {
-    let positions = dataset.points.as_ref().map(|points| &points.positions[..]).unwrap_or_default();
+    let positions = dataset
+        .points
+        .as_ref()
+        .map(|points| &points.positions[..])
+        .unwrap_or_default();
     let seen = view.points_seen.iter().filter_map(|i| positions.get(*i as usize));
     let mut depths: Vec<f32> = seen
         .map(|position| view.camera.pose.camera_from_world(*position).z)

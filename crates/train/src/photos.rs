@@ -1,10 +1,17 @@
-//! Training photographs in memory, as 8 bits, within a budget: scenes larger than memory can be trained.
+//! Training photographs in memory, as 8 bits, within a budget, loaded ahead of their steps: scenes larger than memory can be trained.
+
+mod loader;
 
 use irradia_scene::{Dataset, LoadError, Photo};
-use rayon::prelude::*;
+use loader::{Job, Loaded, Loader};
 use std::collections::HashMap;
 use std::sync::Arc;
 use std::time::Instant;
+
+/// Photographs loaded ahead if not all fit into the budget, for each loading thread: enough for a few slow ones.
+const AHEAD: usize = 8;
+/// Fraction of the budget, as a divisor, that photographs being decoded may use beside it.
+const WORKING_SHARE: usize = 4;
 
 /// A photograph ready for the loss.
 #[derive(Debug)]
@@ -52,78 +59,103 @@ impl Prepared {
     }
 }
 
-/// Photographs that are loaded on demand and evicted when they would exceed the budget.
+/// What is in memory of a photograph.
+#[derive(Default)]
+struct Held {
+    /// At the current scale.
+    prepared: Option<Arc<Prepared>>,
+    /// At full size, from which other scales are made.
+    full: Option<Arc<Photo>>,
+}
+
+impl Held {
+    fn bytes(&self) -> usize {
+        self.prepared.as_ref().map_or(0, |photo| photo.bytes()) + self.full.as_ref().map_or(0, |photo| photo.bytes())
+    }
+}
+
+/// Photographs that are loaded ahead of their use and evicted when they would exceed the budget.
+///
+/// The pixels of a photograph at a scale depend on nothing else: neither on the budget nor on the number of threads.
 pub struct PhotoCache {
     dataset: Arc<Dataset>,
-    background: [f32; 3],
     budget: usize,
-    held: HashMap<usize, Arc<Prepared>>,
+    held: HashMap<usize, Held>,
     bytes: usize,
-    /// Size relative to the data's; a change evicts everything.
+    /// Size relative to the data's.
     scale: f32,
-    /// Seconds spent on loading since the last [`Self::take_seconds`].
+    /// Whether all training photographs fit.
+    fits: bool,
+    /// Whether they also fit at full size beside those of `scale`.
+    keeps_full: bool,
+    /// Photographs loaded ahead if not all fit.
+    ahead: usize,
+    loader: Loader,
+    /// Seconds spent waiting for photographs since the last [`Self::take_seconds`].
     seconds: f64,
 }
 
 impl PhotoCache {
     /// Holds at most `budget` bytes, but always at least the current photograph.
     pub fn new(dataset: Arc<Dataset>, background: [f32; 3], budget: usize) -> Self {
-        Self {
+        let working = dataset.views.iter().map(|view| view.photo.working_bytes()).max();
+        let most = budget / WORKING_SHARE / working.unwrap_or(0).max(1);
+        let threads = rayon::current_num_threads().min(most).max(1);
+        let mut cache = Self {
+            loader: Loader::new(dataset.clone(), background, threads),
             dataset,
-            background,
             budget,
             held: HashMap::new(),
             bytes: 0,
             scale: 1.0,
+            fits: false,
+            keeps_full: false,
+            ahead: AHEAD * threads,
             seconds: 0.0,
-        }
+        };
+        cache.use_scale(1.0);
+        cache
     }
 
-    /// Wall-clock seconds of loading since the last call.
+    /// Wall-clock seconds of waiting for photographs since the last call.
     pub fn take_seconds(&mut self) -> f64 {
         std::mem::take(&mut self.seconds)
     }
 
-    /// The photograph of view `upcoming[0]` at `scale`. If it must be loaded, the next ones are loaded with it, in parallel, as
-    /// far as there is room; those needed last, or not at all, are evicted.
+    /// The photograph of view `upcoming[0]` at `scale`; waits until it is loaded. The next ones are loaded meanwhile, as far as
+    /// there is room. For it, those needed last, or not at all, are evicted: none is loaded twice if all fit.
     ///
     /// # Errors
-    /// When a photograph cannot be read.
+    /// When a photograph, this one or one loaded ahead, cannot be read.
     pub fn get(&mut self, upcoming: &[usize], scale: f32) -> Result<Arc<Prepared>, LoadError> {
         if scale != self.scale {
-            self.held.clear();
-            self.bytes = 0;
-            self.scale = scale;
+            self.use_scale(scale);
         }
-        let view = upcoming[0];
-        if let Some(photo) = self.held.get(&view) {
-            return Ok(photo.clone());
-        }
+        self.keep(false)?;
+        self.load_ahead(upcoming);
         let started = Instant::now();
-        let wanted = self.plan_loads(upcoming);
-        let (dataset, background) = (&self.dataset, self.background);
-        let loaded: Vec<(usize, Result<Prepared, LoadError>)> = wanted
-            .into_par_iter()
-            .map(|view| (view, load(dataset, view, scale, background)))
-            .collect();
-        for (view, photo) in loaded {
-            let photo = Arc::new(photo?);
-            self.bytes += photo.bytes();
-            self.held.insert(view, photo);
+        loop {
+            if let Some(photo) = self.held.get(&upcoming[0]).and_then(|held| held.prepared.clone()) {
+                self.seconds += started.elapsed().as_secs_f64();
+                return Ok(photo);
+            }
+            self.keep(true)?;
+            self.load_ahead(upcoming);
         }
-        self.seconds += started.elapsed().as_secs_f64();
-        Ok(self.held[&view].clone())
     }
 
-    /// The largest scale, at most 1, at which all of `views` fit into the budget together.
-    pub fn scale_that_fits(&self, views: &[usize]) -> f32 {
-        let total = |scale: f32| -> usize { views.iter().map(|view| self.size(*view, scale)).sum() };
-        let mut scale = 1.0;
-        // Sides are rounded, so that a second or third iteration may be needed; at one pixel each, this ends.
-        while total(scale) > self.budget && scale > 1e-3 {
-            scale *= 0.98 * (self.budget as f32 / total(scale) as f32).sqrt();
-        }
-        scale
+    /// From now on, photographs are needed at `scale`. Pixels at full size stay in memory, if they are there.
+    fn use_scale(&mut self, scale: f32) {
+        self.scale = scale;
+        let total = |scale: f32| -> usize { self.dataset.train.iter().map(|view| self.size(*view, scale)).sum() };
+        let (full, scaled) = (total(1.0), total(scale));
+        self.fits = scaled <= self.budget;
+        self.keeps_full = scale < 1.0 && full + scaled <= self.budget;
+        self.held.retain(|_, held| {
+            held.prepared = None;
+            held.full.is_some()
+        });
+        self.bytes = self.held.values().map(Held::bytes).sum();
     }
 
     /// Maximum number of bytes of a view's photograph at `scale`.
@@ -132,53 +164,96 @@ impl PhotoCache {
         4 * k.width as usize * k.height as usize
     }
 
-    /// Selects the views to load now: as many of the upcoming ones as fit beside those needed sooner. Evicts others to make room.
-    fn plan_loads(&mut self, upcoming: &[usize]) -> Vec<usize> {
-        let mut planned = 0;
-        let keep: Vec<usize> = upcoming
-            .iter()
-            .copied()
-            .take_while(|view| {
-                planned += self.size(*view, self.scale);
-                planned <= self.budget || *view == upcoming[0]
-            })
-            .collect();
-        let all_fit = keep.len() == upcoming.len();
-        if !all_fit || self.bytes + planned > self.budget {
-            let bytes = &mut self.bytes;
-            self.held.retain(|view, photo| {
-                let stays = keep.contains(view);
-                if !stays {
-                    *bytes -= photo.bytes();
-                }
-                stays
+    /// Bytes to reserve for loading view `view`, beyond what is in memory of it.
+    fn reserved(&self, view: usize) -> usize {
+        let full = if self.keeps_full { self.size(view, 1.0) } else { 0 };
+        let held = self.held.get(&view).map_or(0, Held::bytes);
+        (self.size(view, self.scale) + full).saturating_sub(held)
+    }
+
+    /// Stores what was loaded; waits for something if `wait`.
+    fn keep(&mut self, wait: bool) -> Result<(), LoadError> {
+        for Loaded { view, scale, result } in self.loader.take(wait) {
+            let (prepared, full) = result?;
+            let held = self.held.entry(view).or_default();
+            self.bytes -= held.bytes();
+            // What was loaded for an earlier scale may serve at full size.
+            held.full = full.filter(|_| self.keeps_full);
+            if scale == self.scale {
+                held.prepared = Some(prepared);
+            }
+            self.bytes += held.bytes();
+        }
+        Ok(())
+    }
+
+    /// Queues the next photographs that are not in memory, and evicts others to make room.
+    fn load_ahead(&mut self, upcoming: &[usize]) {
+        let is_there = |cache: &Self, view: &usize| cache.held.get(view).is_some_and(|held| held.prepared.is_some());
+        let horizon = if self.fits {
+            upcoming.len()
+        } else {
+            self.ahead.min(upcoming.len())
+        };
+        if upcoming[..horizon].iter().all(|view| is_there(self, view)) {
+            return;
+        }
+        let in_flight = self.loader.in_flight();
+        let mut planned: usize = in_flight.iter().map(|view| self.reserved(*view)).sum();
+        let mut jobs = Vec::new();
+        let last_needed = LastNeeded::new(upcoming, self.dataset.views.len());
+        for (position, view) in upcoming[..horizon].iter().enumerate() {
+            if is_there(self, view) || in_flight.contains(view) && position > 0 {
+                continue;
+            }
+            let bytes = self.reserved(*view);
+            while self.bytes + planned + bytes > self.budget {
+                let Some(evicted) = last_needed.of(&self.held, position) else {
+                    break;
+                };
+                self.bytes -= self.held.remove(&evicted).map_or(0, |held| held.bytes());
+            }
+            if position > 0 && self.bytes + planned + bytes > self.budget {
+                break;
+            }
+            planned += bytes;
+            let k = self.dataset.views[*view].camera.intrinsics.scaled(self.scale);
+            let from_full = self.dataset.views[*view].photo.is_shrunk_from_full(k.width, k.height);
+            jobs.push(Job {
+                view: *view,
+                scale: self.scale,
+                full: self
+                    .held
+                    .get(view)
+                    .and_then(|held| held.full.clone())
+                    .filter(|_| from_full),
+                keep_full: self.keeps_full && from_full,
             });
         }
-        // If not everything fits, a batch of a few per thread keeps the threads busy without a long wait.
-        let batch = if all_fit {
-            keep.len()
-        } else {
-            4 * rayon::current_num_threads()
-        };
-        keep.into_iter()
-            .filter(|view| !self.held.contains_key(view))
-            .take(batch)
-            .collect()
+        self.loader.queue(jobs);
     }
 }
 
-fn load(dataset: &Dataset, view: usize, scale: f32, background: [f32; 3]) -> Result<Prepared, LoadError> {
-    let view = &dataset.views[view];
-    let photo = view.photo.load()?;
-    let k = &view.camera.intrinsics;
-    if (photo.width, photo.height) != (k.width, k.height) {
-        return Err(LoadError(format!(
-            "{}: the photograph has {}x{} pixels where its camera has {}x{}: was the file replaced while training?",
-            view.name, photo.width, photo.height, k.width, k.height
-        )));
+/// Finds the photographs in memory that are needed last.
+struct LastNeeded {
+    /// By view: its position among the upcoming ones.
+    positions: Vec<usize>,
+}
+
+impl LastNeeded {
+    fn new(upcoming: &[usize], views: usize) -> Self {
+        let mut positions = vec![usize::MAX; views];
+        for (position, view) in upcoming.iter().enumerate().rev() {
+            positions[*view] = position;
+        }
+        Self { positions }
     }
-    let k = k.scaled(scale);
-    Ok(Prepared::new(&photo, k.width, k.height, background))
+
+    /// The view of `held` that is needed last, after `position`.
+    fn of(&self, held: &HashMap<usize, Held>, position: usize) -> Option<usize> {
+        let later = held.keys().filter(|view| self.positions[**view] > position);
+        later.max_by_key(|view| (self.positions[**view], **view)).copied()
+    }
 }
 
 #[cfg(test)]
@@ -224,6 +299,7 @@ mod tests {
         (
             Arc::new(Dataset {
                 views,
+                train: (0..usize::from(n)).collect(),
                 ..Default::default()
             }),
             sources,
@@ -270,14 +346,70 @@ mod tests {
         for i in 0..40 {
             let upcoming: Vec<usize> = (0..20).map(|k| (i + k) % 20).collect();
             assert_eq!(cache.get(&upcoming, 1.0).unwrap().rgb[0] as usize, upcoming[0]);
-            assert!(cache.bytes <= 2000 && cache.bytes == cache.held.values().map(|p| p.bytes()).sum::<usize>());
+            assert!(cache.bytes <= 2000 && cache.bytes == cache.held.values().map(Held::bytes).sum::<usize>());
         }
-        assert!(loads(&sources) >= 35);
-        let all: Vec<usize> = (0..20).collect();
-        let scale = cache.scale_that_fits(&all);
-        assert!(scale < 0.5 && all.iter().map(|view| cache.size(*view, scale)).sum::<usize>() <= 2000);
-        assert_eq!(cache.scale_that_fits(&[0, 1]), 1.0);
+        // A fifth of the photographs fits, and stays.
+        assert!((20..40).contains(&loads(&sources)), "{}", loads(&sources));
         let mut tiny = PhotoCache::new(dataset(3).0, [0.0; 3], 1);
         assert!(tiny.get(&[0, 1, 2], 1.0).is_ok() && tiny.get(&[1, 2, 0], 1.0).is_ok());
+    }
+
+    #[test]
+    fn a_change_of_scale_shrinks_what_is_in_memory() {
+        let (data, sources) = dataset(20);
+        let mut cache = PhotoCache::new(data, [0.0; 3], 1 << 20);
+        let all: Vec<usize> = (0..20).collect();
+        for scale in [0.25, 0.5, 1.0] {
+            for view in 0..20 {
+                let photo = cache.get(&all[view..], scale).unwrap();
+                assert_eq!(photo.width, (10.0 * scale).round() as u32);
+                assert_eq!(photo.rgb[0] as usize, view);
+            }
+        }
+        assert_eq!(loads(&sources), 20);
+        assert!(
+            cache.held.values().all(|held| held.full.is_none()),
+            "at full size one copy suffices"
+        );
+    }
+
+    #[test]
+    fn photographs_do_not_depend_on_the_budget() {
+        let pixels = |budget: usize| -> Vec<Vec<u8>> {
+            let mut cache = PhotoCache::new(dataset(20).0, [0.0; 3], budget);
+            let order = |i: usize| -> Vec<usize> { (0..20).map(|k| (i * 7 + k) % 20).collect() };
+            let scale = |i: usize| [0.3, 1.0, 0.5][i / 30 % 3];
+            (0..90)
+                .map(|i| cache.get(&order(i), scale(i)).unwrap().rgb.clone())
+                .collect()
+        };
+        assert_eq!(pixels(1 << 20), pixels(1));
+        assert_eq!(pixels(1 << 20), pixels(3000));
+    }
+
+    struct Broken(bool);
+    impl PhotoSource for Broken {
+        fn load(&self) -> Result<Photo, LoadError> {
+            assert!(!self.0, "a decoder's bug");
+            Err(LoadError("gone.png: not found".into()))
+        }
+    }
+
+    #[test]
+    fn errors_and_panics_of_a_source_arrive() {
+        for panics in [false, true] {
+            let (data, _) = dataset(3);
+            let mut data = Arc::try_unwrap(data).unwrap_or_else(|_| panic!("not shared"));
+            data.views[1].photo = Arc::new(Broken(panics));
+            let mut cache = PhotoCache::new(Arc::new(data), [0.0; 3], 1 << 20);
+            let error = (0..3)
+                .find_map(|view| cache.get(&[view], 1.0).err())
+                .expect("an error")
+                .to_string();
+            assert!(
+                error.contains(if panics { "1: the image decoder" } else { "gone.png" }),
+                "{error}"
+            );
+        }
     }
 }

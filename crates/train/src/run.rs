@@ -2,6 +2,7 @@
 
 use crate::eval::{EvalOptions, Metrics, evaluate_views, mean};
 use crate::event::{Event, Observer, Signal, StepReport};
+use crate::first_splats::first_count;
 use crate::forecast::{self, Forecast};
 use crate::half_fit::HalfFit;
 use crate::paces::Paces;
@@ -151,7 +152,7 @@ pub fn run(
 
 /// A warning where a run ends with fewer splats than it began with.
 fn fewer_than_at_first(trainer: &Trainer) -> Option<Event> {
-    let (first, last) = (trainer.first_count(), trainer.engine.len());
+    let (first, last) = (first_count(&trainer.dataset, &trainer.recipe), trainer.engine.len());
     let reduced = trainer.field.is_none() && trainer.finished() && last < first;
     reduced.then(|| Event::Warned {
         message: format!(

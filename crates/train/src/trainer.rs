@@ -3,22 +3,24 @@
 use crate::event::{Event, StepReport};
 use crate::exposure_probe;
 use crate::field_step::{first_field, is_field};
+use crate::first_splats::first_count;
 use crate::free_space::FreeSpace;
 use crate::half_fit::HalfFit;
+use crate::memory::{MemoryPlan, Needs};
 use crate::model::Model;
 use crate::objective::{Objective, Reference};
-use crate::photos::{PhotoCache, Prepared};
+use crate::photos::PhotoCache;
 use crate::recipe::{AdamKind, Choice, DensityControl, LengthUnit, Param, Recipe};
 use crate::schedule::{Clock, Round, StepMetrics, StepPlan, plan, upcoming_views};
-use crate::socket::{Exposure, Residual, Sockets};
+use crate::socket::{Residual, Sockets};
 use crate::times::Times;
 use cpu_time::ProcessTime;
 use irradia_compute::adam::AdamStep;
 use irradia_field::{FieldError, FieldState, KnownDepth};
 use irradia_measure::{DepthSample, Lpips};
-use irradia_scene::{Camera, Dataset, LoadError, PointCloud, Rng, View, sh};
+use irradia_scene::{Camera, Dataset, LoadError, Rng, sh};
 use irradia_splat::densify::{DensityChange, classic, fast, mcmc, merge, taming};
-use irradia_splat::init::{self, InitOptions, PixelClass};
+use irradia_splat::init;
 use irradia_splat::{
     Engine, FramePlanes, Gather, Noise, Optimizer, RenderOptions, SplatState, Splats, Statistics, Update, ViewParams,
     filter,
@@ -51,6 +53,20 @@ pub enum TrainError {
     /// The field configuration is invalid.
     #[error(transparent)]
     Field(#[from] FieldError),
+    /// The first splats and a few photographs do not fit into memory.
+    #[error(
+        "{limit} of memory are too little for {splats} splats and a few photographs; --memory {needed} would do{otherwise}"
+    )]
+    Memory {
+        /// All memory of the process, with its unit.
+        limit: String,
+        /// What would suffice, with its unit.
+        needed: String,
+        /// Splats to begin with.
+        splats: usize,
+        /// What else would do.
+        otherwise: String,
+    },
     /// A checkpoint does not fit.
     #[error("{0}")]
     Checkpoint(String),
@@ -63,31 +79,28 @@ pub struct TrainOptions {
     pub seed: u64,
     /// Steps of the run; the recipe's own number when `None`.
     pub steps: Option<u64>,
-    /// Memory budget for photographs, bytes.
-    pub photo_budget: usize,
+    /// Memory of the whole process, bytes; `None`: photographs get 2 GiB, and splats have the recipe's limit only.
+    pub memory: Option<usize>,
     /// Weights of the perceptual loss; without them a recipe's perceptual loss is skipped.
     pub lpips: Option<Arc<Lpips>>,
 }
 
 impl Default for TrainOptions {
-    /// Seed 0, the recipe's steps, 2 GiB of photographs (5,500 of 360 x 360: what remains on an 8 GiB machine).
+    /// Seed 0, the recipe's steps, and no limit on memory.
     fn default() -> Self {
         Self {
             seed: 0,
             steps: None,
-            photo_budget: 2 << 30,
+            memory: None,
             lpips: None,
         }
     }
 }
 
 /// Random streams derived from the run's seed, one per use.
-const STREAM_INIT: u64 = 1;
+pub(crate) const STREAM_INIT: u64 = 1;
 const STREAM_DENSIFY: u64 = 2;
 const STREAM_STEP: u64 = 5;
-
-/// Points of a dataset below which splats begin at random positions.
-const MIN_POINTS: usize = 10;
 
 /// Training views over which the convergence error is measured.
 const MEASURED_VIEWS: usize = 8;
@@ -118,12 +131,14 @@ pub struct Trainer {
     pub cpu_seconds: f64,
     /// Wall time between the first step and the last, and its breakdown.
     pub times: Times,
-    /// Maximum number of splats: the recipe's limits for this dataset.
+    /// Maximum number of splats: the recipe's limits for this dataset, and that of the memory.
     pub cap: usize,
     /// Pixels of a training image, averaged over views.
     pixels: f64,
     /// What was decided from the data before the first step, one line each.
     pub(crate) decisions: Vec<String>,
+    /// The distribution of the memory.
+    pub memory: MemoryPlan,
     pub(crate) photos: PhotoCache,
     /// Known depths of the views on which a field is trained, by view, width and height.
     pub(crate) depths: HashMap<(usize, u32, u32), Arc<[KnownDepth]>>,
@@ -137,7 +152,12 @@ impl Trainer {
     /// # Errors
     /// When there are no training views or no initial points, or photographs needed for colours cannot be read.
     pub fn new(dataset: Arc<Dataset>, recipe: Recipe, options: TrainOptions) -> Result<Self, TrainError> {
-        let mut trainer = Self::unfilled(dataset, recipe, options)?;
+        let first = first_count(&dataset, &recipe);
+        let mut trainer = Self::unfilled(dataset, recipe, options, first)?;
+        if trainer.memory.splats < trainer.memory.wanted_splats {
+            // In the recipe, so that a resumed run has the same limit.
+            trainer.recipe.max_splats = trainer.memory.splats;
+        }
         if is_field(&trainer.recipe, 0) {
             trainer.field = Some(trainer.first_field()?);
         } else {
@@ -148,13 +168,24 @@ impl Trainer {
         Ok(trainer)
     }
 
-    /// A trainer whose state is yet to be filled in, by a checkpoint for example.
-    pub(crate) fn unfilled(dataset: Arc<Dataset>, recipe: Recipe, options: TrainOptions) -> Result<Self, TrainError> {
+    /// A trainer whose state is yet to be filled in with `first_splats` splats, by a checkpoint for example.
+    pub(crate) fn unfilled(
+        dataset: Arc<Dataset>,
+        recipe: Recipe,
+        options: TrainOptions,
+        first_splats: usize,
+    ) -> Result<Self, TrainError> {
         if dataset.train.is_empty() {
             return Err(TrainError::NoViews(0));
         }
         let cameras = train_cameras(&dataset);
         let total = recipe.total_steps() as f64;
+        let needs = Needs {
+            first_splats,
+            most_splats: cap(&recipe, &cameras).max(first_splats),
+            ..Needs::of(&dataset, &recipe, options.lpips.as_ref().map(|lpips| lpips.net()))
+        };
+        let memory = MemoryPlan::new(&needs, options.memory)?;
         Ok(Self {
             clock: Clock::new(&recipe),
             pace: options.steps.map_or(1.0, |steps| total / steps.max(1) as f64),
@@ -162,8 +193,9 @@ impl Trainer {
             cpu_seconds: 0.0,
             times: Times::default(),
             extent: init::camera_extent(&cameras),
-            photos: PhotoCache::new(dataset.clone(), recipe.render.background, options.photo_budget),
-            cap: cap(&recipe, &cameras),
+            photos: PhotoCache::new(dataset.clone(), recipe.render.background, memory.photos),
+            cap: cap(&recipe, &cameras).min(memory.splats),
+            memory,
             pixels: mean_pixels(&cameras),
             decisions: Vec::new(),
             depths: HashMap::new(),
@@ -203,70 +235,6 @@ impl Trainer {
         Ok(self.photos.get(&self.dataset.train[..1], 1.0)?.alpha.is_some())
     }
 
-    /// Options of the first splats.
-    pub(crate) fn init_options(&self) -> InitOptions {
-        InitOptions {
-            opacity: self.recipe.init.opacity,
-            scale: self.recipe.init.scale,
-            sh_degree: sh::MAX_DEGREE,
-        }
-    }
-
-    fn first_splats(&mut self) -> Result<Splats, TrainError> {
-        let options = self.init_options();
-        let dataset = self.dataset.clone();
-        let most = self.recipe.max_splats;
-        let splats = match dataset.points.as_ref().filter(|points| points.len() >= MIN_POINTS) {
-            // Evenly over the file: SfM writes points in the order in which it finds them, region by region.
-            Some(points) if points.len() > most => {
-                let chosen = (0..most).map(|i| i * points.len() / most);
-                let (positions, colors) = chosen.map(|i| (points.positions[i], points.colors[i])).unzip();
-                init::from_points(&PointCloud { positions, colors }, &options)
-            }
-            Some(points) => init::from_points(points, &options),
-            None => {
-                let views: Vec<&View> = dataset.train.iter().map(|i| &dataset.views[*i]).collect();
-                let cameras: Vec<Camera> = views.iter().map(|v| v.camera).collect();
-                let bounds: Vec<Option<[f32; 2]>> = views.iter().map(|v| v.depth_bounds).collect();
-                let mut photos: Vec<Option<Arc<Prepared>>> = vec![None; views.len()];
-                // Colours are taken from all photographs in turn: downscaled if they do not fit into memory.
-                let scale = self.photos.scale_that_fits(&dataset.train);
-                for (i, photo) in photos.iter_mut().enumerate() {
-                    let upcoming: Vec<usize> = dataset.train[i..].to_vec();
-                    *photo = Some(self.photos.get(&upcoming, scale)?);
-                }
-                let mut rng = Rng::new(self.options.seed, STREAM_INIT);
-                let points = init::random_points(
-                    &cameras,
-                    &bounds,
-                    self.recipe.init.random_points.min(most),
-                    &mut rng,
-                    |view, pixel| {
-                        let photo = photos[view].as_ref().expect("loaded above");
-                        let k = &cameras[view].intrinsics;
-                        let x = pixel.x as usize * photo.width as usize / k.width as usize;
-                        let y = pixel.y as usize * photo.height as usize / k.height as usize;
-                        let at = y * photo.width as usize + x;
-                        let zero = |plane: &Option<Vec<u8>>| plane.as_ref().is_some_and(|plane| plane[at] == 0);
-                        if zero(&photo.mask) {
-                            PixelClass::Masked
-                        } else if zero(&photo.alpha) {
-                            PixelClass::Empty
-                        } else {
-                            PixelClass::Color([0, 1, 2].map(|c| photo.rgb[3 * at + c]))
-                        }
-                    },
-                );
-                let opacity = self.recipe.init.random_opacity.unwrap_or(options.opacity);
-                init::from_points(&points, &InitOptions { opacity, ..options })
-            }
-        };
-        if splats.is_empty() {
-            return Err(TrainError::NoPoints);
-        }
-        Ok(splats)
-    }
-
     /// Number of steps of this run, as far as known.
     pub fn total_steps(&self) -> u64 {
         let left = (self.recipe.total_steps() as f64 - self.clock.time).max(0.0);
@@ -302,7 +270,11 @@ impl Trainer {
         let probe_at = exposure_probe::AT * self.recipe.total_steps() as f64;
         let before = self.clock.time;
         let entered = self.tick(metrics) && !self.finished();
-        if before < probe_at && self.clock.time >= probe_at && self.recipe.exposure == Choice::Auto && self.field.is_none() {
+        if before < probe_at
+            && self.clock.time >= probe_at
+            && self.recipe.exposure == Choice::Auto
+            && self.field.is_none()
+        {
             events.extend(self.decide_exposure()?);
         }
         if entered {
@@ -468,8 +440,12 @@ impl Trainer {
     }
 
     fn densify(&mut self, round: &Round) -> DensityChange {
-        let limit = self.limit(self.clock.stage, round.count_share);
-        let first = self.first_count();
+        let pixels = self.engine.frame().color.len() / 3;
+        let by_memory = self
+            .memory
+            .splats_at(self.engine.intersections(), self.engine.len(), pixels);
+        let limit = self.limit(self.clock.stage, round.count_share).min(by_memory);
+        let first = first_count(&self.dataset, &self.recipe);
         let mut rng = Rng::new(self.options.seed ^ self.clock.step << 20, STREAM_DENSIFY);
         let state = self.engine.state_mut();
         match round.density {
@@ -488,15 +464,6 @@ impl Trainer {
                 fast::densify(state, &knobs.options(self.pace, floor, limit))
             }
         }
-    }
-
-    /// Number of the first splats.
-    pub(crate) fn first_count(&self) -> usize {
-        let points = self.dataset.points.as_ref().map(|points| points.len());
-        points
-            .filter(|count| *count >= MIN_POINTS)
-            .unwrap_or(self.recipe.init.random_points)
-            .min(self.recipe.max_splats)
     }
 
     /// Maximum number of splats of stage `stage` at `count_share`, a fraction of the cap.
@@ -584,45 +551,6 @@ impl Trainer {
         Ok(sum / f64::from(count.max(1)))
     }
 
-    /// Adds an exposure per photograph if the photographs need it, and says so.
-    fn decide_exposure(&mut self) -> Result<Option<Event>, TrainError> {
-        let plan = plan(&self.recipe, &self.clock);
-        let upcoming = upcoming_views(&self.dataset.train, self.options.seed, &self.clock);
-        let train = self.dataset.train.clone();
-        let stride = train.len().div_ceil(exposure_probe::VIEWS).max(1);
-        let mut measured = Vec::new();
-        for view in train.into_iter().step_by(stride) {
-            let order: Vec<usize> = std::iter::once(view)
-                .chain(upcoming.iter().copied().filter(|other| *other != view))
-                .collect();
-            let photo = self.photos.get(&order, plan.image_scale)?;
-            let camera = self.scaled_camera(view, plan.image_scale);
-            self.engine.render(camera.into(), &self.render_options(plan.sh_degree));
-            if let Some(log) = exposure_probe::log_exposure(self.engine.frame().color, &photo) {
-                measured.push((view, camera, log));
-            }
-        }
-        let views: Vec<(Camera, f64)> = measured.iter().map(|(_, camera, log)| (*camera, *log)).collect();
-        let Some(spread) = exposure_probe::unpredicted(&views, self.extent) else {
-            return Ok(None);
-        };
-        if std::env::var_os("PROBE").is_some() {
-            eprintln!("PROBE {spread:.4}");
-        }
-        if spread < exposure_probe::THRESHOLD {
-            return Ok(None);
-        }
-        let logs: Vec<(usize, f64)> = measured.into_iter().map(|(view, _, log)| (view, log)).collect();
-        let exposure = Exposure::new(self.dataset.views.len(), &self.dataset.train).with_gains(&logs);
-        self.sockets.exposure = Some(exposure);
-        Ok(Some(Event::Warned {
-            message: format!(
-                "photographs differ in exposure by {:.0} % beyond what adjacent ones predict: each has its own from here on (--set exposure=false for none)",
-                100.0 * spread
-            ),
-        }))
-    }
-
     /// Advances the clock; steps saved by an early end of a stage go to the remaining stages.
     fn tick(&mut self, metrics: StepMetrics) -> bool {
         let stretch = self.clock.stretch;
@@ -658,14 +586,15 @@ impl Trainer {
         }
     }
 
-    /// Parts of the dataset that the recipe ignores: one line each.
+    /// Parts of the dataset that the recipe ignores, and splats for which there is no memory: one line each.
     pub fn warnings(&self) -> Vec<String> {
         let moves = self.dataset.train.iter().any(|i| self.dataset.views[*i].time.is_some());
         let line = format!(
             "the photographs were taken at different times, which recipe {} ignores: moving objects become blurred",
             self.recipe.name
         );
-        if moves { vec![line] } else { Vec::new() }
+        let by_memory = self.memory.warning(&self.recipe.name);
+        moves.then_some(line).into_iter().chain(by_memory).collect()
     }
 
     /// The scene as exported and evaluated: with the smoothing filter baked in.

@@ -3,13 +3,14 @@
 
 use super::declared::{Declared, DeclaredView};
 use super::split;
+use super::world::world_from_dataset;
 use super::{DEFAULT_MAX_SIDE, DatasetOptions};
 use crate::FormatError;
 use crate::image_file::{Header, read_header};
 use crate::photo::PhotoFile;
 use crate::undistort::Undistortion;
 use image::metadata::Orientation;
-use irradia_scene::{Camera, Dataset, Intrinsics, Lens, View};
+use irradia_scene::{Camera, Dataset, Intrinsics, Lens, Similarity, View};
 use rayon::prelude::*;
 use std::sync::Arc;
 
@@ -43,6 +44,7 @@ impl Skipped {
 /// A view with a readable image file.
 struct Probed {
     orientation: Orientation,
+    jpeg: bool,
     /// At the actual size of the upright image, lens included.
     source: Intrinsics,
     /// Set for distorted cameras by [`plan_undistortion`].
@@ -102,15 +104,23 @@ pub(super) fn assemble(declared: Declared, options: &DatasetOptions) -> Result<D
         warnings.extend(scaled_warning(&usable));
     }
 
+    let positions: Vec<_> = usable
+        .iter()
+        .filter_map(|(view, _)| Some(view.pose?.position))
+        .collect();
+    let world = world_from_dataset(&positions);
     let views = usable
         .into_iter()
-        .filter_map(|(view, probed)| finish(view, &probed, downscale, max_side))
+        .filter_map(|(view, probed)| finish(view, &probed, downscale, max_side, &world))
         .collect();
     Ok(Dataset {
         views,
         train: indices.train,
         test: indices.test,
-        points: points.filter(|points| !points.is_empty()),
+        points: points
+            .map(|points| points.in_world(&world))
+            .filter(|points| !points.is_empty()),
+        world_from_dataset: world,
         kind: kind.to_owned(),
         warnings,
     })
@@ -130,6 +140,7 @@ fn probe(view: &DeclaredView, ignores_exif: bool) -> Result<Probed, Skipped> {
     }
     Ok(Probed {
         orientation,
+        jpeg: header.jpeg,
         source,
         undistortion: None,
     })
@@ -184,7 +195,13 @@ fn scaled_warning(usable: &[(DeclaredView, Probed)]) -> Option<String> {
     ))
 }
 
-fn finish(view: DeclaredView, probed: &Probed, downscale: f32, max_side: Option<u32>) -> Option<View> {
+fn finish(
+    view: DeclaredView,
+    probed: &Probed,
+    downscale: f32,
+    max_side: Option<u32>,
+    world_from_dataset: &Similarity,
+) -> Option<View> {
     let undistorted = probed.undistorted();
     let longer = undistorted.width.max(undistorted.height) as f32;
     let smaller = max_side.map_or(downscale, |side| downscale.max(longer / side as f32));
@@ -193,15 +210,18 @@ fn finish(view: DeclaredView, probed: &Probed, downscale: f32, max_side: Option<
         image: view.image?,
         mask: view.mask,
         orientation: probed.orientation,
+        jpeg: probed.jpeg,
         upright: (probed.source.width, probed.source.height),
         undistortion: probed.undistortion,
         size: (intrinsics.width, intrinsics.height),
     };
     Some(View {
         name: view.name,
-        camera: Camera::new(view.pose?, intrinsics),
+        camera: Camera::new(view.pose?.in_world(world_from_dataset), intrinsics),
         photo: Arc::new(photo),
-        depth_bounds: view.depth_bounds.and_then(usable_bounds),
+        depth_bounds: view
+            .depth_bounds
+            .and_then(|bounds| usable_bounds(bounds.map(|depth| depth * world_from_dataset.scale))),
         time: view.time,
         points_seen: view.points_seen,
     })

@@ -3,8 +3,9 @@
 use super::declared::{Declared, Split};
 use super::nerfstudio::declared_views;
 use super::transforms::parse_transforms;
+use crate::FormatError;
 use crate::error::read_and_parse;
-use crate::{FormatError, read_points_ply};
+use crate::points_ply::read_declared_points;
 use std::path::Path;
 
 /// Training views are those of the train file; held out are the frames of the test file, or of the validation file if there
@@ -25,7 +26,7 @@ pub(super) fn read(root: &Path, downscale: f32) -> Result<Declared, FormatError>
         frames.iter_mut().for_each(|view| view.split = Some(split));
         views.extend(frames);
         if let (None, Some(ply)) = (&points, &transforms.ply_file_path) {
-            match read_points_ply(&root.join(ply)) {
+            match read_declared_points(&root.join(ply)) {
                 Ok(read) => points = Some(read),
                 Err(error) => warnings.push(format!("the initial points are ignored: {error}")),
             }

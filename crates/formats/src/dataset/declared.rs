@@ -1,7 +1,7 @@
 //! What a dataset's files declare, before any image is opened: the common form into which all layouts are read.
 
 use glam::{DMat3, DQuat, DVec3};
-use irradia_scene::{Intrinsics, Lens, PointCloud, Pose};
+use irradia_scene::{Intrinsics, Lens, PointCloud, Pose, Similarity};
 use std::path::PathBuf;
 
 pub(super) struct Declared {
@@ -10,7 +10,7 @@ pub(super) struct Declared {
     /// The dataset's folder.
     pub root: PathBuf,
     pub views: Vec<DeclaredView>,
-    pub points: Option<PointCloud>,
+    pub points: Option<DeclaredPoints>,
     /// Whether the tool that made it ignores EXIF orientation.
     pub ignores_exif: bool,
     /// Factor by which the images must still be downscaled.
@@ -25,7 +25,7 @@ pub(super) struct DeclaredView {
     pub image: Option<PathBuf>,
     pub mask: Option<PathBuf>,
     /// `None` when the numbers do not form a pose.
-    pub pose: Option<Pose>,
+    pub pose: Option<DeclaredPose>,
     pub camera: DeclaredCamera,
     /// Nearest and farthest depth along +Z, world units, as in the file.
     pub depth_bounds: Option<[f64; 2]>,
@@ -34,6 +34,60 @@ pub(super) struct DeclaredView {
     pub points_seen: Vec<u32>,
     /// `None` when the dataset does not declare it.
     pub split: Option<Split>,
+}
+
+/// A pose in the files' own coordinates, which may be too large for `f32`.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct DeclaredPose {
+    /// World from camera (x right, y down, z forward).
+    pub rotation: DQuat,
+    /// Camera centre.
+    pub position: DVec3,
+}
+
+impl DeclaredPose {
+    /// The pose, if its numbers form one.
+    pub fn checked(self) -> Option<Self> {
+        self.in_world(&Similarity::IDENTITY).is_valid().then_some(self)
+    }
+
+    /// The pose in the world of `world_from_dataset`.
+    pub fn in_world(&self, world_from_dataset: &Similarity) -> Pose {
+        Pose {
+            rotation: self.rotation.as_quat(),
+            position: world_from_dataset.apply(self.position).as_vec3(),
+        }
+    }
+}
+
+/// Coloured points in the files' own coordinates.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub(crate) struct DeclaredPoints {
+    /// `[N]`, representable in `f32` but not exactly.
+    pub positions: Vec<DVec3>,
+    /// `[N]` sRGB, 8 bits.
+    pub colors: Vec<[u8; 3]>,
+}
+
+impl DeclaredPoints {
+    /// Adds a point; false if its coordinates are not finite in `f32`.
+    pub fn push(&mut self, position: DVec3, color: [u8; 3]) -> bool {
+        let finite = position.as_vec3().is_finite();
+        if finite {
+            self.positions.push(position);
+            self.colors.push(color);
+        }
+        finite
+    }
+
+    /// The points in the world of `world_from_dataset`.
+    pub fn in_world(self, world_from_dataset: &Similarity) -> PointCloud {
+        let positions = self.positions.into_iter();
+        PointCloud {
+            positions: positions.map(|p| world_from_dataset.apply(p).as_vec3()).collect(),
+            colors: self.colors,
+        }
+    }
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -102,7 +156,7 @@ pub(super) fn lens_or_pinhole(lens: Lens) -> Lens {
 
 /// A pose from the camera's axes (right, down, forward; any length) and centre in the world; `None` when they are not
 /// finite, not roughly perpendicular, or left-handed.
-pub(super) fn pose_from_axes(right: DVec3, down: DVec3, forward: DVec3, position: DVec3) -> Option<Pose> {
+pub(super) fn pose_from_axes(right: DVec3, down: DVec3, forward: DVec3, position: DVec3) -> Option<DeclaredPose> {
     let axes = [right, down, forward].map(DVec3::try_normalize);
     let [Some(x), Some(y), Some(z)] = axes else {
         return None;
@@ -115,9 +169,9 @@ pub(super) fn pose_from_axes(right: DVec3, down: DVec3, forward: DVec3, position
     let z = z.normalize();
     let x = (x - z * x.dot(z)).normalize();
     let rotation = DQuat::from_mat3(&DMat3::from_cols(x, z.cross(x), z));
-    let pose = Pose {
-        rotation: rotation.normalize().as_quat(),
-        position: position.as_vec3(),
-    };
-    pose.is_valid().then_some(pose)
+    DeclaredPose {
+        rotation: rotation.normalize(),
+        position,
+    }
+    .checked()
 }

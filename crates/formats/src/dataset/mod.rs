@@ -14,9 +14,11 @@ mod nerfstudio;
 mod npy;
 mod split;
 pub(crate) mod transforms;
+mod world;
 
 use crate::FormatError;
 use declared::Declared;
+pub(crate) use declared::DeclaredPoints;
 use irradia_scene::Dataset;
 pub use split::Holdout;
 use std::fmt;
@@ -130,6 +132,9 @@ impl Default for DatasetOptions {
 ///
 /// Views are sorted by name and split by [`DatasetOptions::holdout`]. Skipped views (missing images, invalid poses) are listed in
 /// [`Dataset::warnings`].
+///
+/// World: that of the files, unless the cameras are far from its origin or its unit is unusual, such as UTM coordinates or
+/// millimetres. Then origin and unit are changed in `f64`, which [`Dataset::world_from_dataset`] records.
 ///
 /// EXIF orientation: poses belong to the pixels as the tool that made them saw them. If the declared size has the aspect of the
 /// stored image only, no orientation is applied; if it has the aspect of the upright image, it is applied; if both match (half

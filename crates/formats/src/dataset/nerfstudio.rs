@@ -4,8 +4,9 @@ use super::declared::{Declared, DeclaredView, Split};
 use super::files::{find_image, relative_name};
 use super::masks::Masks;
 use super::transforms::{Transforms, parse_transforms};
+use crate::FormatError;
 use crate::error::read_and_parse;
-use crate::{FormatError, read_points_ply};
+use crate::points_ply::read_declared_points;
 use std::collections::HashSet;
 use std::path::{Path, PathBuf};
 
@@ -44,7 +45,7 @@ pub(super) fn read(path: &Path, downscale: f32) -> Result<Declared, FormatError>
         warnings.extend(masks.warning(views.len(), masked));
     }
     let points = transforms.ply_file_path.as_ref().and_then(|ply| {
-        let read = read_points_ply(&root.join(ply));
+        let read = read_declared_points(&root.join(ply));
         read.map_err(|error| warnings.push(format!("the initial points are ignored: {error}")))
             .ok()
     });

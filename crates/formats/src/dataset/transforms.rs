@@ -1,9 +1,9 @@
 //! `transforms*.json`: cameras and frames of NeRF's Blender scenes, instant-ngp and nerfstudio.
 
-use super::declared::{DeclaredCamera, Focal, lens_or_pinhole, pose_from_axes};
+use super::declared::{DeclaredCamera, DeclaredPose, Focal, lens_or_pinhole, pose_from_axes};
 use crate::Malformed;
 use glam::DVec3;
-use irradia_scene::{Lens, Pose};
+use irradia_scene::Lens;
 use serde::Deserialize;
 
 /// A `transforms.json`.
@@ -201,7 +201,7 @@ impl CameraKeys {
 
 impl Frame {
     /// The pose in OpenCV axes: the file's cameras look along -Z with Y up.
-    pub(super) fn pose(&self) -> Option<Pose> {
+    pub(super) fn pose(&self) -> Option<DeclaredPose> {
         let number = |row: usize, column: usize| *self.transform_matrix.get(row)?.get(column)?;
         let column = |c: usize| Some(DVec3::new(number(0, c)?, number(1, c)?, number(2, c)?));
         pose_from_axes(column(0)?, -column(1)?, -column(2)?, column(3)?)
@@ -211,7 +211,6 @@ impl Frame {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use glam::Vec3;
 
     #[test]
     fn a_frame_overrides_globals_and_axes_are_flipped() {
@@ -224,12 +223,12 @@ mod tests {
             panic!("two frames")
         };
         let pose = a.pose().unwrap();
-        assert_eq!(pose.position, Vec3::new(1.0, 2.0, 3.0));
+        assert_eq!(pose.position, DVec3::new(1.0, 2.0, 3.0));
         assert!(
-            (pose.rotation * Vec3::Z - Vec3::NEG_Z).length() < 1e-6,
+            (pose.rotation * DVec3::Z - DVec3::NEG_Z).length() < 1e-6,
             "looks along -Z"
         );
-        assert!((pose.rotation * Vec3::Y - Vec3::NEG_Y).length() < 1e-6, "down is -Y");
+        assert!((pose.rotation * DVec3::Y - DVec3::NEG_Y).length() < 1e-6, "down is -Y");
         assert_eq!((a.file_path.as_str(), b.pose()), ("a NaN.png", None));
         let camera = a.camera.or(&transforms.camera).camera().unwrap();
         assert_eq!(camera.at_size(50, 25).fx, 40.0);

@@ -1,10 +1,14 @@
 //! Splats as PLY, in the layout of the Inria 3DGS code (Kerbl et al. 2023, `save_ply` of its `gaussian_model.py`):
 //! `x y z nx ny nz f_dc_0..2 f_rest_0.. opacity scale_0..2 rot_0..3`, little-endian floats. `f_rest` is channel-major:
 //! all of red's coefficients, then green's, then blue's. `rot` is `w x y z`; scales are ln, opacity is a logit.
+//!
+//! Files have the dataset's coordinates. If these are far from the origin, `x y z` are doubles, since floats are centimetres apart
+//! at 500 km in millimetres; a comment then holds [`GaussianCloud::world_from_dataset`], by which reading returns to floats.
 
 use crate::Malformed;
 use crate::ply::{Column, Ply, Rows};
-use irradia_scene::{GaussianCloud, sh};
+use glam::DVec3;
+use irradia_scene::{GaussianCloud, Similarity, sh};
 use rayon::prelude::*;
 use std::io::{self, Write};
 
@@ -12,6 +16,8 @@ use std::io::{self, Write};
 const CHUNK: usize = 16_384;
 /// The comment that stores [`GaussianCloud::antialiased`], for which the layout has no property.
 const ANTIALIASED: &str = "antialiased 1";
+/// The comment that stores [`GaussianCloud::world_from_dataset`]: scale and centre.
+const WORLD: &str = "world_from_dataset";
 /// Highest degree supported.
 const MAX_DEGREE: u32 = 4;
 
@@ -33,6 +39,8 @@ pub fn parse_splat_ply(bytes: &[u8]) -> Result<GaussianCloud, Malformed> {
     let rows = ply.rows("vertex")?;
     let columns = Columns::find(&rows, sh_degree)?;
 
+    let world_from_dataset = world_in(&ply)?;
+    let (local, log_scale) = (!world_from_dataset.is_identity(), world_from_dataset.scale.ln());
     let count = rows.len();
     let sh_values = 3 * sh::coefficients(sh_degree);
     let mut cloud = GaussianCloud {
@@ -43,6 +51,7 @@ pub fn parse_splat_ply(bytes: &[u8]) -> Result<GaussianCloud, Malformed> {
         sh: vec![0.0; count * sh_values],
         sh_degree,
         antialiased: ply.comments.iter().any(|comment| comment.trim() == ANTIALIASED),
+        world_from_dataset,
     };
     let geometry = cloud.means.par_chunks_mut(CHUNK).zip(cloud.quats.par_chunks_mut(CHUNK));
     let shape = cloud
@@ -60,6 +69,11 @@ pub fn parse_splat_ply(bytes: &[u8]) -> Result<GaussianCloud, Malformed> {
                 means[i] = columns.position.map(|c| c.f32(row));
                 quats[i] = columns.rotation.map(|c| c.f32(row));
                 scales[i] = columns.scale.map(|c| c.f32(row));
+                if local {
+                    let position = DVec3::from(columns.position.map(|c| c.f64(row)));
+                    means[i] = world_from_dataset.apply(position).as_vec3().to_array();
+                    scales[i] = scales[i].map(|scale| (f64::from(scale) + log_scale) as f32);
+                }
                 opacities[i] = columns.opacity.f32(row);
                 for (value, column) in sh.iter_mut().zip(&columns.sh) {
                     *value = column.f32(row);
@@ -67,6 +81,34 @@ pub fn parse_splat_ply(bytes: &[u8]) -> Result<GaussianCloud, Malformed> {
             }
         });
     Ok(cloud)
+}
+
+/// The world of the file's splats; the identity if the file does not give one.
+fn world_in(ply: &Ply) -> Result<Similarity, Malformed> {
+    let Some(numbers) = ply
+        .comments
+        .iter()
+        .find_map(|comment| comment.trim().strip_prefix(WORLD))
+    else {
+        return Ok(Similarity::IDENTITY);
+    };
+    let numbers: Vec<f64> = numbers
+        .split_whitespace()
+        .map_while(|number| number.parse().ok())
+        .collect();
+    let world = match numbers[..] {
+        [scale, x, y, z] => Similarity {
+            scale,
+            center: DVec3::new(x, y, z),
+        },
+        _ => Similarity::default(),
+    };
+    if numbers.len() == 4 && world.is_valid() {
+        return Ok(world);
+    }
+    Err(Malformed(format!(
+        "the comment {WORLD} does not hold a positive scale and three coordinates; remove it to read the file as it is"
+    )))
 }
 
 /// Whether a PLY contains splats rather than a point cloud, by the names of its properties.
@@ -143,7 +185,7 @@ fn check_properties(ply: &Ply) -> Result<u32, Malformed> {
         })
 }
 
-/// Writes `cloud` in the Inria layout with zero normals; `3 ((degree + 1)^2 - 1)` values of `f_rest`.
+/// Writes `cloud` in the Inria layout, in the dataset's coordinates, with zero normals; `3 ((degree + 1)^2 - 1)` values of `f_rest`.
 pub(crate) fn write_splat_ply(out: &mut dyn Write, cloud: &GaussianCloud) -> io::Result<()> {
     let rest = cloud.sh_coefficients() - 1;
     let mut names: Vec<String> = POSITION
@@ -159,28 +201,54 @@ pub(crate) fn write_splat_ply(out: &mut dyn Write, cloud: &GaussianCloud) -> io:
     if cloud.antialiased {
         writeln!(out, "comment {ANTIALIASED}")?;
     }
+    let world = cloud.world_from_dataset;
+    if !world.is_identity() {
+        let [x, y, z] = world.center.to_array();
+        writeln!(out, "comment {WORLD} {} {x} {y} {z}", world.scale)?;
+    }
+    let doubles = world.center != DVec3::ZERO;
     writeln!(out, "element vertex {}", cloud.len())?;
     for name in &names {
-        writeln!(out, "property float {name}")?;
+        let scalar = if doubles && POSITION.contains(&name.as_str()) {
+            "double"
+        } else {
+            "float"
+        };
+        writeln!(out, "property {scalar} {name}")?;
     }
     writeln!(out, "end_header")?;
 
-    let sh_values = 3 * (rest + 1);
+    let (sh_values, log_scale) = (3 * (rest + 1), world.scale.ln());
     let chunk_bytes = |chunk: usize| {
         let first = chunk * CHUNK;
         let last = (first + CHUNK).min(cloud.len());
-        let mut bytes = Vec::with_capacity((last - first) * names.len() * 4);
+        let mut bytes = Vec::with_capacity((last - first) * (names.len() * 4 + 12));
         for i in first..last {
             let sh = &cloud.sh[i * sh_values..(i + 1) * sh_values];
+            let position = world.invert(DVec3::from(cloud.means[i].map(f64::from)));
+            if doubles {
+                let coordinates = position.to_array().map(f64::to_le_bytes);
+                bytes.extend_from_slice(coordinates.as_flattened());
+            }
             let mut put = |value: f32| bytes.extend_from_slice(&value.to_le_bytes());
-            cloud.means[i].into_iter().for_each(&mut put);
+            if world.is_identity() {
+                // Not through `f64`, which would change the bits of a NaN.
+                cloud.means[i].into_iter().for_each(&mut put);
+            } else if !doubles {
+                position.as_vec3().to_array().into_iter().for_each(&mut put);
+            }
             [0.0; 3].into_iter().for_each(&mut put);
             sh[..3].iter().copied().for_each(&mut put);
             for channel in 0..3 {
                 (1..=rest).for_each(|coefficient| put(sh[3 * coefficient + channel]));
             }
             put(cloud.opacity_logits[i]);
-            cloud.log_scales[i].into_iter().for_each(&mut put);
+            if world.is_identity() {
+                cloud.log_scales[i].into_iter().for_each(&mut put);
+            } else {
+                let scales = cloud.log_scales[i].map(|scale| (f64::from(scale) - log_scale) as f32);
+                scales.into_iter().for_each(&mut put);
+            }
             cloud.quats[i].into_iter().for_each(&mut put);
         }
         bytes
@@ -214,6 +282,7 @@ mod tests {
             sh: (0..count * 3 * sh::coefficients(sh_degree)).map(|_| f()).collect(),
             sh_degree,
             antialiased,
+            world_from_dataset: Similarity::IDENTITY,
         }
     }
 
@@ -240,6 +309,45 @@ mod tests {
                 assert_eq!(bits(&back), bits(&cloud));
             }
         }
+    }
+
+    #[test]
+    fn files_far_from_the_origin_hold_doubles_of_the_datasets_coordinates() {
+        let mut cloud = random_cloud(0, 0, false);
+        cloud.means = vec![[1.5, -2.25, 1e-6]];
+        cloud.quats = vec![[1.0, 0.0, 0.0, 0.0]];
+        (cloud.log_scales, cloud.opacity_logits, cloud.sh) = (vec![[-3.0; 3]], vec![0.0], vec![0.0; 3]);
+        for (center, scalar) in [(DVec3::new(5e8, 0.125, -5e8), "double"), (DVec3::ZERO, "float")] {
+            cloud.world_from_dataset = Similarity { scale: 1e-3, center };
+            let mut bytes = Vec::new();
+            write_splat_ply(&mut bytes, &cloud).unwrap();
+            let ply = Ply::parse(&bytes).unwrap();
+            let rows = ply.rows("vertex").unwrap();
+            let row = rows.row(0);
+            let position = DVec3::from(rows.columns(POSITION).unwrap().map(|column| column.f64(row)));
+            let expected = center + DVec3::new(1500.0, -2250.0, 1e-3);
+            assert!((position - expected).length() < 1e-4, "{position}");
+            let scale = rows.columns(SCALE).unwrap()[0].f64(row);
+            assert!((scale - (1000f64.ln() - 3.0)).abs() < 1e-6);
+            assert!(String::from_utf8_lossy(&bytes).contains(&format!("property {scalar} x\n")));
+            assert_eq!(parse_splat_ply(&bytes).unwrap(), cloud);
+        }
+        let broken = b"ply\nformat ascii 1.0\ncomment world_from_dataset 0 1 2 3\nelement vertex 0\n";
+        let properties: String = POSITION
+            .iter()
+            .chain(&DC)
+            .chain(&["opacity"])
+            .chain(&SCALE)
+            .chain(&ROTATION)
+            .map(|name| format!("property float {name}\n"))
+            .collect();
+        let bytes = [&broken[..], properties.as_bytes(), b"end_header\n"].concat();
+        assert!(
+            parse_splat_ply(&bytes)
+                .unwrap_err()
+                .to_string()
+                .contains("world_from_dataset")
+        );
     }
 
     #[test]

@@ -260,6 +260,7 @@ fn density(engine: &mut Engine, state_bytes: f64, step: f64, limits: &Limits) {
         *seen += 2.0;
     }
     let options = FastOptions {
+        floor: 0,
         target: n + n / 20,
         min_opacity: 0.13,
         min_weight: 0.0,

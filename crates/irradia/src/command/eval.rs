@@ -77,7 +77,7 @@ pub fn run(args: &Args) -> Result<()> {
         // The run was trained on all views except those that it held out.
         reading.holdout = run.as_ref().and_then(|record| record.input.reading.holdout.clone());
     }
-    let dataset = reading.read(&args.data)?;
+    let dataset = scene.place(reading.read(&args.data)?);
     let background = match (args.background, &run) {
         (None, None) => Background::usual(&dataset)?,
         (given, _) => given,

@@ -56,7 +56,7 @@ pub fn run(args: &Args) -> Result<()> {
     scene.options.depth = args.depth;
     let cameras: Vec<(String, Camera)> = match (&args.data, args.orbit) {
         (Some(data), _) => {
-            let dataset = args.reading.read(data)?;
+            let dataset = scene.place(args.reading.read(data)?);
             let stems = file_stems(dataset.views.iter().map(|view| view.name.as_str()));
             let views = args.split.of(&dataset);
             views

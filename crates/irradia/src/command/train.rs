@@ -31,6 +31,10 @@ pub struct Args {
     /// Maximum number of splats
     #[arg(long, value_name = "N", conflicts_with = "resume", value_parser = RangedU64ValueParser::<usize>::new().range(1..))]
     pub max_splats: Option<usize>,
+    /// Memory of the process, such as 8GiB; three quarters of what is free when absent. Photographs that do not fit are read again
+    /// when they are needed; splats that do not fit are not added
+    #[arg(long, value_name = "SIZE", value_parser = parse_bytes)]
+    pub memory: Option<usize>,
     /// Random seed
     #[arg(long, value_name = "N", default_value_t = 0, conflicts_with = "resume")]
     pub seed: u64,
@@ -64,6 +68,29 @@ pub struct Args {
     pub reading: DataArgs,
 }
 
+/// `8GiB`, `8G`, `512MiB`, `512M` or a number of bytes.
+pub fn parse_bytes(text: &str) -> Result<usize, String> {
+    let units = [
+        ("KiB", 10),
+        ("MiB", 20),
+        ("GiB", 30),
+        ("TiB", 40),
+        ("K", 10),
+        ("M", 20),
+        ("G", 30),
+        ("T", 40),
+        ("", 0),
+    ];
+    let found = units
+        .iter()
+        .find_map(|(unit, power)| Some((text.strip_suffix(unit)?, *power)));
+    let (number, power) = found.expect("the last unit is empty");
+    match number.trim().parse::<f64>() {
+        Ok(value) if value > 0.0 && value.is_finite() => Ok((value * f64::from(power).exp2()) as usize),
+        _ => Err("expected a size such as 8GiB or 512MiB".into()),
+    }
+}
+
 /// `90`, `90s`, `5m` or `1.5h` in seconds.
 pub fn parse_seconds(text: &str) -> Result<f64, String> {
     let (number, unit) = match text.char_indices().last() {
@@ -94,6 +121,7 @@ fn replay(run: &Path, args: &Args) -> Result<TrainInput> {
     if let Some(data) = &args.data {
         input.data.clone_from(data);
     }
+    input.memory = args.memory.or(input.memory);
     input.lpips = lpips_for(input.lpips, args)?;
     input.unseen_lpips = input.unseen_lpips.filter(|path| path.exists());
     input.overwrite = args.overwrite;
@@ -118,6 +146,7 @@ fn input(args: &Args) -> Result<TrainInput> {
         steps: args.steps,
         budget: args.budget,
         until_psnr: args.until_psnr,
+        memory: args.memory,
         seed: args.seed,
         lpips,
         reading: args.reading.reading(),
@@ -157,6 +186,7 @@ fn resume(folder: &Path, args: &Args) -> Result<()> {
         (input.budget, input.steps) = (args.budget, None);
     }
     input.until_psnr = args.until_psnr.or(input.until_psnr);
+    input.memory = args.memory.or(input.memory);
     input.lpips = lpips_for(input.lpips, args)?;
     let request = input.check().map_err(by_option)?;
     let dataset = request.read_dataset()?;
@@ -173,6 +203,7 @@ fn finish(mut run: Run) -> Result<()> {
     if let (Some(lpips), Some(path)) = (&run.trainer().options.lpips, &run.request().input().lpips) {
         lpips::tell(lpips, path);
     }
+    note(&run.trainer().memory);
     let stop = stop_flag();
     let trained = run.train(&mut [&mut Progress::new(stop.clone())]);
     // If Ctrl-C ended the steps, a second one ends the evaluation.

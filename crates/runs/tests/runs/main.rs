@@ -5,6 +5,7 @@ mod requests;
 mod scenes;
 mod snapshots;
 mod watched;
+mod world;
 
 use irradia_runs::prelude::*;
 use std::path::Path;

@@ -419,7 +419,7 @@ fn every_level_matches_double_precision() {
             opacity_logits: column(10, 1),
             sh: column(GEOMETRY, 3 * coefficients(scene.degree)),
             sh_degree: scene.degree,
-            antialiased: false,
+            ..GaussianCloud::default()
         };
         let splats = Splats::from_cloud(&cloud);
         let mut variances = vec![0.0; splats.stride()];

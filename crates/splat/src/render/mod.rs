@@ -256,6 +256,11 @@ impl Renderer {
         (self.depth_keys[i] != u32::MAX).then(|| self.footprints[i].extent)
     }
 
+    /// Intersections of splats and tiles in the last frame.
+    pub fn intersections(&self) -> usize {
+        self.bins.entry_count()
+    }
+
     /// Splat-pixel pairs visited by blending in the last frame (whole blocks of 16): a frame's cost.
     pub fn pairs(&self) -> u64 {
         (0..self.bins.tile_count())

@@ -2,6 +2,7 @@ use super::*;
 use crate::recipe::{Param, Values};
 use glam::Vec3;
 use irradia_scene::{Camera, Intrinsics, Photo, PointCloud, Pose, View};
+use safetensors::tensor::TensorView;
 
 /// Two grey photographs and a few points.
 fn dataset() -> Arc<Dataset> {
@@ -102,7 +103,11 @@ fn a_streamed_checkpoint_has_the_bytes_of_the_format_and_a_copy_is_that_of_its_m
         .map(|bytes| SafeTensors::read_metadata(bytes).unwrap())
         .into();
     assert_eq!(ours.1.offset_keys(), theirs.1.offset_keys());
-    assert_eq!(ours.1.tensors(), theirs.1.tensors());
+    for (name, info) in ours.1.tensors() {
+        let other = theirs.1.info(&name).unwrap();
+        let shape = |info: &safetensors::tensor::TensorInfo| (info.dtype, info.shape.clone(), info.data_offsets);
+        assert_eq!(shape(info), shape(other), "{name}");
+    }
     let copy = Checkpoint::of(&trainer).copied();
     trainer.step(&mut Vec::new()).unwrap();
     let mut later = Vec::new();

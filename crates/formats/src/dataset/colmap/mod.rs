@@ -4,13 +4,13 @@
 pub mod binary;
 pub mod text;
 
-use super::declared::{Declared, DeclaredCamera, DeclaredView, Focal, lens_or_pinhole};
+use super::declared::{Declared, DeclaredCamera, DeclaredPoints, DeclaredPose, DeclaredView, Focal, lens_or_pinhole};
 use super::files::{ImageFolder, choose_image_folder, find_image};
 use super::masks::Masks;
 use crate::error::read_and_parse;
 use crate::{FormatError, Malformed};
 use glam::{DQuat, DVec3};
-use irradia_scene::{Lens, PointCloud, Pose};
+use irradia_scene::Lens;
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 
@@ -177,7 +177,7 @@ pub(super) fn read(root: &Path, downscale: f32) -> Result<Declared, FormatError>
     })
 }
 
-fn pose(image: &ColmapImage) -> Option<Pose> {
+fn pose(image: &ColmapImage) -> Option<DeclaredPose> {
     let [w, x, y, z] = image.rotation;
     let camera_from_world = DQuat::from_xyzw(x, y, z, w);
     let length = camera_from_world.length();
@@ -185,22 +185,20 @@ fn pose(image: &ColmapImage) -> Option<Pose> {
         return None;
     }
     let world_from_camera = (camera_from_world / length).inverse();
-    let pose = Pose {
-        rotation: world_from_camera.as_quat(),
-        position: -(world_from_camera * DVec3::from(image.translation)).as_vec3(),
-    };
-    pose.is_valid().then_some(pose)
+    DeclaredPose {
+        rotation: world_from_camera,
+        position: -(world_from_camera * DVec3::from(image.translation)),
+    }
+    .checked()
 }
 
-fn gather(points: Vec<ColmapPoint>) -> (PointCloud, HashMap<u64, u32>) {
-    let mut cloud = PointCloud::default();
+fn gather(points: Vec<ColmapPoint>) -> (DeclaredPoints, HashMap<u64, u32>) {
+    let mut cloud = DeclaredPoints::default();
     let mut index_of = HashMap::with_capacity(points.len());
     for point in points {
-        let position = DVec3::from(point.position).as_vec3();
-        if position.is_finite() {
-            index_of.insert(point.id, cloud.len() as u32);
-            cloud.positions.push(position);
-            cloud.colors.push(point.color);
+        let index = cloud.positions.len() as u32;
+        if cloud.push(point.position.into(), point.color) {
+            index_of.insert(point.id, index);
         }
     }
     (cloud, index_of)

@@ -1,0 +1,299 @@
+//! The memory of a training, estimated before its first step: it limits the number of splats and the photographs in memory.
+//!
+//! Constants are bytes per splat or pixel at the peak, from the sizes of the arrays, and checked against the peak memory of runs
+//! (RESULTS.md, "How much memory does a training need?").
+
+use crate::field_step::{ALL_PHOTOS, is_field};
+use crate::recipe::Recipe;
+use crate::trainer::TrainError;
+use irradia_measure::LpipsNet;
+use irradia_scene::Dataset;
+use std::fmt;
+use std::fs;
+
+/// Parameters, gradients and two moments are 59 values each; with statistics, filter, activity and screen gradients.
+const STATE: usize = 4 * (4 * 59 + 5 + 1 + 1 + 4);
+/// Footprint, depth key and orders of a frame.
+const FOOTPRINT: usize = 96;
+/// An intersection of a splat and a tile: index, blocks, position and the sums of its gradients.
+const INTERSECTION: usize = 64;
+/// Intersections per splat: most splats are out of view or within one or two tiles.
+const INTERSECTIONS: usize = 3;
+/// Encoding a checkpoint: parameters, moments and statistics as arrays, and in the file.
+const SAVING: usize = 2 * 4 * (3 * 59 + 6);
+/// A splat, in all.
+const SPLAT: usize = STATE + FOOTPRINT + INTERSECTIONS * INTERSECTION + SAVING;
+/// A pixel of the largest photograph: frame, gradients, the maps of SSIM, and the intersections of a few thousand splats per tile.
+const PIXEL: usize = 300;
+/// The program with its threads.
+const PROGRAM: usize = 64 << 20;
+/// A radiance field of a built-in recipe with its samples.
+const FIELD: usize = 512 << 20;
+/// A point of the dataset.
+const POINT: usize = 15;
+/// Fraction of the memory, as a divisor, that photographs get before splats, if they need it.
+const PHOTO_SHARE: usize = 4;
+/// Photographs without which training would wait for each.
+const FEW_PHOTOS: usize = 8;
+/// For photographs if the free memory is unknown: 5,500 of 360 x 360.
+const UNKNOWN: usize = 2 << 30;
+
+/// The distribution of the memory of a process, bytes.
+#[derive(Clone, Debug, PartialEq)]
+pub struct MemoryPlan {
+    /// All memory of the process; `None` if it is unknown, so that only photographs are limited.
+    pub limit: Option<usize>,
+    /// For the program, the dataset's points, and a field.
+    pub program: usize,
+    /// For frames and losses.
+    pub images: usize,
+    /// For photographs, including those being decoded.
+    pub photos: usize,
+    /// What all photographs would take.
+    pub all_photos: usize,
+    /// Maximum number of splats.
+    pub splats: usize,
+    /// The maximum without a limit on memory.
+    pub wanted_splats: usize,
+}
+
+/// What a training needs.
+pub(crate) struct Needs {
+    /// The program, the dataset's points, and a field, bytes.
+    pub program: usize,
+    /// Frames and losses, bytes.
+    pub images: usize,
+    /// The photographs without which there is no step, and those being decoded, bytes.
+    pub few_photos: usize,
+    /// All photographs, and those being decoded, bytes.
+    pub all_photos: usize,
+    /// Splats to begin with.
+    pub first_splats: usize,
+    /// The recipe's limit for this dataset.
+    pub most_splats: usize,
+}
+
+impl Needs {
+    pub fn of(dataset: &Dataset, recipe: &Recipe, lpips: Option<LpipsNet>) -> Self {
+        let pixels = |view: &usize| {
+            let k = &dataset.views[*view].camera.intrinsics;
+            k.width as usize * k.height as usize
+        };
+        let views = || dataset.train.iter().chain(&dataset.test);
+        let largest = views().map(pixels).max().unwrap_or(0);
+        let working = views()
+            .map(|view| dataset.views[*view].photo.working_bytes())
+            .max()
+            .unwrap_or(0);
+        // Four channels, or three and a mask.
+        let all: usize = dataset.train.iter().map(|view| 4 * pixels(view)).sum();
+        let has_field = (0..recipe.stage.len()).any(|stage| is_field(recipe, stage));
+        let all_at_once = has_field && all <= ALL_PHOTOS;
+        let perceptual = match lpips {
+            None => 0,
+            Some(LpipsNet::Squeeze | LpipsNet::Alex) => 300,
+            Some(LpipsNet::Vgg) => 3000,
+        };
+        Self {
+            program: PROGRAM
+                + dataset.points.as_ref().map_or(0, |points| POINT * points.len())
+                + if has_field { FIELD } else { 0 },
+            images: (PIXEL + perceptual) * largest,
+            few_photos: working
+                + if all_at_once {
+                    all
+                } else {
+                    all.min(FEW_PHOTOS * 4 * largest)
+                },
+            all_photos: working + all,
+            first_splats: 0,
+            most_splats: recipe.max_splats,
+        }
+    }
+}
+
+impl MemoryPlan {
+    /// Distributes `limit` bytes.
+    ///
+    /// # Errors
+    /// When the first splats and a few photographs do not fit: the error says what would.
+    pub(crate) fn new(needs: &Needs, limit: Option<usize>) -> Result<Self, TrainError> {
+        let plan = |splats, photos| Self {
+            limit,
+            program: needs.program,
+            images: needs.images,
+            photos,
+            all_photos: needs.all_photos,
+            splats,
+            wanted_splats: needs.most_splats,
+        };
+        let Some(memory) = limit else {
+            return Ok(plan(needs.most_splats, UNKNOWN));
+        };
+        let fixed = needs.program + needs.images;
+        let least = fixed + needs.few_photos + SPLAT * needs.first_splats.max(1);
+        if least > memory {
+            let fitting = memory.saturating_sub(fixed + needs.few_photos) / SPLAT;
+            return Err(TrainError::Memory {
+                limit: in_gib(memory),
+                needed: in_gib_above(least),
+                splats: needs.first_splats,
+                otherwise: if fitting >= 1000 {
+                    format!(", or {fitting} splats with --max-splats")
+                } else {
+                    ", or smaller photographs with --max-side".into()
+                },
+            });
+        }
+        let photos = needs
+            .all_photos
+            .min(needs.few_photos.max((memory - fixed) / PHOTO_SHARE));
+        let fitting = (memory - fixed).saturating_sub(photos) / SPLAT;
+        let splats = needs.most_splats.min(fitting.max(needs.first_splats)).max(1);
+        // Photographs at full size, and at the scale of a stage.
+        Ok(plan(
+            splats,
+            (2 * needs.all_photos).min(memory - fixed - SPLAT * splats),
+        ))
+    }
+
+    /// The limit on the number of splats while a frame has `intersections` of splats and tiles with `splats` splats and `pixels`
+    /// pixels; more than were reserved reduce it.
+    pub(crate) fn splats_at(&self, intersections: usize, splats: usize, pixels: usize) -> usize {
+        let reserved = INTERSECTIONS * splats + pixels / 10;
+        let excess = INTERSECTION * intersections.saturating_sub(reserved);
+        match self.limit {
+            // Intersections grow with splats, and other views may have more.
+            Some(_) => self.splats.saturating_sub(2 * excess / SPLAT).max(1),
+            None => usize::MAX,
+        }
+    }
+
+    /// What memory withholds from the recipe `name`: one line.
+    pub(crate) fn warning(&self, name: &str) -> Option<String> {
+        let limit = self.limit.filter(|_| self.splats < self.wanted_splats)?;
+        let more = SPLAT * (self.wanted_splats - self.splats);
+        Some(format!(
+            "{} of memory allow {} splats where recipe {name} has up to {}: density control adds fewer; --memory {} allows all",
+            in_gib(limit),
+            self.splats,
+            self.wanted_splats,
+            in_gib_above(limit + more)
+        ))
+    }
+}
+
+impl fmt::Display for MemoryPlan {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        let Some(limit) = self.limit else {
+            return write!(f, "memory: {} for photographs", in_gib(self.photos));
+        };
+        write!(
+            f,
+            "memory: at most {}: {} for up to {} splats, {} for photographs (all: {}), {} for images, {} for the program",
+            in_gib(limit),
+            in_gib(SPLAT * self.splats),
+            self.splats,
+            in_gib(self.photos),
+            in_gib(self.all_photos),
+            in_gib(self.images),
+            in_gib(self.program)
+        )
+    }
+}
+
+fn in_gib(bytes: usize) -> String {
+    format!("{:.2} GiB", bytes as f64 / (1u64 << 30) as f64)
+}
+
+/// As `--memory` reads it; rounded up, so that the figure suffices.
+fn in_gib_above(bytes: usize) -> String {
+    in_gib(bytes + (1 << 30) / 100).replace(' ', "")
+}
+
+/// Three quarters of the free memory, bytes: of the system, or of the control group if that is less. `None` where unknown.
+pub fn usual_limit() -> Option<usize> {
+    let read = |path: &str| fs::read_to_string(path).ok();
+    let number = |path: &str| read(path)?.trim().parse::<u64>().ok();
+    let system = read("/proc/meminfo").and_then(|text| {
+        let line = text.lines().find_map(|line| line.strip_prefix("MemAvailable:"))?;
+        Some(1024 * line.trim().strip_suffix("kB")?.trim().parse::<u64>().ok()?)
+    })?;
+    let group = number("/sys/fs/cgroup/memory.max")
+        .zip(number("/sys/fs/cgroup/memory.current"))
+        .map_or(u64::MAX, |(most, used)| most.saturating_sub(used));
+    usize::try_from(system.min(group) / 4 * 3).ok()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const GIB: usize = 1 << 30;
+
+    fn needs(first_splats: usize, most_splats: usize) -> Needs {
+        Needs {
+            program: PROGRAM,
+            images: PIXEL * 1_000_000,
+            few_photos: 50 << 20,
+            all_photos: 10 * GIB,
+            first_splats,
+            most_splats,
+        }
+    }
+
+    #[test]
+    fn the_parts_are_within_the_limit_and_a_plan_is_refused_with_the_figure_that_suffices() {
+        for limit in [GIB, 2 * GIB, 4 * GIB, 8 * GIB, 32 * GIB] {
+            for first in [0, 200_000, 1_000_000, 5_000_000] {
+                match MemoryPlan::new(&needs(first, 6_000_000), Some(limit)) {
+                    Ok(plan) => {
+                        let used = plan.program + plan.images + plan.photos + SPLAT * plan.splats;
+                        assert!(used <= limit && plan.splats >= first && plan.photos >= 50 << 20);
+                    }
+                    Err(TrainError::Memory { needed, .. }) => {
+                        let gib: f64 = needed.trim_end_matches("GiB").parse().unwrap();
+                        assert!(gib > limit as f64 / GIB as f64);
+                        assert!(MemoryPlan::new(&needs(first, 6_000_000), Some((gib * GIB as f64) as usize)).is_ok());
+                    }
+                    Err(error) => panic!("{error}"),
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn a_warning_names_the_memory_that_allows_all_splats() {
+        let plan = MemoryPlan::new(&needs(1000, 1_000_000), Some(2 * GIB)).unwrap();
+        let warning = plan.warning("fast").unwrap();
+        let figure = warning.split("--memory ").nth(1).unwrap().split("GiB").next().unwrap();
+        let enough = (figure.parse::<f64>().unwrap() * GIB as f64) as usize;
+        assert!(plan.splats < 1_000_000, "{warning}");
+        assert!(
+            MemoryPlan::new(&needs(1000, 1_000_000), Some(enough + 3 * GIB))
+                .unwrap()
+                .warning("fast")
+                .is_none()
+        );
+        assert!(
+            MemoryPlan::new(&needs(1000, 1_000_000), None)
+                .unwrap()
+                .warning("fast")
+                .is_none()
+        );
+    }
+
+    #[test]
+    fn splats_over_many_tiles_leave_room_for_fewer() {
+        let plan = MemoryPlan::new(&needs(1000, 1_000_000), Some(4 * GIB)).unwrap();
+        let usual = plan.splats_at(200_000, 100_000, 1_000_000);
+        assert_eq!(usual, plan.splats);
+        assert!(plan.splats_at(10_000_000, 100_000, 1_000_000) < usual);
+    }
+
+    #[test]
+    #[cfg(target_os = "linux")]
+    fn the_free_memory_is_known() {
+        assert!(usual_limit().unwrap() > 1 << 26);
+    }
+}

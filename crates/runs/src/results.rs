@@ -113,6 +113,7 @@ impl Run {
             unseen_lpips: mean.unseen_lpips,
             unseen_lpips_net: name_of(networks.unseen),
             trained_on_lpips: name_of(networks.first).filter(|_| has_perceptual_loss(&trainer.recipe)),
+            psnr_corrected: mean.psnr_corrected,
             half_fit_psnr: mean.half_fit_psnr,
             views,
             schedule: schedule(
@@ -169,6 +170,7 @@ fn write_view(folder: &RunFolder, stem: &str, view: &EvaluatedView) -> Result<Vi
         ssim: view.metrics.ssim,
         lpips: view.metrics.lpips,
         unseen_lpips: view.metrics.unseen_lpips,
+        psnr_corrected: view.metrics.psnr_corrected,
         half_fit_psnr: view.metrics.half_fit_psnr,
         truth: write("truth", &view.truth)?,
         render: write("render", &view.render)?,

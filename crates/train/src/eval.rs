@@ -81,6 +81,7 @@ pub fn evaluate_views(
             Metrics::All(networks) => evaluate(&render, &truth, mask, networks),
             Metrics::Psnr => Evaluation {
                 psnr: psnr_masked(&render.rounded_to_8_bits(), &truth, mask),
+                psnr_corrected: f64::NAN,
                 ssim: f64::NAN,
                 lpips: None,
                 unseen_lpips: None,
@@ -100,6 +101,7 @@ pub fn evaluate_views(
         }
         // Not `f64::min`, which returns the other operand for NaN.
         metrics.psnr = metrics.psnr.clamp(f64::NEG_INFINITY, MAX_PSNR);
+        metrics.psnr_corrected = metrics.psnr_corrected.clamp(f64::NEG_INFINITY, MAX_PSNR);
         metrics.half_fit_psnr = metrics.half_fit_psnr.map(|psnr| psnr.min(MAX_PSNR));
         let seen = see(EvaluatedView {
             name: view.name.clone(),
@@ -128,6 +130,7 @@ fn truth_image(photo: &Photo, view: &View, background: [f32; 3]) -> Image {
 
 const NOT_MEASURED: Evaluation = Evaluation {
     psnr: f64::NAN,
+    psnr_corrected: f64::NAN,
     ssim: f64::NAN,
     lpips: None,
     unseen_lpips: None,
@@ -146,6 +149,7 @@ pub fn mean(metrics: &[Evaluation]) -> Evaluation {
     };
     Evaluation {
         psnr: all(|m| m.psnr),
+        psnr_corrected: all(|m| m.psnr_corrected),
         ssim: all(|m| m.ssim),
         lpips: distance(|m| m.lpips),
         unseen_lpips: distance(|m| m.unseen_lpips),

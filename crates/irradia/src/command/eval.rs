@@ -118,7 +118,7 @@ pub fn run(args: &Args) -> Result<()> {
         if view.is_measured() {
             say(figures(&view.name, &m, nets))?;
             rows.push(json!({
-                "name": view.name, "psnr": m.psnr, "ssim": m.ssim, "lpips": m.lpips, "unseen_lpips": m.unseen_lpips,
+                "name": view.name, "psnr": m.psnr, "psnr_corrected": m.psnr_corrected, "ssim": m.ssim, "lpips": m.lpips, "unseen_lpips": m.unseen_lpips,
                 "half_fit_psnr": m.half_fit_psnr,
             }));
         }
@@ -140,7 +140,7 @@ pub fn run(args: &Args) -> Result<()> {
             "scene": scene_of(&args.scene), "data": args.data,
             "splats": scene.model.splats().map(|splats| splats.len()),
             "parameters": scene.model.field().map(|field| field.len()),
-            "psnr": mean.psnr, "ssim": mean.ssim, "lpips": mean.lpips, "lpips_net": nets[0].map(LpipsNet::name),
+            "psnr": mean.psnr, "psnr_corrected": mean.psnr_corrected, "ssim": mean.ssim, "lpips": mean.lpips, "lpips_net": nets[0].map(LpipsNet::name),
             "unseen_lpips": mean.unseen_lpips, "unseen_lpips_net": nets[1].map(LpipsNet::name),
             "half_fit_psnr": mean.half_fit_psnr, "views": rows,
         });
@@ -152,7 +152,10 @@ pub fn run(args: &Args) -> Result<()> {
 
 /// One line of figures.
 fn figures(name: &str, m: &Evaluation, nets: [Option<LpipsNet>; 2]) -> String {
-    let mut line = format!("{name:<40} PSNR {:6.2} dB  SSIM {:.4}", m.psnr, m.ssim);
+    let mut line = format!(
+        "{name:<40} PSNR {:6.2} dB  corrected {:6.2} dB  SSIM {:.4}",
+        m.psnr, m.psnr_corrected, m.ssim
+    );
     for (lpips, net) in [m.lpips, m.unseen_lpips].into_iter().zip(nets) {
         let Some((lpips, net)) = lpips.zip(net) else { continue };
         line += &format!("  LPIPS ({net}) {lpips:.4}");

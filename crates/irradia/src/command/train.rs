@@ -233,8 +233,9 @@ fn tell(finished: &Finished) -> Result<()> {
         "nothing was evaluated: there is no held-out view with pixels to measure".to_owned()
     } else {
         format!(
-            "held-out PSNR {:.2} dB, SSIM {:.4}{}{}{}",
+            "held-out PSNR {:.2} dB ({:.2} colour-corrected), SSIM {:.4}{}{}{}",
             report.psnr,
+            report.psnr_corrected,
             report.ssim,
             in_words(report.lpips, report.lpips_net.as_deref()),
             in_words(report.unseen_lpips, report.unseen_lpips_net.as_deref()),

@@ -18,6 +18,9 @@ use irradia_scene::Image;
 pub struct Evaluation {
     /// Peak signal-to-noise ratio, dB; infinite where the images are equal.
     pub psnr: f64,
+    /// The same after the affine colour map that fits the render best (gsplat's `color_correct`): without differences of exposure
+    /// and white balance.
+    pub psnr_corrected: f64,
     /// Mean structural similarity, at most 1.
     pub ssim: f64,
     /// Learned perceptual distance, 0 for equal images; `None` without weights or for images below [`LpipsNet::min_side`].
@@ -51,9 +54,11 @@ pub fn evaluate(render: &Image, truth: &Image, mask: Option<&[u8]>, networks: Ne
     if let Some(mask) = mask {
         render = with_truth_where_masked(&render, &truth, mask);
     }
+    let corrected = Affine::fit(&render, &truth, |i| mask.is_none_or(|mask| mask[i] != 0)).apply_to(&render);
     let distance = |lpips: Option<&Lpips>| lpips.and_then(|net| net.distance(&render, &truth).ok());
     Evaluation {
         psnr: psnr_masked(&render, &truth, mask),
+        psnr_corrected: psnr_masked(&corrected.rounded_to_8_bits(), &truth, mask),
         ssim: ssim_masked(&render, &truth, mask),
         lpips: distance(networks.first),
         unseen_lpips: distance(networks.unseen),

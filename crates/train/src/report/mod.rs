@@ -61,6 +61,10 @@ pub struct Report {
     /// Mean over the held-out views, dB; NaN, and absent from files, if none could be measured.
     #[serde(default = "nan", deserialize_with = "or_nan", skip_serializing_if = "is_nan")]
     pub psnr: f64,
+    /// Mean over the held-out views after the affine colour map of each that fits best, dB; NaN, and absent from files, if none
+    /// could be measured.
+    #[serde(default = "nan", deserialize_with = "or_nan", skip_serializing_if = "is_nan")]
+    pub psnr_corrected: f64,
     /// Mean over the held-out views; NaN, and absent from files, if none could be measured.
     #[serde(default = "nan", deserialize_with = "or_nan", skip_serializing_if = "is_nan")]
     pub ssim: f64,
@@ -167,6 +171,9 @@ pub struct ViewReport {
     /// dB; NaN, and absent from files, if the view's mask excludes all pixels.
     #[serde(default = "nan", deserialize_with = "or_nan", skip_serializing_if = "is_nan")]
     pub psnr: f64,
+    /// The same after the affine colour map that fits best, dB.
+    #[serde(default = "nan", deserialize_with = "or_nan", skip_serializing_if = "is_nan")]
+    pub psnr_corrected: f64,
     /// Structural similarity; NaN, and absent from files, if the view's mask excludes all pixels.
     #[serde(default = "nan", deserialize_with = "or_nan", skip_serializing_if = "is_nan")]
     pub ssim: f64,

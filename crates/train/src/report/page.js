@@ -10,6 +10,7 @@
   at("subtitle").textContent = [report.recipe && `recipe ${report.recipe}`, report.device].filter(Boolean).join(" · ");
   for (const [label, value, unit] of [
     ["PSNR", fixed(report.psnr, 2), "dB"],
+    ["Colour-corrected", fixed(report.psnr_corrected, 2), "dB"],
     ["SSIM", fixed(report.ssim, 4)],
     [lpips, fixed(report.lpips, 4)],
     ...(unseen ? [[unseen, fixed(report.unseen_lpips, 4)]] : []),
@@ -58,6 +59,7 @@
   const columns = [
     ["View", (v) => v.name, (v) => v.name],
     ["PSNR, dB", (v) => v.psnr, (v) => fixed(v.psnr, 2)],
+    ["corrected, dB", (v) => v.psnr_corrected, (v) => fixed(v.psnr_corrected, 2)],
     ["SSIM", (v) => v.ssim, (v) => fixed(v.ssim, 4)],
     [lpips, (v) => v.lpips, (v) => fixed(v.lpips, 4)],
     ...(unseen ? [[unseen, (v) => v.unseen_lpips, (v) => fixed(v.unseen_lpips, 4)]] : []),
@@ -105,7 +107,7 @@
     });
     const mean = make("tr");
     mean.append(make("td", "Mean"));
-    const means = [fixed(report.psnr, 2), fixed(report.ssim, 4), fixed(report.lpips, 4)];
+    const means = [fixed(report.psnr, 2), fixed(report.psnr_corrected, 2), fixed(report.ssim, 4), fixed(report.lpips, 4)];
     if (unseen) means.push(fixed(report.unseen_lpips, 4));
     for (const text of means) mean.append(make("td", text));
     const [head, foot] = [make("thead"), make("tfoot")];

@@ -164,6 +164,12 @@ impl Kernel for AdamPiece<'_> {
     where
         S::F: Lanes<Scalar = f32>,
     {
+        if let Active::Sparse(_, counts) = self.active {
+            let runs = &counts[self.from / RUN..][..self.parameter.len().div_ceil(RUN)];
+            if runs.iter().all(|count| *count == 0) {
+                return;
+            }
+        }
         let rule = AdamRule::new(simd, &self.step, self.rate);
         let (zero, faintest) = (simd.splat(0.0), simd.splat(FAINTEST_MOMENT));
         let dense = matches!(self.active, Active::Dense(_));

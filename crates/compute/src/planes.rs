@@ -149,9 +149,9 @@ impl Planes {
             self.data.resize(self.count * new, 0.0);
         }
         scratch.resize(order.len(), 0.0);
-        for step in 0..self.count {
+        for turn in 0..self.count {
             // A plane moves up or down in memory: the order in which none is overwritten before its turn.
-            let c = if new > old { self.count - 1 - step } else { step };
+            let c = if new > old { self.count - 1 - turn } else { turn };
             let plane = &self.data[c * old..][..self.len];
             let value = |i: usize| {
                 let mut i = i;
@@ -245,9 +245,9 @@ mod tests {
         let items = |from: usize, n: usize| -> Vec<f32> { (from..from + 2 * n).map(|v| v as f32).collect() };
         let added = [3, PIECE + 9].map(|n| Planes::from_interleaved(2, &items(1_000_000, n)));
         let total = n + added[0].len() + added[1].len();
-        for (len, step) in [(n / 3, 2), (n, 7), (total + 5, 11), (0, 1)] {
+        for (len, apart) in [(n / 3, 2), (n, 7), (total + 5, 11), (0, 1)] {
             // Every kind of index, out of order, with gaps and repetitions; some beyond the last item.
-            let order: Vec<u32> = (0..len).map(|i| (i * step % (total + 3)) as u32).collect();
+            let order: Vec<u32> = (0..len).map(|i| (i * apart % (total + 3)) as u32).collect();
             let all = [
                 items(0, n),
                 added[0].to_interleaved(),

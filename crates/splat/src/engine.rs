@@ -228,10 +228,10 @@ impl Engine {
                 gradients,
             );
         }
-        if update.trained_fraction < 1.0 {
-            regularize::freeze_small(&self.state.splats, update.trained_fraction, gradients);
-        }
         let regularized = regularizers.map_or(Regularized::Visible, |_| update.regularized);
+        if update.trained_fraction < 1.0 {
+            regularize::freeze_small(&self.state.splats, update.trained_fraction, regularized, gradients);
+        }
         self.state.step(
             level,
             gradients,

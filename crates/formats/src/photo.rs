@@ -137,3 +137,48 @@ fn resized(from: Pixels, (width, height): (u32, u32)) -> Pixels {
         data: resize_area(&from.data, from.channels, [from.width, from.height], [width, height]),
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use irradia_scene::{Intrinsics, Lens};
+
+    #[test]
+    fn a_large_jpeg_is_decoded_at_a_fraction_of_its_size_and_looks_the_same() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("large.jpg");
+        let wave = |v: u32, length: f32| (127.0 + 100.0 * (v as f32 / length).sin()) as u8;
+        let color = |x, y| image::Rgb([wave(x, 60.0), wave(y, 90.0), wave(x + y, 150.0)]);
+        image::RgbImage::from_fn(2001, 1403, color).save(&path).unwrap();
+        let bent = Intrinsics {
+            lens: Lens::Opencv {
+                k: [0.05, 0.0, 0.0, 0.0, 0.0, 0.0],
+                p: [0.0; 2],
+            },
+            ..Intrinsics::from_fov_x(2001, 1403, 1.0)
+        };
+        for undistortion in [None, Undistortion::plan(&bent)] {
+            let photo = |jpeg: bool| PhotoFile {
+                image: path.clone(),
+                mask: None,
+                orientation: Orientation::NoTransforms,
+                jpeg,
+                upright: (2001, 1403),
+                undistortion,
+                size: (960, 672),
+            };
+            let (file, whole) = (photo(true), photo(false));
+            assert!([(960, 672), (480, 336), (240, 168)].map(|size| file.divisor(size)) == [2, 4, 8]);
+            assert!(whole.divisor((240, 168)) == 1 && whole.is_shrunk_from_full(240, 168));
+            assert!(!file.is_shrunk_from_full(480, 336) && file.is_shrunk_from_full(900, 630));
+            for (width, height) in [(960, 672), (480, 336), (240, 168), (900, 630)] {
+                let [a, b] = [&file, &whole].map(|photo| photo.load_at(width, height).unwrap());
+                assert_eq!((a.width, a.height), (width, height));
+                let off = |(a, b): (&u8, &u8)| f64::from(a.abs_diff(*b));
+                let mean = a.data.iter().zip(&b.data).map(off).sum::<f64>() / a.data.len() as f64;
+                // A shift by half a pixel of the coarsest would be 2 to 3.
+                assert!(mean < 1.0, "{width}x{height}: {mean}");
+            }
+        }
+    }
+}

@@ -10,7 +10,7 @@ use std::time::Instant;
 
 /// Photographs loaded ahead if not all fit into the budget, for each loading thread: enough for a few slow ones.
 const AHEAD: usize = 8;
-/// Fraction of the budget, as a divisor, that photographs being decoded may use beside it.
+/// Fraction of the budget, as a divisor, that photographs being decoded may use.
 const WORKING_SHARE: usize = 4;
 
 /// A photograph ready for the loss.
@@ -88,7 +88,8 @@ pub struct PhotoCache {
     fits: bool,
     /// Whether they also fit at full size beside those of `scale`.
     keeps_full: bool,
-    /// Photographs loaded ahead if not all fit.
+    threads: usize,
+    /// Photographs loaded ahead if not all fit: at most half of those that do, so that the others may stay until they are needed.
     ahead: usize,
     loader: Loader,
     /// Seconds spent waiting for photographs since the last [`Self::take_seconds`].
@@ -96,21 +97,27 @@ pub struct PhotoCache {
 }
 
 impl PhotoCache {
-    /// Holds at most `budget` bytes, but always at least the current photograph.
+    /// Uses at most `budget` bytes, those being decoded included, but holds at least the current photograph.
     pub fn new(dataset: Arc<Dataset>, background: [f32; 3], budget: usize) -> Self {
-        let working = dataset.views.iter().map(|view| view.photo.working_bytes()).max();
-        let most = budget / WORKING_SHARE / working.unwrap_or(0).max(1);
+        let working = dataset
+            .views
+            .iter()
+            .map(|view| view.photo.working_bytes())
+            .max()
+            .unwrap_or(0);
+        let most = budget / WORKING_SHARE / working.max(1);
         let threads = rayon::current_num_threads().min(most).max(1);
         let mut cache = Self {
             loader: Loader::new(dataset.clone(), background, threads),
             dataset,
-            budget,
+            budget: budget.saturating_sub(threads * working),
             held: HashMap::new(),
             bytes: 0,
             scale: 1.0,
             fits: false,
             keeps_full: false,
-            ahead: AHEAD * threads,
+            threads,
+            ahead: 1,
             seconds: 0.0,
         };
         cache.use_scale(1.0);
@@ -149,6 +156,8 @@ impl PhotoCache {
         self.scale = scale;
         let total = |scale: f32| -> usize { self.dataset.train.iter().map(|view| self.size(*view, scale)).sum() };
         let (full, scaled) = (total(1.0), total(scale));
+        let fitting = self.budget * self.dataset.train.len() / scaled.max(1);
+        self.ahead = (AHEAD * self.threads).min(fitting / 2).max(1);
         self.fits = scaled <= self.budget;
         self.keeps_full = scale < 1.0 && full + scaled <= self.budget;
         self.held.retain(|_, held| {

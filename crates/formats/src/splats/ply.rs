@@ -314,7 +314,7 @@ mod tests {
     #[test]
     fn files_far_from_the_origin_hold_doubles_of_the_datasets_coordinates() {
         let mut cloud = random_cloud(0, 0, false);
-        cloud.means = vec![[1.5, -2.25, 1e-6]];
+        cloud.means = vec![[1.5, -2.25, 0.25]];
         cloud.quats = vec![[1.0, 0.0, 0.0, 0.0]];
         (cloud.log_scales, cloud.opacity_logits, cloud.sh) = (vec![[-3.0; 3]], vec![0.0], vec![0.0; 3]);
         for (center, scalar) in [(DVec3::new(5e8, 0.125, -5e8), "double"), (DVec3::ZERO, "float")] {
@@ -325,7 +325,7 @@ mod tests {
             let rows = ply.rows("vertex").unwrap();
             let row = rows.row(0);
             let position = DVec3::from(rows.columns(POSITION).unwrap().map(|column| column.f64(row)));
-            let expected = center + DVec3::new(1500.0, -2250.0, 1e-3);
+            let expected = center + DVec3::new(1500.0, -2250.0, 250.0);
             assert!((position - expected).length() < 1e-4, "{position}");
             let scale = rows.columns(SCALE).unwrap()[0].f64(row);
             assert!((scale - (1000f64.ln() - 3.0)).abs() < 1e-6);

@@ -4,6 +4,7 @@ mod bad_input;
 mod compare;
 mod field;
 mod lpips;
+mod memory;
 mod outputs;
 mod process;
 mod real_data;

@@ -50,8 +50,8 @@ impl PhotoSource for PhotoFile {
 }
 
 impl PhotoFile {
-    /// The fraction of its size, as a divisor, at which the file is decoded for a photograph of `size`: more than 1 only for JPEG
-    /// above [`DEFAULT_MAX_SIDE`], so that it takes less time. It depends on sizes alone.
+    /// The fraction of its size, as a divisor of both sides, at which the file is decoded for a photograph of `size`: more than 1 only
+    /// for JPEG above [`DEFAULT_MAX_SIDE`], so that it takes less time. It depends on sizes alone.
     fn divisor(&self, size: (u32, u32)) -> u32 {
         if !self.jpeg || self.upright.0.max(self.upright.1) <= DEFAULT_MAX_SIDE {
             return 1;
@@ -60,7 +60,8 @@ impl PhotoFile {
             let pinhole = plan.pinhole();
             (pinhole.width, pinhole.height)
         });
-        let suffices = |divisor: &u32| width / divisor >= size.0 && height / divisor >= size.1;
+        let is_whole = |divisor: u32| self.upright.0.is_multiple_of(divisor) && self.upright.1.is_multiple_of(divisor);
+        let suffices = |divisor: &u32| is_whole(*divisor) && width / divisor >= size.0 && height / divisor >= size.1;
         [8, 4, 2].into_iter().find(suffices).unwrap_or(1)
     }
 
@@ -149,13 +150,13 @@ mod tests {
         let path = folder.path().join("large.jpg");
         let wave = |v: u32, length: f32| (127.0 + 100.0 * (v as f32 / length).sin()) as u8;
         let color = |x, y| image::Rgb([wave(x, 60.0), wave(y, 90.0), wave(x + y, 150.0)]);
-        image::RgbImage::from_fn(2001, 1403, color).save(&path).unwrap();
+        image::RgbImage::from_fn(2000, 1400, color).save(&path).unwrap();
         let bent = Intrinsics {
             lens: Lens::Opencv {
                 k: [0.05, 0.0, 0.0, 0.0, 0.0, 0.0],
                 p: [0.0; 2],
             },
-            ..Intrinsics::from_fov_x(2001, 1403, 1.0)
+            ..Intrinsics::from_fov_x(2000, 1400, 1.0)
         };
         for undistortion in [None, Undistortion::plan(&bent)] {
             let photo = |jpeg: bool| PhotoFile {
@@ -163,12 +164,17 @@ mod tests {
                 mask: None,
                 orientation: Orientation::NoTransforms,
                 jpeg,
-                upright: (2001, 1403),
+                upright: (2000, 1400),
                 undistortion,
                 size: (960, 672),
             };
             let (file, whole) = (photo(true), photo(false));
             assert!([(960, 672), (480, 336), (240, 168)].map(|size| file.divisor(size)) == [2, 4, 8]);
+            let odd = PhotoFile {
+                upright: (2001, 1400),
+                ..file.clone()
+            };
+            assert_eq!(odd.divisor((240, 168)), 1);
             assert!(whole.divisor((240, 168)) == 1 && whole.is_shrunk_from_full(240, 168));
             assert!(!file.is_shrunk_from_full(480, 336) && file.is_shrunk_from_full(900, 630));
             for (width, height) in [(960, 672), (480, 336), (240, 168), (900, 630)] {

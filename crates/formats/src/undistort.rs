@@ -102,17 +102,24 @@ impl Undistortion {
     }
 
     fn apply_channels<const C: usize>(&self, from: &Pixels) -> Pixels {
-        // Pixels of the source for each of `from`; 1 at full size.
-        let step = [
+        // Pixels of the source for each of `from`, and of the whole crop for each of the result; 1 at full size.
+        let per_source = [
             f64::from(self.source.width) / f64::from(from.width),
             f64::from(self.source.height) / f64::from(from.height),
         ];
         let side = |full: u32, step: f64| ((f64::from(full) / step) as u32).max(1);
-        let (width, height) = (side(self.width, step[0]), side(self.height, step[1]));
+        let (width, height) = (side(self.width, per_source[0]), side(self.height, per_source[1]));
+        let per_result = [
+            f64::from(self.width) / f64::from(width),
+            f64::from(self.height) / f64::from(height),
+        ];
         let grid_columns = width.div_ceil(GRID) + 1;
         let grid_row = |y: u32| -> Vec<[f32; 2]> {
             (0..grid_columns)
-                .map(|column| self.source_index(column * GRID, y, step))
+                .map(|column| {
+                    let at = self.source_position(column * GRID, y, per_result);
+                    [0, 1].map(|axis| (at[axis] / per_source[axis] - 0.5) as f32)
+                })
                 .collect()
         };
         let mut data = Vec::with_capacity(width as usize * height as usize * C);
@@ -142,15 +149,13 @@ impl Undistortion {
         }
     }
 
-    /// Position in the photograph of the centre of undistorted pixel `(x, y)`, where pixel centres are integers; both have one pixel
-    /// for `step` of the source.
-    fn source_index(&self, x: u32, y: u32, step: [f64; 2]) -> [f32; 2] {
-        let at = distorted_pixel(
+    /// Position in the photograph, pixels, of the centre of undistorted pixel `(x, y)`, each `size` pixels of the crop large.
+    fn source_position(&self, x: u32, y: u32, size: [f64; 2]) -> DVec2 {
+        distorted_pixel(
             &self.source,
-            (f64::from(x) + 0.5) * step[0] + self.left as f64,
-            (f64::from(y) + 0.5) * step[1] + self.top as f64,
-        );
-        [(at.x / step[0] - 0.5) as f32, (at.y / step[1] - 0.5) as f32]
+            (f64::from(x) + 0.5) * size[0] + self.left as f64,
+            (f64::from(y) + 0.5) * size[1] + self.top as f64,
+        )
     }
 }
 

@@ -86,6 +86,8 @@ pub struct PhotoCache {
     scale: f32,
     /// Whether all training photographs fit.
     fits: bool,
+    /// Whether all of them were loaded once.
+    all_seen: bool,
     /// Whether they also fit at full size beside those of `scale`.
     keeps_full: bool,
     threads: usize,
@@ -115,6 +117,7 @@ impl PhotoCache {
             bytes: 0,
             scale: 1.0,
             fits: false,
+            all_seen: false,
             keeps_full: false,
             threads,
             ahead: 1,
@@ -130,7 +133,8 @@ impl PhotoCache {
     }
 
     /// The photograph of view `upcoming[0]` at `scale`; waits until it is loaded. The next ones are loaded meanwhile, as far as
-    /// there is room. For it, those needed last, or not at all, are evicted: none is loaded twice if all fit.
+    /// there is room; for it, those needed last, or not at all, are evicted. If all fit, none is loaded twice, and the first call
+    /// waits for all, so that a damaged file ends a run before its first step.
     ///
     /// # Errors
     /// When a photograph, this one or one loaded ahead, cannot be read.
@@ -141,10 +145,18 @@ impl PhotoCache {
         self.keep(false)?;
         self.load_ahead(upcoming);
         let started = Instant::now();
+        let mut all = self.fits && !self.all_seen && upcoming.len() == self.dataset.train.len();
         loop {
-            if let Some(photo) = self.held.get(&upcoming[0]).and_then(|held| held.prepared.clone()) {
+            let needed = if all { upcoming } else { &upcoming[..1] };
+            if needed.iter().all(|view| self.is_there(view)) {
                 self.seconds += started.elapsed().as_secs_f64();
-                return Ok(photo);
+                self.all_seen |= all;
+                return Ok(self.held[&upcoming[0]].prepared.clone().expect("it is there"));
+            }
+            if all && self.loader.is_idle() {
+                // Masks beside alpha take more than was assumed: not all fit.
+                all = false;
+                continue;
             }
             self.keep(true)?;
             self.load_ahead(upcoming);
@@ -173,6 +185,11 @@ impl PhotoCache {
         4 * k.width as usize * k.height as usize
     }
 
+    /// Whether view `view` is in memory at the current scale.
+    fn is_there(&self, view: &usize) -> bool {
+        self.held.get(view).is_some_and(|held| held.prepared.is_some())
+    }
+
     /// Bytes to reserve for loading view `view`, beyond what is in memory of it.
     fn reserved(&self, view: usize) -> usize {
         let full = if self.keeps_full { self.size(view, 1.0) } else { 0 };
@@ -198,13 +215,12 @@ impl PhotoCache {
 
     /// Queues the next photographs that are not in memory, and evicts others to make room.
     fn load_ahead(&mut self, upcoming: &[usize]) {
-        let is_there = |cache: &Self, view: &usize| cache.held.get(view).is_some_and(|held| held.prepared.is_some());
         let horizon = if self.fits {
             upcoming.len()
         } else {
             self.ahead.min(upcoming.len())
         };
-        if upcoming[..horizon].iter().all(|view| is_there(self, view)) {
+        if upcoming[..horizon].iter().all(|view| self.is_there(view)) {
             return;
         }
         let in_flight = self.loader.in_flight();
@@ -212,7 +228,7 @@ impl PhotoCache {
         let mut jobs = Vec::new();
         let last_needed = LastNeeded::new(upcoming, self.dataset.views.len());
         for (position, view) in upcoming[..horizon].iter().enumerate() {
-            if is_there(self, view) || in_flight.contains(view) && position > 0 {
+            if self.is_there(view) || in_flight.contains(view) && position > 0 {
                 continue;
             }
             let bytes = self.reserved(*view);

@@ -35,7 +35,7 @@ fn density_control_stops_at_the_memory_and_says_so() {
         )
         .success()
     };
-    let (small, large) = (train("small", "72MiB"), train("large", "1GiB"));
+    let (small, large) = (train("small", "85MiB"), train("large", "1GiB"));
     let counts = ["small", "large"].map(|run| json(&folder.path().join(run).join("report.json"))["splats"].as_u64());
     assert!(counts[0] < counts[1], "{counts:?}");
     assert!(small.stderr.contains("density control adds fewer"), "{small:#?}");

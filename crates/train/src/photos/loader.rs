@@ -122,6 +122,12 @@ impl Loader {
         std::mem::take(&mut state.done)
     }
 
+    /// Whether nothing is queued, being loaded, or waiting to be taken.
+    pub fn is_idle(&self) -> bool {
+        let state = self.0.lock();
+        state.queue.is_empty() && state.running.is_empty() && state.done.is_empty()
+    }
+
     /// Views being loaded, and those waiting to be taken.
     pub fn in_flight(&self) -> Vec<usize> {
         let state = self.0.lock();

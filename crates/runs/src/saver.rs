@@ -3,6 +3,7 @@
 
 use crate::RunFolder;
 use irradia_train::checkpoint::Checkpoint;
+use irradia_train::memory;
 use std::thread::JoinHandle;
 
 /// Copying is worth its memory for checkpoints of at least this many bytes: smaller ones are written in half a second.
@@ -20,13 +21,13 @@ pub(crate) struct Saver {
 
 impl Saver {
     /// Writes `checkpoint`. Returns its path, or nothing if it is still being written, from a copy: where it is large and memory
-    /// for the copy is free twice over.
+    /// for the copy, for which [`memory::MemoryPlan`] leaves room, is free twice over.
     ///
     /// # Errors
     /// One line.
     pub fn save(&mut self, folder: &RunFolder, checkpoint: Checkpoint) -> Result<Option<String>, String> {
         let bytes = checkpoint.bytes();
-        if bytes < BACKGROUND_FROM || available_memory().is_none_or(|free| free < 2 * bytes) {
+        if bytes < BACKGROUND_FROM || memory::free().is_none_or(|free| (free as u64) < 2 * bytes) {
             return self.save_now(folder, &checkpoint).map(Some);
         }
         self.save_behind(folder, &checkpoint);
@@ -97,13 +98,6 @@ fn write(folder: &RunFolder, checkpoint: &Checkpoint) -> Outcome {
     let path = folder.write_checkpoint(checkpoint);
     path.map(|path| (checkpoint.step, path))
         .map_err(|error| format!("no checkpoint: {error}"))
-}
-
-/// Memory that can be taken without swapping, bytes; `None` where the system does not tell.
-fn available_memory() -> Option<u64> {
-    let text = std::fs::read_to_string("/proc/meminfo").ok()?;
-    let line = text.lines().find_map(|line| line.strip_prefix("MemAvailable:"))?;
-    Some(1024 * line.trim().strip_suffix("kB")?.trim().parse::<u64>().ok()?)
 }
 
 #[cfg(test)]

@@ -19,8 +19,8 @@ const FOOTPRINT: usize = 96;
 const INTERSECTION: usize = 64;
 /// Intersections per splat: most splats are out of view or within one or two tiles.
 const INTERSECTIONS: usize = 3;
-/// Encoding a checkpoint: parameters, moments and statistics as arrays, and in the file.
-const SAVING: usize = 2 * 4 * (3 * 59 + 6);
+/// A copy of parameters, moments and statistics, from which a checkpoint is written in the background.
+const SAVING: usize = 4 * (3 * 59 + 6);
 /// A splat, in all.
 const SPLAT: usize = STATE + FOOTPRINT + INTERSECTIONS * INTERSECTION + SAVING;
 /// A pixel of the largest photograph: frame, gradients, the maps of SSIM, and the intersections of a few thousand splats per tile.
@@ -211,8 +211,13 @@ fn in_gib_above(bytes: usize) -> String {
     in_gib(bytes + (1 << 30) / 100).replace(' ', "")
 }
 
-/// Three quarters of the free memory, bytes: of the system, or of the control group if that is less. `None` where unknown.
+/// Three quarters of the free memory, bytes; `None` where unknown.
 pub fn usual_limit() -> Option<usize> {
+    Some(free()? / 4 * 3)
+}
+
+/// Memory that can be taken without swapping, bytes: of the system, or of the control group if that is less. `None` where unknown.
+pub fn free() -> Option<usize> {
     let read = |path: &str| fs::read_to_string(path).ok();
     let number = |path: &str| read(path)?.trim().parse::<u64>().ok();
     let system = read("/proc/meminfo").and_then(|text| {
@@ -222,7 +227,7 @@ pub fn usual_limit() -> Option<usize> {
     let group = number("/sys/fs/cgroup/memory.max")
         .zip(number("/sys/fs/cgroup/memory.current"))
         .map_or(u64::MAX, |(most, used)| most.saturating_sub(used));
-    usize::try_from(system.min(group) / 4 * 3).ok()
+    usize::try_from(system.min(group)).ok()
 }
 
 #[cfg(test)]

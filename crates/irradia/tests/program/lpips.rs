@@ -76,16 +76,21 @@ fn weights_are_imported_found_and_named() {
 
     let measure = |more: &str| {
         let ended = irradia(here, &format!("eval run --data data --json figures.json {more}")).success();
-        assert_eq!(ended.stderr.matches("LPIPS of ").count(), 1, "{ended:?}");
         let figures = json(&here.join("figures.json"));
+        // A second network only if none is requested.
+        let networks = if figures["unseen_lpips"].is_null() { 1 } else { 2 };
+        assert_eq!(ended.stderr.matches("LPIPS of ").count(), networks, "{ended:?}");
         let net = figures["lpips_net"].as_str().expect("a network").to_owned();
         assert!(ended.stdout.contains(&format!("LPIPS ({net}) ")), "{ended:?}");
         (net, figures["lpips"].as_f64().expect("a number"))
     };
     let (net, by_squeeze) = measure("");
     assert_eq!(net, "squeeze");
+    let both = json(&here.join("figures.json"));
     let (net, by_alex) = measure("--lpips-net alex");
     assert!(net == "alex" && by_alex != by_squeeze);
+    assert!(both["unseen_lpips_net"] == "alex" && both["unseen_lpips"] == by_alex);
+    assert!(json(&here.join("figures.json"))["unseen_lpips"].is_null());
     // A file's network is recognised by its tensors, files in a folder by name.
     assert_eq!(
         measure(&format!("--lpips {}", alex.display())),

@@ -63,6 +63,7 @@ pub use irradia_scene as scene;
 pub use irradia_synth as synth;
 pub use irradia_train as train;
 pub use journal::logged_errors;
+pub use orbit::Outlook;
 pub use provenance::{data_fingerprint, program_fingerprint};
 pub use request::{DEFAULT_RECIPE, HOW_TO_GET_LPIPS, Reading, TrainInput, TrainRequest, read_recipe};
 pub use results::write_image;

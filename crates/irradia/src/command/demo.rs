@@ -61,12 +61,13 @@ pub fn run(args: &Args) -> Result<()> {
         start.elapsed().as_secs_f64(),
         data.display()
     ));
-    train::begin(TrainInput {
+    let input = TrainInput {
         steps: Some(args.steps),
         lpips: lpips_path(None)?,
         overwrite: true,
         ..TrainInput::new(data, out.clone())
-    })?;
+    };
+    train::begin(input, None)?;
     say(format_args!(
         "the scene is {}; render an orbit of it with: irradia render {} --orbit 60 --out frames",
         out.join("scene.ply").display(),

@@ -10,6 +10,7 @@ pub mod recipe;
 mod recipe_keys;
 pub mod render;
 pub mod train;
+pub mod view;
 
 use crate::Usage;
 use crate::terminal::note;

@@ -7,6 +7,7 @@ mod bin;
 mod blend;
 mod chunk;
 mod harmonics;
+mod inspect;
 mod project;
 mod sh;
 mod view;
@@ -15,6 +16,7 @@ mod view;
 mod gradients;
 
 pub use blend::{ALPHA_MAX, TRANSMITTANCE_MIN};
+pub use inspect::{Hit, Shape};
 pub use project::{ALPHA_MIN, DILATION};
 pub use view::ViewParams;
 

@@ -139,11 +139,6 @@ impl Live {
         lock(&self.history).phase == Phase::Training
     }
 
-    /// Whether there are no more steps.
-    pub fn is_finished(&self) -> bool {
-        lock(&self.history).phase == Phase::Finished
-    }
-
     /// The next copy of the scene is taken after this time; never if `None`.
     pub fn set_due(&self, due: Option<Instant>) {
         *lock(&self.due) = due;

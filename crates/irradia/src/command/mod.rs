@@ -4,6 +4,7 @@ pub mod compare;
 pub mod demo;
 pub mod eval;
 pub mod files;
+mod film;
 pub mod lpips;
 mod progress;
 pub mod recipe;

@@ -46,13 +46,14 @@ export class Stage extends HTMLElement {
     this.handle.setAttribute("aria-label", "Border between photograph and picture");
     this.empty = el("div", { className: "empty" });
     this.prepend(this.served, this.localCanvas, this.photo, this.overlay, this.handle, this.empty);
-    this.local = new LocalRenderer(this.localCanvas, () => (this.dirty = true));
+    const local = new LocalRenderer(this.localCanvas, () => (this.dirty = true));
+    this.local = local;
     this.navigation = new Navigation(this.overlay, (x, y) => this.pickAt(x, y));
     new ResizeObserver(() => this.resize()).observe(this);
     for (const key of /** @type {const} */ (["camera", "view", "mode", "background", "clip", "drawing", "compare", "scene"])) {
       state.addEventListener(key, () => (this.dirty = true));
     }
-    state.addEventListener("scene", () => this.local.load(state.get("scene")));
+    state.addEventListener("scene", () => local.load(state.get("scene")));
     state.watch(["view", "compare", "views"], () => this.showPhoto());
     state.watch(["tool"], () => this.classList.toggle("picking", state.get("tool") !== "none"));
     state.watch(["connection", "scene"], () => this.tellEmpty());
@@ -61,7 +62,7 @@ export class Stage extends HTMLElement {
       this.dirty = true;
     });
     connection.addEventListener("picture", (event) => this.receive(/** @type {CustomEvent} */ (event).detail));
-    this.overlay.addEventListener("click", (event) => this.click(event));
+    this.overlay.addEventListener("click", (event) => this.useTool(event));
     this.handle.addEventListener("pointermove", (event) => this.dragHandle(event));
     this.handle.addEventListener("pointerdown", (event) => this.handle?.setPointerCapture(event.pointerId));
     this.handle.addEventListener("keydown", (event) => this.keyHandle(event));
@@ -207,7 +208,7 @@ export class Stage extends HTMLElement {
   }
 
   /** @param {MouseEvent} event */
-  async click(event) {
+  async useTool(event) {
     const tool = state.get("tool");
     if (tool === "none") return;
     const picked = await this.pickAt(event.offsetX, event.offsetY);

@@ -73,7 +73,7 @@ export function take(block) {
   count = Math.max(count, block.first + block.count);
 }
 
-if (typeof WorkerGlobalScope !== "undefined" && self instanceof WorkerGlobalScope) {
+if (typeof document === "undefined" && "onmessage" in globalThis) {
   self.onmessage = ({ data }) => {
     if (data.reserve !== undefined) reserve(data.reserve);
     else if (data.block) take(data.block);

@@ -23,6 +23,14 @@ const shader = async (name) => (await fetch(`page/shaders/${name}${location.sear
 export class LocalRenderer {
   works = false;
   accelerated = false;
+  /** @type {WebGL2RenderingContext | null} */
+  gl = null;
+  /** Splats of the scene, and their degree. */
+  total = 0;
+  degree = 0;
+  /** @type {{ camera: Camera, shot: any } | null} */
+  painted = null;
+  fresh = false;
   /** Splats that have arrived. */
   loaded = 0;
   version = 0;
@@ -43,7 +51,8 @@ export class LocalRenderer {
   constructor(canvas, dirty) {
     this.canvas = canvas;
     this.dirty = dirty;
-    const gl = canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false, preserveDrawingBuffer: true, powerPreference: "high-performance", xrCompatible: false });
+    const options = { alpha: false, antialias: false, depth: false, preserveDrawingBuffer: true, powerPreference: "high-performance" };
+    const gl = /** @type {WebGL2RenderingContext | null} */ (canvas.getContext("webgl2", options));
     if (!gl) return;
     this.gl = gl;
     const info = gl.getExtension("WEBGL_debug_renderer_info");

@@ -17,7 +17,7 @@ const IN_FLIGHT: usize = 2;
 const REST: Duration = Duration::from_millis(100);
 /// Wishes other than pictures that wait.
 const JOBS: usize = 4;
-/// Of a training's time that drawing may take while the camera rests: one part in this many.
+/// Between two copies of a training's scene passes this many times what a copy and its picture take.
 const AT_REST: u32 = 15;
 /// Least time between two copies of a training's scene.
 const COPIES: Duration = Duration::from_millis(700);
@@ -269,20 +269,20 @@ impl Desk {
         self.with_seat(seat, |seat| drop(seat.outbox.try_send(Out::Text(text))));
     }
 
-    /// Leaves time to a training after `seconds` of drawing; returns when the next copy of its scene, which takes `copying` seconds,
-    /// is due.
-    pub fn spare(&self, seconds: f32, copying: f32, moving: bool) -> Option<Instant> {
+    /// Leaves time to a training after `seconds` of drawing a moving camera.
+    pub fn rest(&self, seconds: f32) {
+        self.lock().rest_until = Some(Instant::now() + Duration::from_secs_f32(0.6 * seconds));
+    }
+
+    /// When the next copy of a training's scene is due, after a picture of the present one that took `seconds` and a copy that took
+    /// `copying`; never while nobody looks.
+    pub fn renewal(&self, seconds: f32, copying: f32) -> Option<Instant> {
         let mut state = self.lock();
         if state.seats.is_empty() {
             return None;
         }
-        let now = Instant::now();
-        let spent = Duration::from_secs_f32(seconds);
-        if moving {
-            state.rest_until = Some(now + spent.mul_f32(0.6));
-        }
-        let pause = (spent + Duration::from_secs_f32(copying)) * AT_REST;
-        let due = now + pause.max(COPIES);
+        let pause = Duration::from_secs_f32(seconds + copying) * AT_REST;
+        let due = Instant::now() + pause.max(COPIES);
         state.renew_after = Some(due);
         Some(due)
     }

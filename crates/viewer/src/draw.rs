@@ -18,6 +18,8 @@ const COPY_RATE: f32 = 1.5e9;
 /// Draws until the desk closes.
 pub(crate) fn draw(subject: &Subject, desk: &Desk) {
     let mut painter = Painter::default();
+    // The version whose successor has been asked for.
+    let mut renewed = 0;
     let now = || Now {
         version: subject.edition().map_or(0, |edition| edition.version),
         training: subject.live.as_ref().is_some_and(|live| live.is_training()),
@@ -30,7 +32,18 @@ pub(crate) fn draw(subject: &Subject, desk: &Desk) {
                 share,
                 moving,
                 sharp,
-            } => draw_picture(subject, desk, &mut painter, &edition, seat, &shot, share, moving, sharp),
+            } => draw_picture(
+                subject,
+                desk,
+                &mut painter,
+                &edition,
+                seat,
+                &shot,
+                share,
+                moving,
+                sharp,
+                &mut renewed,
+            ),
             Task::Pick { x, y, tag, shot } => {
                 if let Some(shot) = shot.check() {
                     let picked = painter.pick(&edition, &shot, x, y, tag);
@@ -58,6 +71,7 @@ fn draw_picture(
     share: f32,
     moving: bool,
     sharp: bool,
+    renewed: &mut u64,
 ) {
     let started = Instant::now();
     let k = shot.camera.intrinsics.scaled(share.sqrt());
@@ -103,8 +117,14 @@ fn draw_picture(
         edition.version,
     );
     if let Some(live) = &subject.live {
-        let copied = edition.scene().model.splats().map_or(0, |splats| splats.bytes());
-        live.set_due(desk.spare(seconds, copied as f32 / COPY_RATE, moving));
+        if moving {
+            desk.rest(seconds);
+        }
+        if *renewed < edition.version {
+            *renewed = edition.version;
+            let copied = edition.scene().model.splats().map_or(0, |splats| splats.bytes());
+            live.set_due(desk.renewal(seconds, copied as f32 / COPY_RATE));
+        }
     }
 }
 

@@ -22,7 +22,7 @@ impl Default for Pace {
     fn default() -> Self {
         Self {
             per_pixel: 1e-7,
-            share: 0.3,
+            share: 0.1,
         }
     }
 }

@@ -106,7 +106,7 @@ test("a live training is paused, stepped, resumed and left alone, and its bytes 
   }, step);
   await sharp(page);
   const before = await picture(page);
-  await page.screenshot({ path: join(OUT, "training-1440.png") });
+  await page.screenshot({ path: join(OUT, "training-1440-dark.jpg"), quality: 80 });
   await page.getByRole("button", { name: "Resume" }).click();
   await page.waitForFunction(async (step) => (await import("/page/js/state.js")).state.get("train").step > step + 60, step);
   // A page that closes disturbs nothing; the other one sees the scene improve.
@@ -158,14 +158,15 @@ test("an address holds the camera", async () => {
 });
 
 test("every screen at 1440 and 360 pixels", async () => {
-  const server = await serve("view", trained(), "--port", "0");
+  // SCREENS_OF names a run to take pictures of, such as that of README.md: views-1440-dark.jpg.
+  const server = await serve("view", process.env.SCREENS_OF ?? trained(), "--port", "0");
   for (const [width, height] of [[1440, 900], [360, 740]]) {
     for (const theme of ["dark", "light"]) {
       const { page, problems } = await open(browser, server.address, { width, height, theme });
       await set(page, { drawing: "served" });
       const shoot = async (name) => {
         await sharp(page);
-        await page.screenshot({ path: join(OUT, `${name}-${width}-${theme}.png`) });
+        await page.screenshot({ path: join(OUT, `${name}-${width}-${theme}.jpg`), quality: 80 });
         const wide = await page.evaluate(() => document.documentElement.scrollWidth);
         assert.ok(wide <= width, `${name} is ${wide} pixels wide`);
       };

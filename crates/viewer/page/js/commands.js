@@ -80,7 +80,10 @@ export const COMMANDS = {
   Tools: [
     { keys: "m", name: "Measure a distance", run: () => toggleTool("measure") },
     { keys: "i", name: "Inspect a splat", run: () => toggleTool("inspect") },
-    { keys: "k", name: "Set a key frame", run: () => state.set({ tab: "path", sidebar: true }) },
+    { keys: "k", name: "Set a key frame", run: () => {
+      state.set({ tab: "path" });
+      path.add(state.get("camera"));
+    } },
     { keys: " ", name: "Play the path", run: () => path.dispatchEvent(new Event("toggle")) },
     { keys: "p", name: "Pause or resume the training", run: () => train(state.get("train")?.phase === "paused" ? "resume" : "pause") },
   ],

@@ -12,6 +12,8 @@ import { state } from "./state.js";
 export const AXIS_COLORS = ["#e5736f", "#6cc08b", "#6ea8fe"];
 const EDGES = [[0, 1], [1, 2], [2, 3], [3, 0], [4, 5], [5, 6], [6, 7], [7, 4], [0, 4], [1, 5], [2, 6], [3, 7]];
 
+/** Size of a drawn camera, as a share of the scene's radius. */
+const FRUSTUM = 0.09;
 /** Depth at which lines are cut off, as a share of the scene's radius. */
 const NEAR = 0.01;
 
@@ -23,11 +25,8 @@ export function drawOverlay(context, camera, k, pixel) {
   const draw = { context, camera, k, near: NEAR * size };
   context.lineWidth = pixel;
   const inside = state.get("view");
-  if (state.get("frusta")) {
-    const scores = state.get("scores");
-    state.get("views").forEach((view, index) => {
-      if (index !== inside) drawFrustum(draw, view, 0.09 * size, colorOf(view.trained, scores.get(index)));
-    });
+  for (const { view, index } of seenFrusta(camera)) {
+    drawFrustum(draw, view, FRUSTUM * size, colorOf(view.trained, state.get("scores").get(index)), view.photo ? thumbnail(index) : null);
   }
   if (state.get("axes") && inside === null) {
     const pivot = state.get("pivot");
@@ -52,6 +51,42 @@ export function drawOverlay(context, camera, k, pixel) {
   drawPath(draw, pixel);
 }
 
+/** Cameras that are drawn: not those around the present one, which would only cover the picture; none beside a photograph.
+ * @param {Camera} camera */
+function seenFrusta(camera) {
+  if (!state.get("frusta") || state.get("compare") !== "none") return [];
+  const near = 1.5 * FRUSTUM * (state.get("scene")?.radius ?? 1);
+  const all = state.get("views").map((view, index) => ({ view, index, apart: length(subtract(view.position, camera.position)) }));
+  return all.filter(({ apart }) => apart > near).sort((a, b) => b.apart - a.apart);
+}
+
+/** The camera drawn nearest to a point of the picture, within a few pixels of it.
+ * @param {Camera} camera @param {Intrinsics} k @param {number} x @param {number} y @param {number} within @returns {number | null} */
+export function frustumAt(camera, k, x, y, within) {
+  const size = FRUSTUM * (state.get("scene")?.radius ?? 1);
+  let best = null;
+  for (const { view, index } of seenFrusta(camera)) {
+    const middle = add(view.position, scale(axes(view.rotation)[2], 0.7 * size));
+    const at = project(camera, k, middle);
+    if (at && Math.hypot(at[0] - x, at[1] - y) < Math.max(within, (0.3 * size * k.fx) / at[2])) best = index;
+  }
+  return best;
+}
+
+/** @type {Map<number, HTMLImageElement>} */
+const thumbnails = new Map();
+
+/** @param {number} index */
+function thumbnail(index) {
+  let image = thumbnails.get(index);
+  if (!image) {
+    image = new Image();
+    image.src = `view/${index}/thumbnail${location.search}`;
+    thumbnails.set(index, image);
+  }
+  return image.complete && image.naturalWidth ? image : null;
+}
+
 /** @typedef {{ context: CanvasRenderingContext2D, camera: Camera, k: Intrinsics, near: number }} Draw */
 
 /** @param {boolean} trained @param {number | null | undefined} psnr */
@@ -72,14 +107,25 @@ function line({ context, camera, k, near }, a, b) {
   context.stroke();
 }
 
-/** @param {Draw} draw @param {import("./camera.js").View} view @param {number} size @param {string} color */
-function drawFrustum(draw, view, size, color) {
+/** @param {Draw} draw @param {import("./camera.js").View} view @param {number} size @param {string} color
+ * @param {HTMLImageElement | null} image */
+function drawFrustum(draw, view, size, color, image) {
   const [right, down, ahead] = axes(view.rotation);
   const corner = (/** @type {number} */ x, /** @type {number} */ y) => {
     const offset = add(scale(right, (x - view.cx) / view.fx), scale(down, (y - view.cy) / view.fy));
     return add(view.position, scale(add(offset, ahead), size));
   };
   const corners = [corner(0, 0), corner(view.width, 0), corner(view.width, view.height), corner(0, view.height)];
+  const [a, b, , d] = corners.map((corner) => project(draw.camera, draw.k, corner));
+  if (image && a && b && d) {
+    // Three corners make an affine map; the fourth is off by the perspective, which is little over a small picture.
+    const [w, h] = [image.naturalWidth, image.naturalHeight];
+    draw.context.save();
+    draw.context.globalAlpha = 0.9;
+    draw.context.transform((b[0] - a[0]) / w, (b[1] - a[1]) / w, (d[0] - a[0]) / h, (d[1] - a[1]) / h, a[0], a[1]);
+    draw.context.drawImage(image, 0, 0);
+    draw.context.restore();
+  }
   draw.context.strokeStyle = color;
   for (const [i, from] of corners.entries()) {
     line(draw, view.position, from);

@@ -10,6 +10,9 @@ import { clamp, multiply, slerp, unit } from "./math.js";
 /** @typedef {import("./camera.js").Camera} Camera */
 /** @typedef {{ time: number, position: Vec3, rotation: Quat, fov: number }} Key */
 
+/** Seconds between key frames at first. */
+export const APART = 2;
+
 /** @param {Quat} q @returns {Quat} */
 const conjugate = ([w, x, y, z]) => [w, -x, -y, -z];
 
@@ -48,6 +51,13 @@ class Path extends EventTarget {
   get seconds() {
     const last = this.keys[this.keys.length - 1]?.time ?? 0;
     return last + (this.loop && this.keys.length > 1 ? this.closing : 0);
+  }
+
+  /** Adds a camera as the last key frame. @param {Camera} camera */
+  add({ position, rotation, fov }) {
+    const last = this.keys[this.keys.length - 1];
+    this.keys.push({ time: last ? last.time + APART : 0, position, rotation, fov });
+    this.changed();
   }
 
   changed() {

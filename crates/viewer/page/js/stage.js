@@ -5,7 +5,7 @@ import { connection } from "./connection.js";
 import { el } from "./dom.js";
 import { LocalRenderer } from "./local/renderer.js";
 import { Navigation } from "./navigation.js";
-import { drawOverlay } from "./overlay.js";
+import { drawOverlay, frustumAt } from "./overlay.js";
 import { state } from "./state.js";
 
 /** @typedef {import("./camera.js").Camera} Camera */
@@ -29,6 +29,8 @@ export class Stage extends HTMLElement {
   ids = 0;
   dirty = true;
   split = 0.5;
+  /** Where the pointer went down. */
+  pressed = { x: 0, y: 0 };
   /** Of the last second. */
   times = /** @type {number[]} */ ([]);
   /** Milliseconds from the change of the camera to the picture, newest last. */
@@ -62,6 +64,7 @@ export class Stage extends HTMLElement {
       this.dirty = true;
     });
     connection.addEventListener("picture", (event) => this.receive(/** @type {CustomEvent} */ (event).detail));
+    this.overlay.addEventListener("pointerdown", (event) => (this.pressed = { x: event.clientX, y: event.clientY }));
     this.overlay.addEventListener("click", (event) => this.useTool(event));
     this.handle.addEventListener("pointermove", (event) => this.dragHandle(event));
     this.handle.addEventListener("pointerdown", (event) => this.handle?.setPointerCapture(event.pointerId));
@@ -210,13 +213,27 @@ export class Stage extends HTMLElement {
   /** @param {MouseEvent} event */
   async useTool(event) {
     const tool = state.get("tool");
-    if (tool === "none") return;
+    if (tool === "none") {
+      const still = Math.hypot(event.clientX - this.pressed.x, event.clientY - this.pressed.y) < 4;
+      if (still) this.enterFrustum(event.offsetX, event.offsetY);
+      return;
+    }
     const picked = await this.pickAt(event.offsetX, event.offsetY);
     if (tool === "inspect") state.set({ picked });
     if (tool === "measure" && picked?.point) {
       const before = state.get("measured");
       state.set({ measured: [...(before.length >= 2 ? [] : before), picked.point] });
     }
+  }
+
+  /** Enters the view whose camera is drawn at a point of the stage. @param {number} x @param {number} y */
+  enterFrustum(x, y) {
+    const shown = this.drawsLocally ? { camera: state.get("camera"), k: this.local?.k } : this.shown;
+    if (!shown?.k) return;
+    const rect = this.frameRect;
+    const factor = shown.k.width / rect.width;
+    const index = frustumAt(shown.camera, shown.k, (x - rect.left) * factor, (y - rect.top) * factor, 14 * factor);
+    if (index !== null) this.navigation?.enter(index);
   }
 
   showPhoto() {

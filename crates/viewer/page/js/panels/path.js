@@ -1,23 +1,12 @@
 // The panel of the camera path: key frames, timing, files.
 
 import { el, row, section } from "../dom.js";
-import { path } from "../path.js";
+import { APART, path } from "../path.js";
 import { state } from "../state.js";
-
-/** Seconds between key frames at first. */
-const APART = 2;
-
-/** Adds the present camera as the last key frame. */
-export function addKey() {
-  const { position, rotation, fov } = state.get("camera");
-  const last = path.keys.at(-1);
-  path.keys.push({ time: last ? last.time + APART : 0, position, rotation, fov });
-  path.changed();
-}
 
 class PathPanel extends HTMLElement {
   connectedCallback() {
-    const add = el("button", { type: "button", className: "primary", textContent: "Add this camera", onclick: addKey });
+    const add = el("button", { type: "button", className: "primary", textContent: "Add this camera", onclick: () => path.add(state.get("camera")) });
     const views = el("button", { type: "button", textContent: "From the views", title: "Up to twelve of the views, evenly", onclick: () => this.fromViews() });
     const clear = el("button", { type: "button", textContent: "Clear", onclick: () => {
       path.keys = [];

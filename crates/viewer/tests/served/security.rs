@@ -1,5 +1,6 @@
 //! Hostile clients: refused, told once, and without effect on others.
 
+use crate::client::{SHOT, Socket, address_of, connect};
 use irradia_runs::formats::write_splats;
 use irradia_scene::GaussianCloud;
 use irradia_viewer::{Listen, Subject, Viewer};
@@ -50,18 +51,11 @@ fn serve(host: &str) -> Served {
 
 impl Served {
     fn address(&self) -> SocketAddr {
-        let host = self.viewer.address().trim_start_matches("http://");
-        let end = host.find('/').expect("a path");
-        let port = host[..end].rsplit_once(':').expect("a port").1;
-        SocketAddr::from(([127, 0, 0, 1], port.parse().expect("a number")))
+        address_of(self.viewer.address())
     }
 
     fn connect(&self) -> TcpStream {
-        let stream = TcpStream::connect(self.address()).expect("connected");
-        let limit = Some(Duration::from_secs(30));
-        stream.set_read_timeout(limit).expect("a limit");
-        stream.set_write_timeout(limit).expect("a limit");
-        stream
+        connect(self.address())
     }
 
     /// The head of the answer to a request with these lines after the first.
@@ -95,24 +89,8 @@ impl Served {
             .count()
     }
 
-    /// A page's socket after its handshake.
     fn socket(&self) -> Socket {
-        let mut stream = self.connect();
-        let request = format!(
-            "GET /socket HTTP/1.1\r\n{}\r\nOrigin: http://{}\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n\
-             Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n",
-            self.host(),
-            self.address()
-        );
-        stream.write_all(request.as_bytes()).expect("sent");
-        let mut head = Vec::new();
-        while !head.ends_with(b"\r\n\r\n") {
-            let mut byte = [0];
-            stream.read_exact(&mut byte).expect("a head");
-            head.push(byte[0]);
-        }
-        assert!(head.starts_with(b"HTTP/1.1 101"), "{}", String::from_utf8_lossy(&head));
-        Socket(stream)
+        Socket::open(self.address())
     }
 
     /// A page still gets a picture.
@@ -128,63 +106,6 @@ impl Served {
             }
         }
         panic!("no picture");
-    }
-}
-
-const SHOT: &str = r#"{"do":"shot","id":1,"position":[0,0,-4],"rotation":[1,0,0,0],"width":64,"height":48,"fx":50,"fy":50,"cx":32,"cy":24}"#;
-
-struct Socket(TcpStream);
-
-impl Socket {
-    /// Sends a masked frame; whether the connection still stood.
-    fn send(&mut self, opcode: u8, payload: &[u8]) -> bool {
-        let mut frame = vec![0x80 | opcode];
-        match payload.len() {
-            len @ ..=125 => frame.push(0x80 | len as u8),
-            len @ ..=0xffff => {
-                frame.push(0x80 | 126);
-                frame.extend((len as u16).to_be_bytes());
-            }
-            len => {
-                frame.push(0x80 | 127);
-                frame.extend((len as u64).to_be_bytes());
-            }
-        }
-        // A mask of zeros.
-        frame.extend([0; 4]);
-        frame.extend(payload);
-        self.0.write_all(&frame).is_ok()
-    }
-
-    /// The next message; `None` when the connection has ended.
-    fn receive(&mut self) -> Option<(u8, Vec<u8>)> {
-        let mut head = [0; 2];
-        self.0.read_exact(&mut head).ok()?;
-        let mut long = [0; 8];
-        let len = match head[1] & 0x7f {
-            126 => {
-                self.0.read_exact(&mut long[6..]).ok()?;
-                u64::from_be_bytes(long)
-            }
-            127 => {
-                self.0.read_exact(&mut long).ok()?;
-                u64::from_be_bytes(long)
-            }
-            len => u64::from(len),
-        };
-        let mut payload = vec![0; len as usize];
-        self.0.read_exact(&mut payload).ok()?;
-        Some((head[0] & 0xf, payload))
-    }
-
-    /// Whether the server ends the connection.
-    fn is_ended(&mut self) -> bool {
-        loop {
-            match self.receive() {
-                Some((8, _)) | None => return true,
-                Some(_) => {}
-            }
-        }
     }
 }
 

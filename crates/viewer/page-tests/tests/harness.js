@@ -20,9 +20,16 @@ process.on("exit", () => rmSync(scratch, { recursive: true, force: true }));
 /** Runs the program to its end. @param {...string} args */
 export const run = (...args) => execFileSync(PROGRAM, args, { stdio: ["ignore", "pipe", "pipe"], encoding: "utf8" });
 
+/** Programs that still serve, after a test that failed for example. @type {Set<import("node:child_process").ChildProcess>} */
+const serving = new Set();
+/** Ends them. */
+export const stopAll = () => serving.forEach((child) => child.kill("SIGKILL"));
+
 /** Starts a command that serves a page. @param {...string} args */
 export async function serve(...args) {
   const child = spawn(PROGRAM, args, { stdio: ["ignore", "pipe", "pipe"] });
+  serving.add(child);
+  child.on("exit", () => serving.delete(child));
   const lines = [];
   const address = await new Promise((resolve, reject) => {
     const read = (/** @type {Buffer} */ data) => {

@@ -4,13 +4,16 @@ import assert from "node:assert/strict";
 import { mkdirSync, readdirSync, writeFileSync } from "node:fs";
 import { join } from "node:path";
 import { after, before, test } from "node:test";
-import { browse, get, open, picture, psnr, readPng, run, scratch, serve, set, sharp } from "./harness.js";
+import { browse, get, open, picture, psnr, readPng, run, scratch, serve, set, sharp, stopAll } from "./harness.js";
 import { field, fox, random, shiny, trained } from "./scenes.js";
 
 /** @type {import("playwright-core").Browser} */
 let browser;
 before(async () => (browser = await browse()));
-after(() => browser.close());
+after(async () => {
+  stopAll();
+  await browser.close();
+});
 
 let frames = 0;
 
@@ -37,7 +40,7 @@ async function drag(page, dx, dy) {
   await sharp(page);
 }
 
-const SIZE = { width: 700, height: 500 };
+const SIZE = { width: 560, height: 400 };
 
 test("a drag changes the served picture as the renderer says", async () => {
   const scene = trained();
@@ -76,7 +79,7 @@ for (const [name, make, least] of [["a field", field, 38], ["splats with a resid
   });
 }
 
-for (const [name, make] of [["a trained scene", trained], ["random splats", () => random(20000)], ["photographs", fox]]) {
+for (const [name, make] of [["a trained scene", trained], ["random splats", () => random(4000)], ["photographs", fox]]) {
   test(`${name} drawn in the browser are those of the renderer`, async (context) => {
     const scene = make();
     if (!scene) return context.skip("SKIPPED (no ../shared)");

@@ -23,14 +23,14 @@ export function trained() {
 /** A run with a radiance field. */
 export function field() {
   const out = join(scratch, "field");
-  if (!existsSync(out)) run("train", dataset(), "--out", out, "--steps", "120", "--recipe", "hashgrid");
+  if (!existsSync(out)) run("train", dataset(), "--out", out, "--steps", "40", "--recipe", "hashgrid");
   return out;
 }
 
 /** A run whose splats have a residual field. */
 export function shiny() {
   const out = join(scratch, "shiny");
-  if (!existsSync(out)) run("train", dataset(), "--out", out, "--steps", "150", "--recipe", "shiny");
+  if (!existsSync(out)) run("train", dataset(), "--out", out, "--steps", "100", "--recipe", "shiny");
   return out;
 }
 

@@ -5,13 +5,16 @@ import { join } from "node:path";
 import { createHash } from "node:crypto";
 import { readFileSync } from "node:fs";
 import { after, before, test } from "node:test";
-import { OUT, browse, get, open, picture, psnr, run, scratch, serve, set, sharp } from "./harness.js";
+import { OUT, browse, get, open, picture, psnr, run, scratch, serve, set, sharp, stopAll } from "./harness.js";
 import { dataset, trained } from "./scenes.js";
 
 /** @type {import("playwright-core").Browser} */
 let browser;
 before(async () => (browser = await browse()));
-after(() => browser.close());
+after(async () => {
+  stopAll();
+  await browser.close();
+});
 
 const settled = (page) => sharp(page);
 

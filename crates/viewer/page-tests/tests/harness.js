@@ -64,6 +64,7 @@ export const browse = () => chromium.launch({
 export async function open(browser, address, { width = 1440, height = 900, theme = "dark", density = 1 } = {}) {
   const context = await browser.newContext({ viewport: { width, height }, colorScheme: /** @type {any} */ (theme), deviceScaleFactor: density, reducedMotion: "reduce" });
   const page = await context.newPage();
+  context.setDefaultTimeout(120000);
   const problems = [];
   page.on("pageerror", (error) => problems.push(String(error)));
   page.on("console", (message) => message.type() === "error" && !/WebSocket|ERR_CONNECTION|404/.test(message.text()) && problems.push(message.text()));

@@ -216,7 +216,7 @@ impl Desk {
                         match seat.next(at, renew_after, clock) {
                             Next::Now(task) => {
                                 state.served = id;
-                                return Some((id, task));
+                                return Some((id, *task));
                             }
                             Next::At(at) => sooner(at),
                             Next::Nothing => {}
@@ -289,7 +289,7 @@ impl Desk {
 }
 
 enum Next {
-    Now(Task),
+    Now(Box<Task>),
     At(Instant),
     Nothing,
 }
@@ -297,7 +297,7 @@ enum Next {
 impl Seat {
     fn next(&mut self, now: Now, renew_after: Option<Instant>, clock: Instant) -> Next {
         if let Some(job) = self.jobs.pop_front() {
-            return Next::Now(job);
+            return Next::Now(Box::new(job));
         }
         let picture = self.picture(now, renew_after, clock);
         if matches!(picture, Next::Now(_)) {
@@ -308,7 +308,7 @@ impl Seat {
         match self.scores.filter(|_| at_rest && self.outbox.capacity() > 2) {
             Some((view, count)) => {
                 self.scores = (view + 1 < count).then_some((view + 1, count));
-                Next::Now(Task::Score { view })
+                Next::Now(Box::new(Task::Score { view }))
             }
             None => picture,
         }
@@ -324,12 +324,12 @@ impl Seat {
         let same = self.drawn.as_ref().filter(|drawn| drawn.id == shot.id);
         let picture = |moving: bool, last: Option<f32>| {
             let (share, sharp) = self.pace.share(&shot, moving, last);
-            Next::Now(Task::Picture {
+            Next::Now(Box::new(Task::Picture {
                 shot,
                 share,
                 moving,
                 sharp,
-            })
+            }))
         };
         let rests_at = self.shot_at + REST;
         match same {

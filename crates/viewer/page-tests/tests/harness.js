@@ -92,7 +92,11 @@ export async function picture(page) {
 }
 
 /** Changes the page's state. @param {import("playwright-core").Page} page @param {object} values */
-export const set = (page, values) => page.evaluate(async (values) => (await import("/page/js/state.js")).state.set(values), values);
+export const set = (page, values) => page.evaluate(async (values) => {
+  (await import("/page/js/state.js")).state.set(values);
+  // The layout follows in the next frame, and the picture's size after it.
+  for (let i = 0; i < 3; i += 1) await new Promise(requestAnimationFrame);
+}, values);
 export const get = (page, key) => page.evaluate(async (key) => (await import("/page/js/state.js")).state.get(key), key);
 
 export const readPng = (path) => PNG.sync.read(readFileSync(path));

@@ -155,7 +155,13 @@ export class Stage extends HTMLElement {
   layOut() {
     const rect = this.frameRect;
     const style = { left: `${rect.left}px`, top: `${rect.top}px`, width: `${rect.width}px`, height: `${rect.height}px` };
-    for (const element of [this.served, this.localCanvas, this.photo]) if (element) Object.assign(element.style, style);
+    for (const element of [this.localCanvas, this.photo]) if (element) Object.assign(element.style, style);
+    if (this.served) {
+      // Until a picture of the stage's new size is here, the old one keeps its proportions; the vertical field of view stays.
+      const k = this.shown?.header ? this.shown.k : rect;
+      const width = (rect.height * k.width) / k.height;
+      Object.assign(this.served.style, style, { left: `${rect.left + (rect.width - width) / 2}px`, width: `${width}px` });
+    }
     if (this.handle && !this.handle.hidden) {
       Object.assign(this.handle.style, { left: `${rect.left + this.split * rect.width}px`, top: style.top, height: style.height });
     }

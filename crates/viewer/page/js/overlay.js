@@ -26,7 +26,7 @@ export function drawOverlay(context, camera, k, pixel) {
   context.lineWidth = pixel;
   const inside = state.get("view");
   for (const { view, index } of seenFrusta(camera)) {
-    drawFrustum(draw, view, FRUSTUM * size, colorOf(view.trained, state.get("scores").get(index)), view.photo ? thumbnail(index) : null);
+    drawFrustum(draw, view, FRUSTUM * size, colorOf(view.trained, state.get("scores").get(index)), view.photo ? thumbnails.get(index) : null);
   }
   if (state.get("axes") && inside === null) {
     const pivot = state.get("pivot");
@@ -73,19 +73,25 @@ export function frustumAt(camera, k, x, y, within) {
   return best;
 }
 
-/** @type {Map<number, HTMLImageElement>} */
-const thumbnails = new Map();
+/** Small photographs, loaded when they are first drawn. */
+class Thumbnails extends EventTarget {
+  /** @type {Map<number, HTMLImageElement>} */
+  images = new Map();
 
-/** @param {number} index */
-function thumbnail(index) {
-  let image = thumbnails.get(index);
-  if (!image) {
-    image = new Image();
-    image.src = `view/${index}/thumbnail${location.search}`;
-    thumbnails.set(index, image);
+  /** @param {number} index */
+  get(index) {
+    let image = this.images.get(index);
+    if (!image) {
+      image = new Image();
+      image.onload = () => this.dispatchEvent(new Event("load"));
+      image.src = `view/${index}/thumbnail${location.search}`;
+      this.images.set(index, image);
+    }
+    return image.complete && image.naturalWidth ? image : null;
   }
-  return image.complete && image.naturalWidth ? image : null;
 }
+
+export const thumbnails = new Thumbnails();
 
 /** @typedef {{ context: CanvasRenderingContext2D, camera: Camera, k: Intrinsics, near: number }} Draw */
 

@@ -5,7 +5,8 @@ import { connection } from "./connection.js";
 import { el } from "./dom.js";
 import { LocalRenderer } from "./local/renderer.js";
 import { Navigation } from "./navigation.js";
-import { drawOverlay, frustumAt } from "./overlay.js";
+import { drawOverlay, frustumAt, thumbnails } from "./overlay.js";
+import { path } from "./path.js";
 import { state } from "./state.js";
 
 /** @typedef {import("./camera.js").Camera} Camera */
@@ -21,13 +22,19 @@ const DENSITY = 2;
 /** Milliseconds between the two pictures of a blink. */
 const BLINK = 700;
 
+/** What lines and layout depend on. @type {(keyof import("./state.js").Values)[]} */
+const LINES = ["camera", "pivot", "view", "views", "frusta", "axes", "clip", "measured", "metres", "scores", "compare", "tab", "scene", "sidebar"];
+
 export class Stage extends HTMLElement {
   /** What is on the screen now. @type {{ camera: Camera, k: Intrinsics, header: Header | null } | null} */
   shown = null;
   /** Shots on the way, by id. @type {Map<number, { camera: Camera, k: Intrinsics, at: number }>} */
   sent = new Map();
   ids = 0;
+  /** Whether another picture is wanted. */
   dirty = true;
+  /** Whether lines and layout must be renewed. */
+  stale = true;
   split = 0.5;
   /** Where the pointer went down. */
   pressed = { x: 0, y: 0 };
@@ -55,6 +62,9 @@ export class Stage extends HTMLElement {
     for (const key of /** @type {const} */ (["camera", "view", "mode", "background", "clip", "drawing", "compare", "scene"])) {
       state.addEventListener(key, () => (this.dirty = true));
     }
+    const touch = () => (this.stale = true);
+    for (const key of LINES) state.addEventListener(key, touch);
+    for (const source of [this, path, thumbnails]) for (const kind of ["drawing", "change", "load"]) source.addEventListener(kind, touch);
     state.addEventListener("scene", () => local.load(state.get("scene")));
     state.watch(["view", "compare", "views"], () => this.showPhoto());
     state.watch(["tool"], () => this.classList.toggle("picking", state.get("tool") !== "none"));
@@ -88,7 +98,7 @@ export class Stage extends HTMLElement {
       this.overlay.width = Math.round(this.clientWidth * this.density);
       this.overlay.height = Math.round(this.clientHeight * this.density);
     }
-    this.dirty = true;
+    this.dirty = this.stale = true;
   }
 
   /** Whether this page draws. */
@@ -148,6 +158,9 @@ export class Stage extends HTMLElement {
       this.served.hidden = local;
     }
     if (local && this.local.draw(now)) this.count(now);
+    // A page at rest draws nothing.
+    if (!this.stale) return;
+    this.stale = false;
     this.layOut();
     this.drawOverlay();
   }
@@ -248,6 +261,7 @@ export class Stage extends HTMLElement {
     const compare = state.get("compare");
     const shows = Boolean(view?.photo) && (compare === "slider" || compare === "blink");
     if (!this.photo || !this.handle) return;
+    this.stale = true;
     this.photo.hidden = !shows;
     this.handle.hidden = !shows || compare !== "slider";
     clearInterval(this.blinking);
@@ -273,6 +287,7 @@ export class Stage extends HTMLElement {
   dragHandle(event) {
     if (!event.buttons) return;
     const rect = this.frameRect;
+    this.stale = true;
     this.split = Math.min(1, Math.max(0, (event.clientX - this.getBoundingClientRect().left - rect.left) / rect.width));
     this.clipPhoto();
   }
@@ -284,6 +299,7 @@ export class Stage extends HTMLElement {
     event.stopPropagation();
     event.preventDefault();
     this.split = Math.min(1, Math.max(0, this.split + by));
+    this.stale = true;
     this.clipPhoto();
   }
 }

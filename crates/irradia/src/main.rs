@@ -38,6 +38,8 @@ enum Command {
     Lpips(command::lpips::Args),
     /// Render a scene into PNG frames
     Render(command::render::Args),
+    /// Look at a scene, a run or a dataset in a browser
+    View(command::view::Args),
     /// Describe a scene, a run or a dataset
     Info(command::files::InfoArgs),
     /// Convert a scene to another file format, by extension
@@ -67,6 +69,7 @@ fn main() -> ExitCode {
         Command::Eval(args) => command::eval::run(&args),
         Command::Lpips(args) => command::lpips::run(&args),
         Command::Render(args) => command::render::run(&args),
+        Command::View(args) => command::view::run(&args),
         Command::Info(args) => command::files::info(&args),
         Command::Convert(args) => command::files::convert(&args),
         Command::Synth(args) => command::demo::synth(&args),

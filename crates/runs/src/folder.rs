@@ -20,6 +20,9 @@ pub const FIELD: &str = "field.safetensors";
 /// The residual field of a run's splats.
 pub const RESIDUAL: &str = socket::FILES[1];
 
+/// The length of a run's world unit, if it is known.
+pub const UNIT: &str = "unit.json";
+
 /// List of the views of a run's dataset.
 pub(crate) const VIEWS: &str = "views.json";
 /// From the dataset's coordinates to the world in which the run trains.
@@ -28,7 +31,7 @@ const WORLD: &str = "world.json";
 pub(crate) const PACES: &str = "pace.txt";
 
 /// The files of a run.
-const FILES: [&str; 14] = [
+const FILES: [&str; 15] = [
     "run.json",
     VIEWS,
     WORLD,
@@ -43,6 +46,7 @@ const FILES: [&str; 14] = [
     socket::FILES[2],
     "report.json",
     "report.html",
+    UNIT,
 ];
 /// The subfolders of a run.
 const FOLDERS: [&str; 2] = ["eval", "checkpoints"];
@@ -97,6 +101,12 @@ struct WorldRecord {
 /// An `f64` with the digits of an `f32`, so that files do not show digits beyond its precision.
 fn shortest(value: f32) -> f64 {
     value.to_string().parse().unwrap_or(f64::from(value))
+}
+
+/// `unit.json`
+#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
+struct Unit {
+    metres_per_unit: f64,
 }
 
 impl RunFolder {
@@ -178,6 +188,34 @@ impl RunFolder {
             reason: error.to_string(),
         })?;
         Ok((Self(path.to_owned()), record))
+    }
+
+    /// The folder of the run that contains the scene `path`, a file or the folder itself, whether it is complete or not.
+    pub fn containing(path: &Path) -> Option<Self> {
+        let folder = if path.is_dir() { path } else { path.parent()? };
+        folder.join("run.json").is_file().then(|| Self(folder.to_owned()))
+    }
+
+    /// Metres per world unit, if they have been measured.
+    pub fn metres_per_unit(&self) -> Option<f64> {
+        let unit: Unit = serde_json::from_slice(&fs::read(self.file(UNIT)).ok()?).ok()?;
+        Some(unit.metres_per_unit).filter(|metres| metres.is_finite() && *metres > 0.0)
+    }
+
+    /// Keeps the metres per world unit beside the scene.
+    ///
+    /// # Errors
+    /// When the file cannot be written, or `metres` is not a positive number.
+    pub fn set_metres_per_unit(&self, metres: f64) -> Result<(), RunError> {
+        if !(metres.is_finite() && metres > 0.0) {
+            return Err(RunError::setting("unit", metres, "must be a positive number of metres"));
+        }
+        self.write(
+            UNIT,
+            &to_json(&Unit {
+                metres_per_unit: metres,
+            }),
+        )
     }
 
     /// `run.json` of the run that contains the scene `path`, a file or a run's folder; `None` if there is none.

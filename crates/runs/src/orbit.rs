@@ -1,19 +1,27 @@
-//! Cameras on a circle around a scene.
+//! Where a scene is seen from: its centre and up axis, and cameras on a circle around it.
 
 use glam::Vec3;
 use irradia_scene::{Camera, Intrinsics, Pose};
 use irradia_splat::{Splats, init::focus_point};
 
-/// A circle around the focus of the training cameras, at their mean distance and height; for a scene without them, around
-/// the centre of the splats.
-pub(crate) fn orbit(
-    splats: Option<&Splats>,
-    cameras: Option<&[Camera]>,
-    frames: u32,
-    size: Option<(u32, u32)>,
-) -> Vec<Camera> {
-    let cameras = cameras.filter(|c| !c.is_empty());
-    let (center, up, radius, height, mut intrinsics) = match cameras {
+/// From where a scene is seen.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Outlook {
+    /// The focus of the training cameras, or the centre of the splats; world.
+    pub center: Vec3,
+    /// Unit vector, the cameras' mean up axis.
+    pub up: Vec3,
+    /// Mean distance of the cameras from the axis through the centre along `up`, world units.
+    pub radius: f32,
+    /// Mean height of the cameras above the centre, world units.
+    pub height: f32,
+    /// Intrinsic parameters of the first camera, or 1280 x 720 pixels and a field of view of one radian.
+    pub intrinsics: Intrinsics,
+}
+
+/// From the training cameras; for a scene without them, from the distribution of its splats.
+pub(crate) fn outlook(splats: Option<&Splats>, cameras: Option<&[Camera]>) -> Outlook {
+    match cameras.filter(|cameras| !cameras.is_empty()) {
         Some(cameras) => {
             let center = focus_point(cameras);
             let n = cameras.len() as f32;
@@ -24,7 +32,13 @@ pub(crate) fn orbit(
                 (offset - up * offset.dot(up)).length()
             };
             let radius = cameras.iter().map(across).sum::<f32>() / n;
-            (center, up, radius, height, cameras[0].intrinsics)
+            Outlook {
+                center,
+                up,
+                radius,
+                height,
+                intrinsics: cameras[0].intrinsics,
+            }
         }
         None => {
             let middle = |c: usize| {
@@ -41,22 +55,39 @@ pub(crate) fn orbit(
             };
             let axes = [middle(0), middle(1), middle(2)];
             let size = axes.iter().map(|a| a.1).fold(1e-3, f32::max);
-            // Most files of this kind come from COLMAP, whose y axis points down.
-            (
-                Vec3::from_array(axes.map(|a| a.0)),
-                Vec3::NEG_Y,
-                1.5 * size,
-                0.4 * size,
-                Intrinsics::from_fov_x(1280, 720, 1.0),
-            )
+            Outlook {
+                center: Vec3::from_array(axes.map(|a| a.0)),
+                // Most files of this kind come from COLMAP, whose y axis points down.
+                up: Vec3::NEG_Y,
+                radius: 1.5 * size,
+                height: 0.4 * size,
+                intrinsics: Intrinsics::from_fov_x(1280, 720, 1.0),
+            }
         }
-    };
+    }
+}
+
+/// A circle around the centre of the scene, at the training cameras' mean distance and height.
+pub(crate) fn orbit(
+    splats: Option<&Splats>,
+    cameras: Option<&[Camera]>,
+    frames: u32,
+    size: Option<(u32, u32)>,
+) -> Vec<Camera> {
+    let Outlook {
+        center,
+        up,
+        radius,
+        height,
+        mut intrinsics,
+    } = outlook(splats, cameras);
     if let Some((width, height)) = size {
         let fov_x = 2.0 * (0.5 * intrinsics.width as f32 / intrinsics.fx).atan();
         intrinsics = Intrinsics::from_fov_x(width, height, fov_x);
     }
     // The circle starts at the azimuth of the first camera.
-    let toward = cameras.map_or(up.any_orthonormal_vector(), |c| c[0].pose.position - center);
+    let first = cameras.and_then(|cameras| cameras.first());
+    let toward = first.map_or(up.any_orthonormal_vector(), |c| c.pose.position - center);
     let x = (toward - up * toward.dot(up)).normalize_or(up.any_orthonormal_vector());
     let y = up.cross(x);
     (0..frames)

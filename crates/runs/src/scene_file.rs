@@ -2,7 +2,7 @@
 
 use crate::RunError;
 use crate::folder::{FIELD, RESIDUAL, SCENE, cameras_beside, world_beside};
-use crate::orbit::orbit;
+use crate::orbit::{Outlook, orbit, outlook};
 use irradia_field::{Field, Sampler};
 use irradia_formats::read_splats;
 use irradia_scene::{Camera, Dataset, Similarity};
@@ -84,6 +84,11 @@ impl Scene {
     /// images, or 1280 x 720.
     pub fn orbit(&self, frames: u32, size: Option<(u32, u32)>) -> Vec<Camera> {
         orbit(self.model.splats(), self.cameras.as_deref(), frames, size)
+    }
+
+    /// From where the scene is seen: its centre, up axis and extent.
+    pub fn outlook(&self) -> Outlook {
+        outlook(self.model.splats(), self.cameras.as_deref())
     }
 }
 

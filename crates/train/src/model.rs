@@ -20,6 +20,26 @@ pub enum Model<'a> {
     Field(Cow<'a, Field>),
 }
 
+/// Renders the view of `camera` into the buffers of `renderer`, with the colours that `residual` adds.
+pub fn render_splats(
+    splats: &Splats,
+    residual: Option<&Field>,
+    renderer: &mut Renderer,
+    camera: &Camera,
+    options: &RenderOptions,
+) {
+    let view = ViewParams::new(camera);
+    match residual {
+        Some(field) => {
+            renderer.project(splats, &view, options);
+            let surfaces = splats.surfaces(renderer.in_view());
+            renderer.add_colors(&added_colors(field, camera.pose.position, &surfaces));
+            renderer.composite();
+        }
+        None => renderer.render(splats, &view, options),
+    }
+}
+
 /// How a [`Model`] is rendered; options that do not apply to its kind are ignored.
 pub type RenderOptions = irradia_splat::RenderOptions;
 
@@ -45,16 +65,7 @@ impl Model<'_> {
         };
         match self {
             Model::Splats { splats, residual } => {
-                let view = ViewParams::new(camera);
-                match residual {
-                    Some(field) => {
-                        renderer.project(splats, &view, options);
-                        let surfaces = splats.surfaces(renderer.in_view());
-                        renderer.add_colors(&added_colors(field, camera.pose.position, &surfaces));
-                        renderer.composite();
-                    }
-                    None => renderer.render(splats, &view, options),
-                }
+                render_splats(splats, residual.as_deref(), renderer, camera, options);
                 Frame {
                     color: image(renderer.color()),
                     alpha: renderer.alpha().to_vec(),

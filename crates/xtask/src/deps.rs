@@ -28,12 +28,7 @@ const TABLE: &[(&str, May)] = &[
             "scene", "compute", "formats", "splat", "field", "measure", "train", "synth",
         ]),
     ),
-    (
-        "viewer",
-        Import(&[
-            "scene", "compute", "splat", "field", "formats", "train", "synth", "runs",
-        ]),
-    ),
+    ("viewer", Import(&["scene", "splat", "field", "train", "runs"])),
     ("irradia", ImportAll),
     ("python", ImportAll),
     ("testkit", Import(&["scene", "compute"])),

@@ -65,13 +65,14 @@ pub fn run(args: &Args) -> Result<()> {
         data.display()
     ));
     let lpips = lpips_path(None)?;
-    train::begin(TrainInput {
+    let input = TrainInput {
         steps: Some(args.steps),
         unseen_lpips: unseen_lpips_path(None, lpips.as_ref()),
         lpips,
         overwrite: true,
         ..TrainInput::new(data, out.clone())
-    })?;
+    };
+    train::begin(input, None)?;
     say(format_args!(
         "the scene is {}; render an orbit of it with: irradia render {} --orbit 60 --out frames",
         out.join("scene.ply").display(),

@@ -4,12 +4,14 @@ pub mod compare;
 pub mod demo;
 pub mod eval;
 pub mod files;
+mod film;
 pub mod lpips;
 mod progress;
 pub mod recipe;
 mod recipe_keys;
 pub mod render;
 pub mod train;
+pub mod view;
 
 use crate::Usage;
 use crate::terminal::note;

@@ -1,16 +1,17 @@
 //! `irradia render`
 
+use super::film::{self, FilmWriter};
 use super::{DataArgs, Split, thread_count, use_threads};
 use crate::Usage;
 use crate::terminal::say;
 use anyhow::{Context, Result};
 use irradia_runs::scene::{Camera, Image};
-use irradia_runs::{Scene, file_stems, write_image};
+use irradia_runs::{Film, Scene, file_stems, write_image};
 use irradia_splat::Renderer;
 use std::path::PathBuf;
 
 #[derive(clap::Args)]
-#[command(group(clap::ArgGroup::new("cameras").required(true).args(["data", "orbit"])))]
+#[command(group(clap::ArgGroup::new("cameras").required(true).args(["data", "orbit", "path"])))]
 pub struct Args {
     /// The scene: RUN, or a file; background and filters are taken from the run that contains it
     pub scene: PathBuf,
@@ -23,10 +24,19 @@ pub struct Args {
     /// Render this number of frames on a circle around the scene instead
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=100_000))]
     pub orbit: Option<u32>,
-    /// Size of the orbit's frames; when absent that of the training images, or 1280x720
+    /// Render a camera path: a file that the viewer or nerfstudio saved, or orbit, spiral or training (through the cameras)
+    #[arg(long, value_name = "FILE|orbit|spiral|training")]
+    pub path: Option<PathBuf>,
+    /// Frames of --path orbit, spiral and training
+    #[arg(long, value_name = "N", default_value_t = 120, value_parser = clap::value_parser!(u32).range(1..=100_000))]
+    pub frames: u32,
+    /// Frames per second of a film; when absent those of the path, or 30
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=240))]
+    pub fps: Option<u32>,
+    /// Size of the frames of --orbit and --path; when absent that of the training images, or 1280x720
     #[arg(long, value_name = "WxH", value_parser = parse_size, conflicts_with = "data")]
     pub size: Option<(u32, u32)>,
-    /// Folder for the frames
+    /// Folder for the frames; with --orbit or --path also a film: .mp4 and .webm with ffmpeg, .gif without
     #[arg(long)]
     pub out: PathBuf,
     /// Also write depth: NAME.depth.png, near is bright, one range for all frames
@@ -54,22 +64,68 @@ pub fn run(args: &Args) -> Result<()> {
     use_threads(args.threads)?;
     let mut scene = Scene::read(&args.scene)?;
     scene.options.depth = args.depth;
-    let cameras: Vec<(String, Camera)> = match (&args.data, args.orbit) {
-        (Some(data), _) => {
-            let dataset = scene.place(args.reading.read(data)?);
-            let stems = file_stems(dataset.views.iter().map(|view| view.name.as_str()));
-            let views = args.split.of(&dataset);
-            views
-                .iter()
-                .map(|i| (stems[*i].clone(), dataset.views[*i].camera))
-                .collect()
+    if let Some(film) = film(args, &scene)? {
+        if film::kind(&args.out).is_some() {
+            return write_film(args, &scene, &film);
         }
-        (None, Some(frames)) => {
-            let cameras = scene.orbit(frames, args.size).into_iter().enumerate();
-            cameras.map(|(i, camera)| (format!("frame_{i:04}"), camera)).collect()
+        let cameras = film.cameras.into_iter().enumerate();
+        return write_frames(
+            args,
+            &scene,
+            cameras.map(|(i, camera)| (format!("frame_{i:04}"), camera)).collect(),
+        );
+    }
+    let data = args.data.as_ref().expect("clap requires one of them");
+    let dataset = scene.place(args.reading.read(data)?);
+    let stems = file_stems(dataset.views.iter().map(|view| view.name.as_str()));
+    let views = args.split.of(&dataset).into_iter();
+    write_frames(
+        args,
+        &scene,
+        views.map(|i| (stems[i].clone(), dataset.views[i].camera)).collect(),
+    )
+}
+
+/// The cameras of --orbit and --path.
+fn film(args: &Args, scene: &Scene) -> Result<Option<Film>> {
+    if let Some(frames) = args.orbit {
+        return Ok(Some(Film::orbit(scene, frames, args.size)));
+    }
+    let Some(path) = &args.path else { return Ok(None) };
+    let film = match path.to_str() {
+        Some("orbit") => Film::orbit(scene, args.frames, args.size),
+        Some("spiral") => Film::spiral(scene, args.frames, args.size),
+        Some("training") => {
+            let film = Film::training(scene, args.frames, args.size);
+            film.ok_or_else(|| Usage("--path training: the cameras of this scene are not known".into()))?
         }
-        (None, None) => unreachable!("clap requires one of them"),
+        _ => {
+            let k = scene.outlook().intrinsics;
+            Film::read(path, args.size.unwrap_or((k.width, k.height)))?
+        }
     };
+    Ok(Some(film))
+}
+
+fn write_film(args: &Args, scene: &Scene, film: &Film) -> Result<()> {
+    if args.depth || args.alpha {
+        return Err(Usage("depth and alpha are written as frames: name a folder with --out".into()).into());
+    }
+    let Some(first) = film.cameras.first() else {
+        return Err(Usage("nothing to render: the path is empty".into()).into());
+    };
+    let k = first.intrinsics;
+    let fps = args.fps.map_or(film.fps, |fps| fps as f32);
+    let mut writer = FilmWriter::begin(&args.out, (k.width, k.height), fps)?;
+    let mut renderer = Renderer::new();
+    for camera in &film.cameras {
+        writer.add(&scene.model.render(&mut renderer, camera, &scene.options).color)?;
+    }
+    writer.finish()?;
+    say(format_args!("{} frames in {}", film.cameras.len(), args.out.display()))
+}
+
+fn write_frames(args: &Args, scene: &Scene, cameras: Vec<(String, Camera)>) -> Result<()> {
     if cameras.is_empty() {
         return Err(Usage("nothing to render: no such views".into()).into());
     }

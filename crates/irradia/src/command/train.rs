@@ -2,12 +2,14 @@
 
 use super::lpips::{self, lpips_path, unseen_lpips_path};
 use super::progress::{Progress, size_in_words};
+use super::view::ListenArgs;
 use super::{DataArgs, by_option, thread_count, use_threads, warn};
 use crate::interrupt::stop_flag;
 use crate::terminal::{note, one_line, say};
 use anyhow::{Result, anyhow};
 use clap::builder::RangedU64ValueParser;
 use irradia_runs::{Background, DEFAULT_RECIPE, Finished, Run, RunError, RunFolder, TrainInput};
+use irradia_train::event::Observer;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::Ordering;
 
@@ -64,8 +66,20 @@ pub struct Args {
     /// absent white for Blender scenes and the recipe's own for others
     #[arg(long, value_name = "COLOR", conflicts_with = "resume")]
     pub background: Option<Background>,
+    /// Serve a page on which the training can be looked at and paused; see irradia view
+    #[arg(long)]
+    pub view: bool,
+    #[command(flatten)]
+    pub listen: ListenArgs,
     #[command(flatten)]
     pub reading: DataArgs,
+}
+
+impl Args {
+    /// Where to serve a viewer, if one is requested.
+    fn viewer(&self) -> Option<&ListenArgs> {
+        (self.view || self.listen.open).then_some(&self.listen)
+    }
 }
 
 /// `8GiB`, `8G`, `512MiB`, `512M` or a number of bytes.
@@ -109,8 +123,8 @@ pub fn run(args: &Args) -> Result<()> {
     use_threads(args.threads)?;
     match (&args.resume, &args.replay) {
         (Some(run), _) => resume(run, args),
-        (None, Some(run)) => begin(replay(run, args)?),
-        (None, None) => begin(input(args)?),
+        (None, Some(run)) => begin(replay(run, args)?, args.viewer()),
+        (None, None) => begin(input(args)?, args.viewer()),
     }
 }
 
@@ -156,8 +170,8 @@ fn input(args: &Args) -> Result<TrainInput> {
     })
 }
 
-/// Begins a new run on the current threads, and finishes it.
-pub fn begin(input: TrainInput) -> Result<()> {
+/// Begins a new run on the current threads, and finishes it; `viewer` shows it meanwhile.
+pub fn begin(input: TrainInput, viewer: Option<&ListenArgs>) -> Result<()> {
     let request = input.check().map_err(by_option)?;
     RunFolder::check_free(&request.input().out, request.input().overwrite)?;
     let dataset = request.read_dataset()?;
@@ -165,7 +179,7 @@ pub fn begin(input: TrainInput) -> Result<()> {
     warn(&request.warnings());
     let run = Run::begin_on(request, dataset).map_err(by_option)?;
     note(format_args!("background: {}", run.background()));
-    finish(run)
+    finish(run, viewer)
 }
 
 fn resume(folder: &Path, args: &Args) -> Result<()> {
@@ -194,20 +208,27 @@ fn resume(folder: &Path, args: &Args) -> Result<()> {
     warn(&request.warnings());
     let run = Run::resume_on(request, dataset)?;
     note(format_args!("resuming at step {}", run.trainer().clock.step));
-    finish(run)
+    finish(run, args.viewer())
 }
 
 /// Trains, writes all results, and prints a summary.
-fn finish(mut run: Run) -> Result<()> {
+fn finish(mut run: Run, viewer: Option<&ListenArgs>) -> Result<()> {
     let folder = run.folder().path().to_owned();
     if let (Some(lpips), Some(path)) = (&run.trainer().options.lpips, &run.request().input().lpips) {
         lpips::tell(lpips, path);
     }
     note(&run.trainer().memory);
     let stop = stop_flag();
-    let trained = run.train(&mut [&mut Progress::new(stop.clone())]);
+    let mut watched = viewer.map(|listen| listen.watch(&run)).transpose()?;
+    let mut progress = Progress::new(stop.clone());
+    let mut observers: Vec<&mut dyn Observer> = vec![&mut progress];
+    if let Some((_, watcher)) = &mut watched {
+        observers.extend(watcher.observers());
+    }
+    let trained = run.train(&mut observers);
     // If Ctrl-C ended the steps, a second one ends the evaluation.
     let stopped = stop.load(Ordering::Relaxed);
+    let asked = stop.clone();
     let stop = || !stopped && stop.load(Ordering::Relaxed);
     let finished = trained.and_then(|_| run.finish_unless(&stop));
     if matches!(finished, Err(RunError::EvaluationStopped)) {
@@ -224,7 +245,12 @@ fn finish(mut run: Run) -> Result<()> {
             folder.display()
         )
     })?;
-    tell(&finished)
+    tell(&finished)?;
+    if let Some((viewer, _)) = watched.filter(|(viewer, _)| viewer.is_watched() && !stopped) {
+        note("the pages stay until they are closed, or Ctrl-C");
+        viewer.wait_while_watched(&|| asked.load(Ordering::Relaxed));
+    }
+    Ok(())
 }
 
 fn tell(finished: &Finished) -> Result<()> {

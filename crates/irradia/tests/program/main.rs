@@ -3,6 +3,7 @@
 mod bad_input;
 mod compare;
 mod field;
+mod film;
 mod lpips;
 mod memory;
 mod outputs;

@@ -9,6 +9,7 @@ mod chunk;
 mod cull;
 mod develop;
 mod harmonics;
+mod inspect;
 mod project;
 mod sh;
 mod touch;
@@ -20,6 +21,7 @@ mod gradients;
 pub use blend::{ALPHA_MAX, TRANSMITTANCE_MIN};
 pub use cull::ChunkBounds;
 pub use harmonics::CHUNK;
+pub use inspect::{Hit, Shape};
 pub use project::{ALPHA_MIN, DILATION};
 pub use view::ViewParams;
 

@@ -1,0 +1,54 @@
+//! Camera paths and films, and the viewer's command line.
+
+use crate::process::*;
+use std::fs;
+use std::net::TcpListener;
+
+#[test]
+fn paths_become_frames_and_films() {
+    let folder = with_run();
+    for path in ["orbit", "spiral", "training"] {
+        let out = format!("render run --path {path} --frames 3 --size 40x30 --out {path}");
+        irradia(folder.path(), &out).success();
+        let frames = files_under(&folder.path().join(path));
+        assert_eq!(frames.len(), 3, "{frames:?}");
+        let first = fs::read(&frames[0]).expect("a frame");
+        assert_ne!(first, fs::read(&frames[1]).expect("a frame"), "{path} moves");
+    }
+    irradia(
+        folder.path(),
+        "render run --path spiral --frames 4 --size 41x30 --fps 10 --out film.gif",
+    )
+    .success();
+    let film = fs::read(folder.path().join("film.gif")).expect("a film");
+    // Width and height, little endian, after the signature.
+    assert_eq!((&film[..6], &film[6..10]), (&b"GIF89a"[..], &[41, 0, 30, 0][..]));
+}
+
+#[test]
+fn paths_that_cannot_be_followed_are_refused_in_one_line() {
+    let folder = with_run();
+    fs::write(folder.path().join("path.json"), "{\"camera_path\": 3}").expect("written");
+    for (command, code, parts) in [
+        ("render run --path none.json --out x", 1, &["none.json"][..]),
+        ("render run --path path.json --out x", 1, &["path.json"]),
+        ("render run --path orbit --frames 0 --out x", 2, &["--frames"]),
+        ("render run --path orbit --depth --out x.gif", 2, &["depth"]),
+        ("render run --orbit 3 --path orbit --out x", 2, &["--path"]),
+    ] {
+        irradia(folder.path(), command).refused(code, parts);
+    }
+}
+
+#[test]
+fn what_cannot_be_viewed_is_refused_in_one_line() {
+    let folder = with_run();
+    fs::remove_file(folder.path().join("run/scene.ply")).expect("removed");
+    irradia(folder.path(), "view run").refused(1, &["run", "no scene yet", "--resume"]);
+    irradia(folder.path(), "view nowhere.ply").refused(1, &["nowhere.ply"]);
+    // A host of another machine.
+    let taken = TcpListener::bind("127.0.0.1:0").expect("a port");
+    let port = taken.local_addr().expect("bound").port();
+    let command = format!("view data --host 192.0.2.1 --port {port}");
+    irradia(folder.path(), &command).refused(1, &["192.0.2.1", "--host"]);
+}

@@ -1,0 +1,471 @@
+//! Camera paths: key frames with smooth cameras between them, and ready-made paths around a scene. The page of the viewer has a
+//! twin (`crates/viewer/page/js/path.js`), and saves the files that are read here.
+//!
+//! Positions and fields of view follow a Catmull-Rom spline whose tangents are the differences of the neighbours over their
+//! times; rotations are interpolated by squad (Shoemake, "Quaternion calculus and fast animation", 1987).
+
+use crate::{RunError, Scene};
+use glam::{Mat3, Quat, Vec3};
+use irradia_scene::{Camera, Intrinsics, Pose};
+use serde::{Deserialize, Serialize};
+use std::f32::consts::TAU;
+use std::fs;
+use std::path::Path;
+
+/// Frames of a path at most.
+const MAX_FRAMES: usize = 100_000;
+/// Range of frames per second.
+const FPS: std::ops::RangeInclusive<f32> = 0.1..=240.0;
+
+/// A camera at a time.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct PathKey {
+    /// Seconds from the start.
+    pub time: f32,
+    /// Camera centre, world.
+    pub position: [f32; 3],
+    /// World from camera (x right, y down, z forward): w, x, y, z.
+    pub rotation: [f32; 4],
+    /// Vertical field of view, radians.
+    pub fov: f32,
+}
+
+/// Key frames in the order of their times, the first at 0.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct CameraPath {
+    /// Version of the file, 1.
+    irradia_path: u32,
+    /// Frames per second.
+    pub fps: f32,
+    /// Whether the last key is followed by the first one.
+    #[serde(rename = "loop")]
+    pub loops: bool,
+    /// Whether it starts and ends slowly; a loop does not.
+    pub ease: bool,
+    /// Seconds from the last key to the first one of a loop.
+    pub closing: f32,
+    /// At least one.
+    pub keys: Vec<PathKey>,
+}
+
+/// A camera-path file of nerfstudio: a camera per frame.
+#[derive(Deserialize)]
+struct Nerfstudio {
+    #[serde(default)]
+    fps: Option<f32>,
+    camera_path: Vec<NerfstudioCamera>,
+}
+
+#[derive(Deserialize)]
+struct NerfstudioCamera {
+    /// Row-major 4 x 4, OpenGL's axes (x right, y up, z backward).
+    camera_to_world: Vec<f32>,
+    /// Vertical, degrees.
+    fov: f32,
+}
+
+/// The cameras of every frame, and frames per second.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Film {
+    /// In order.
+    pub cameras: Vec<Camera>,
+    /// Frames per second.
+    pub fps: f32,
+}
+
+impl Film {
+    /// Reads a path that the viewer has saved, or a `camera_path.json` of nerfstudio in the coordinates of the scene; frames have
+    /// `width` x `height` pixels.
+    ///
+    /// # Errors
+    /// When the file cannot be read or is no such path.
+    pub fn read(path: &Path, (width, height): (u32, u32)) -> Result<Self, RunError> {
+        let text = fs::read_to_string(path).map_err(RunError::io("read", path))?;
+        let wrong = |reason: &str| RunError::Damaged {
+            path: path.to_owned(),
+            reason: reason.to_owned(),
+        };
+        let value: serde_json::Value =
+            serde_json::from_str(&text).map_err(|error| wrong(&format!("no camera path: {error}")))?;
+        if value.get("camera_path").is_some() {
+            let file: Nerfstudio = serde_json::from_value(value).map_err(|error| wrong(&error.to_string()))?;
+            let cameras: Option<Vec<Camera>> = file
+                .camera_path
+                .iter()
+                .take(MAX_FRAMES)
+                .map(|c| c.camera(width, height))
+                .collect();
+            let cameras = cameras.filter(|cameras| !cameras.is_empty());
+            return Ok(Self {
+                cameras: cameras.ok_or_else(|| wrong("a camera of the path is not a pose with a field of view"))?,
+                fps: file.fps.filter(|fps| FPS.contains(fps)).unwrap_or(30.0),
+            });
+        }
+        let path: CameraPath =
+            serde_json::from_value(value).map_err(|error| wrong(&format!("no camera path: {error}")))?;
+        path.check().map_err(wrong)?;
+        Ok(path.film((width, height)))
+    }
+
+    /// `frames` cameras on a circle around the scene.
+    pub fn orbit(scene: &Scene, frames: u32, size: Option<(u32, u32)>) -> Self {
+        Self {
+            cameras: scene.orbit(frames, size),
+            fps: 30.0,
+        }
+    }
+
+    /// `frames` cameras on two turns of an elliptic spiral about the training cameras' mean, looking at the scene's centre: the path
+    /// of LLFF (Mildenhall et al. 2019) for forward-facing captures.
+    pub fn spiral(scene: &Scene, frames: u32, size: Option<(u32, u32)>) -> Self {
+        let outlook = scene.outlook();
+        let around = scene.orbit(32, None);
+        let cameras = scene
+            .cameras
+            .as_deref()
+            .filter(|cameras| cameras.len() > 1)
+            .unwrap_or(&around);
+        let center = cameras.iter().map(|c| c.pose.position).sum::<Vec3>() / cameras.len() as f32;
+        let pose = Pose::look_at(center, outlook.center, outlook.up);
+        // The 90th percentile of the cameras' offsets along each axis of the mean camera.
+        let radius = |axis: Vec3| {
+            let axis = pose.rotation * axis;
+            let mut offsets: Vec<f32> = cameras
+                .iter()
+                .map(|c| (c.pose.position - center).dot(axis).abs())
+                .collect();
+            offsets.sort_unstable_by(f32::total_cmp);
+            offsets[(offsets.len() * 9 / 10).min(offsets.len() - 1)]
+        };
+        let radii = Vec3::new(radius(Vec3::X), radius(Vec3::Y), radius(Vec3::Z)) * 0.7;
+        let intrinsics = sized(outlook.intrinsics, size);
+        let camera = |i: u32| {
+            let angle = 2.0 * TAU * i as f32 / frames as f32;
+            let offset = Vec3::new(angle.cos(), -angle.sin(), -(0.5 * angle).sin()) * radii;
+            let eye = center + pose.rotation * offset;
+            Camera::new(Pose::look_at(eye, outlook.center, outlook.up), intrinsics)
+        };
+        Self {
+            cameras: (0..frames).map(camera).collect(),
+            fps: 30.0,
+        }
+    }
+
+    /// `frames` cameras on a smooth loop through the training cameras, in the order of their names; `None` if there are none.
+    pub fn training(scene: &Scene, frames: u32, size: Option<(u32, u32)>) -> Option<Self> {
+        let cameras = scene.cameras.as_deref().filter(|cameras| !cameras.is_empty())?;
+        let key = |(i, camera): (usize, &Camera)| {
+            let (k, q) = (&camera.intrinsics, camera.pose.rotation);
+            PathKey {
+                time: i as f32,
+                position: camera.pose.position.to_array(),
+                rotation: [q.w, q.x, q.y, q.z],
+                fov: 2.0 * (0.5 * k.height as f32 / k.fy).atan(),
+            }
+        };
+        let path = CameraPath {
+            irradia_path: 1,
+            fps: 30.0,
+            loops: true,
+            ease: false,
+            closing: 1.0,
+            keys: cameras.iter().enumerate().map(key).collect(),
+        };
+        let (width, height) = size.unwrap_or((cameras[0].intrinsics.width, cameras[0].intrinsics.height));
+        let at = |i: u32| path.camera(path.seconds() * i as f32 / frames as f32, width, height);
+        Some(Self {
+            cameras: (0..frames).map(at).collect(),
+            fps: path.fps,
+        })
+    }
+}
+
+/// Intrinsics of another size with the same horizontal field of view.
+fn sized(k: Intrinsics, size: Option<(u32, u32)>) -> Intrinsics {
+    size.map_or(k, |(width, height)| {
+        Intrinsics::from_fov_x(width, height, 2.0 * (0.5 * k.width as f32 / k.fx).atan())
+    })
+}
+
+impl NerfstudioCamera {
+    fn camera(&self, width: u32, height: u32) -> Option<Camera> {
+        let m = &self.camera_to_world;
+        if m.len() < 12 || m.iter().any(|v| !v.is_finite()) || !(self.fov > 0.0 && self.fov < 180.0) {
+            return None;
+        }
+        let column = |c: usize| Vec3::new(m[c], m[4 + c], m[8 + c]);
+        let [x, y, z] = [column(0), -column(1), -column(2)].map(Vec3::normalize_or_zero);
+        let pose = Pose {
+            rotation: Quat::from_mat3(&Mat3::from_cols(x, y, z)).normalize(),
+            position: column(3),
+        };
+        pose.is_valid()
+            .then(|| seen(pose, self.fov.to_radians(), width, height))
+    }
+}
+
+/// A camera with square pixels and a vertical field of view.
+fn seen(pose: Pose, fov: f32, width: u32, height: u32) -> Camera {
+    let mut k = Intrinsics::from_fov_x(width, height, 1.0);
+    let focal = 0.5 * height as f32 / (0.5 * fov).tan();
+    (k.fx, k.fy) = (focal, focal);
+    Camera::new(pose, k)
+}
+
+impl CameraPath {
+    /// What is wrong with it.
+    fn check(&self) -> Result<(), &'static str> {
+        let finite = |key: &PathKey| {
+            let numbers = [key.time, key.fov].into_iter().chain(key.position).chain(key.rotation);
+            numbers.into_iter().all(f32::is_finite) && key.rotation.iter().any(|v| *v != 0.0)
+        };
+        if self.irradia_path != 1 {
+            return Err("this version of camera paths is not known");
+        }
+        if self.keys.is_empty() || !self.keys.iter().all(finite) {
+            return Err("a key frame is not a pose, or there is none");
+        }
+        if !self
+            .keys
+            .iter()
+            .all(|key| key.fov > 0.0 && key.fov < std::f32::consts::PI)
+        {
+            return Err("a field of view must be above 0 and below pi");
+        }
+        if self.keys[0].time != 0.0 || self.keys.windows(2).any(|pair| pair[0].time > pair[1].time) {
+            return Err("the times of key frames must grow from 0");
+        }
+        if !FPS.contains(&self.fps) || !(0.0..1e6).contains(&self.closing) {
+            return Err("frames per second must be 0.1 to 240, and closing seconds");
+        }
+        if self.seconds() * self.fps > MAX_FRAMES as f32 {
+            return Err("it has more than 100,000 frames");
+        }
+        Ok(())
+    }
+
+    /// Length in seconds.
+    pub fn seconds(&self) -> f32 {
+        let last = self.keys.last().map_or(0.0, |key| key.time);
+        last + if self.loops && self.keys.len() > 1 {
+            self.closing
+        } else {
+            0.0
+        }
+    }
+
+    /// Every frame; a loop's last frame leads to its first.
+    fn film(&self, (width, height): (u32, u32)) -> Film {
+        let steps = (self.seconds() * self.fps).round() as usize;
+        let frames = if self.loops { steps.max(1) } else { steps + 1 };
+        Film {
+            cameras: (0..frames)
+                .map(|i| self.camera(i as f32 / self.fps, width, height))
+                .collect(),
+            fps: self.fps,
+        }
+    }
+
+    /// The camera after `seconds`, with frames of `width` x `height` pixels.
+    pub fn camera(&self, seconds: f32, width: u32, height: u32) -> Camera {
+        let PathKey {
+            position,
+            rotation,
+            fov,
+            ..
+        } = self.at(seconds);
+        let [w, x, y, z] = rotation;
+        let pose = Pose {
+            rotation: Quat::from_xyzw(x, y, z, w).normalize(),
+            position: Vec3::from_array(position),
+        };
+        seen(pose, fov, width, height)
+    }
+
+    /// The interpolated key after `seconds`.
+    pub fn at(&self, seconds: f32) -> PathKey {
+        let (keys, n) = (&self.keys, self.keys.len() as isize);
+        if n == 1 {
+            return keys[0];
+        }
+        let total = self.seconds();
+        let along = seconds.clamp(0.0, total) / total.max(1e-9);
+        let eased = if self.ease && !self.loops {
+            along * along * (3.0 - 2.0 * along)
+        } else {
+            along
+        };
+        let time = eased * total;
+        let mut i = keys.partition_point(|key| key.time <= time) as isize - 1;
+        i = if self.loops { i.max(0) } else { i.clamp(0, n - 2) };
+        let key = |j: isize| -> PathKey {
+            if !self.loops {
+                return keys[j.clamp(0, n - 1) as usize];
+            }
+            let mut key = keys[j.rem_euclid(n) as usize];
+            key.time += j.div_euclid(n) as f32 * total;
+            key
+        };
+        let [k0, k1, k2, k3] = [key(i - 1), key(i), key(i + 1), key(i + 2)];
+        let span = (k2.time - k1.time).max(1e-9);
+        let t = ((time - k1.time) / span).clamp(0.0, 1.0);
+        let spline = |value: &dyn Fn(&PathKey) -> f32| {
+            let [p0, p1, p2, p3] = [&k0, &k1, &k2, &k3].map(value);
+            let m1 = span * (p2 - p0) / (k2.time - k0.time).max(1e-9);
+            let m2 = span * (p3 - p1) / (k3.time - k1.time).max(1e-9);
+            let (t2, t3) = (t * t, t * t * t);
+            (2.0 * t3 - 3.0 * t2 + 1.0) * p1 + (t3 - 2.0 * t2 + t) * m1 + (3.0 * t2 - 2.0 * t3) * p2 + (t3 - t2) * m2
+        };
+        let unit = |key: &PathKey| {
+            let [w, x, y, z] = key.rotation;
+            Quat::from_xyzw(x, y, z, w).normalize()
+        };
+        let near = |a: Quat, b: Quat| if a.dot(b) < 0.0 { -b } else { b };
+        let q1 = unit(&k1);
+        let (q0, q2) = (near(q1, unit(&k0)), near(q1, unit(&k2)));
+        let q3 = near(q2, unit(&k3));
+        let inner = |before: Quat, q: Quat, after: Quat| {
+            let (a, b) = (
+                log(q.conjugate() * near(q, after)),
+                log(q.conjugate() * near(q, before)),
+            );
+            q * exp(-(a + b) / 4.0)
+        };
+        let rotation = slerp(
+            slerp(q1, q2, t),
+            slerp(inner(q0, q1, q2), inner(q1, q2, q3), t),
+            2.0 * t * (1.0 - t),
+        );
+        PathKey {
+            time: seconds,
+            position: [0, 1, 2].map(|c| spline(&|key: &PathKey| key.position[c])),
+            rotation: [rotation.w, rotation.x, rotation.y, rotation.z],
+            fov: spline(&|key: &PathKey| key.fov),
+        }
+    }
+}
+
+/// Axis times half the angle of a unit quaternion.
+fn log(q: Quat) -> Vec3 {
+    let axis = Vec3::new(q.x, q.y, q.z);
+    let sine = axis.length();
+    if sine < 1e-9 {
+        Vec3::ZERO
+    } else {
+        axis * (sine.atan2(q.w) / sine)
+    }
+}
+
+/// The inverse of [`log`].
+fn exp(v: Vec3) -> Quat {
+    let angle = v.length();
+    let axis = if angle < 1e-9 { v } else { v * (angle.sin() / angle) };
+    Quat::from_xyzw(axis.x, axis.y, axis.z, angle.cos())
+}
+
+/// Spherical interpolation along the shorter way.
+fn slerp(a: Quat, b: Quat, t: f32) -> Quat {
+    let cosine = a.dot(b);
+    let (b, cosine) = if cosine < 0.0 { (-b, -cosine) } else { (b, cosine) };
+    let (from, to) = if cosine < 0.9995 {
+        let angle = cosine.acos();
+        (((1.0 - t) * angle).sin() / angle.sin(), (t * angle).sin() / angle.sin())
+    } else {
+        (1.0 - t, t)
+    };
+    (a * from + b * to).normalize()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn path(loops: bool) -> CameraPath {
+        let key = |i: usize| {
+            let q = Quat::from_rotation_y(0.4 * i as f32) * Quat::from_rotation_x(0.1 * (i * i) as f32);
+            PathKey {
+                time: 1.5 * i as f32,
+                position: [i as f32, (i * i) as f32 * 0.5, -(i as f32)],
+                rotation: [q.w, q.x, q.y, q.z],
+                fov: 0.8 + 0.1 * i as f32,
+            }
+        };
+        CameraPath {
+            irradia_path: 1,
+            fps: 10.0,
+            loops,
+            ease: false,
+            closing: 2.0,
+            keys: (0..4).map(key).collect(),
+        }
+    }
+
+    #[test]
+    fn keys_are_met_and_the_way_between_is_smooth() {
+        for loops in [false, true] {
+            let path = path(loops);
+            for key in &path.keys {
+                let at = path.at(key.time);
+                assert!(
+                    (0..3).all(|c| (at.position[c] - key.position[c]).abs() < 1e-4),
+                    "{at:?}"
+                );
+                let dot: f32 = at.rotation.iter().zip(key.rotation).map(|(a, b)| a * b).sum();
+                assert!(dot.abs() > 0.99999 && (at.fov - key.fov).abs() < 1e-4);
+            }
+            let step = 0.01;
+            let velocity = |time: f32| (path.at(time + step).position[1] - path.at(time).position[1]) / step;
+            for key in &path.keys[1..3] {
+                // No kink: the velocity on both sides of a key is the same.
+                assert!((velocity(key.time) - velocity(key.time - step)).abs() < 0.1);
+            }
+        }
+        let looped = path(true);
+        let (start, end) = (looped.at(0.0), looped.at(looped.seconds()));
+        assert!((0..3).all(|c| (start.position[c] - end.position[c]).abs() < 1e-3));
+    }
+
+    #[test]
+    fn files_of_the_viewer_and_of_nerfstudio_are_read() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let file = folder.path().join("path.json");
+        let write = |text: &str| fs::write(&file, text).expect("written");
+        write(&serde_json::to_string(&path(false)).expect("plain data"));
+        let film = Film::read(&file, (64, 48)).expect("a path");
+        assert_eq!((film.cameras.len(), film.fps), (46, 10.0));
+        write(
+            r#"{"fps": 24, "render_width": 5, "camera_path": [
+                {"camera_to_world": [1,0,0,3, 0,1,0,4, 0,0,1,5, 0,0,0,1], "fov": 90, "aspect": 1.5}]}"#,
+        );
+        let film = Film::read(&file, (64, 48)).expect("a path");
+        let camera = film.cameras[0];
+        assert_eq!((film.fps, camera.pose.position), (24.0, Vec3::new(3.0, 4.0, 5.0)));
+        // OpenGL looks along -z with y up.
+        assert!((camera.pose.rotation * Vec3::Z + Vec3::Z).length() < 1e-5);
+        assert!((camera.pose.rotation * Vec3::Y + Vec3::Y).length() < 1e-5);
+        assert!((camera.intrinsics.fy - 24.0).abs() < 1e-3);
+    }
+
+    #[test]
+    fn hostile_files_are_refused_in_one_line() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let file = folder.path().join("path.json");
+        let good = serde_json::to_string(&path(false)).expect("plain data");
+        for text in [
+            "".to_owned(),
+            "[]".to_owned(),
+            "{\"camera_path\": []}".to_owned(),
+            "{\"camera_path\": [{\"camera_to_world\": [1], \"fov\": 50}]}".to_owned(),
+            good.replace("\"fps\":10.0", "\"fps\":0.0"),
+            good.replace("\"fps\":10.0", "\"fps\":1e30"),
+            good.replace("\"time\":4.5", "\"time\":1e30"),
+            good.replace("\"time\":4.5", "\"time\":0.5"),
+            good.replace("\"irradia_path\":1", "\"irradia_path\":2"),
+            good.replacen("\"fov\":0.8", "\"fov\":4", 1),
+        ] {
+            fs::write(&file, &text).expect("written");
+            let error = Film::read(&file, (8, 8)).expect_err(&text).to_string();
+            assert!(!error.contains('\n') && error.contains("path.json"), "{error}");
+        }
+    }
+}

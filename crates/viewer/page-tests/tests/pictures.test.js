@@ -1,0 +1,125 @@
+// Pictures on the page against those that `irradia render` draws of the same camera.
+
+import assert from "node:assert/strict";
+import { mkdirSync, readdirSync, writeFileSync } from "node:fs";
+import { join } from "node:path";
+import { after, before, test } from "node:test";
+import { browse, get, open, picture, psnr, readPng, run, scratch, serve, set, sharp, stopAll } from "./harness.js";
+import { field, fox, random, shiny, trained } from "./scenes.js";
+
+/** @type {import("playwright-core").Browser} */
+let browser;
+before(async () => (browser = await browse()));
+after(async () => {
+  stopAll();
+  await browser.close();
+});
+
+let frames = 0;
+
+/** The program's picture of the page's camera. */
+async function rendered(page, scene, { width, height }) {
+  const camera = await get(page, "camera");
+  const file = join(scratch, "camera.json");
+  writeFileSync(file, JSON.stringify({ irradia_path: 1, fps: 30, loop: false, ease: false, closing: 0, keys: [{ time: 0, ...camera }] }));
+  const out = join(scratch, `frames_${(frames += 1)}`);
+  mkdirSync(out);
+  run("render", scene, "--path", file, "--size", `${width}x${height}`, "--out", out);
+  return readPng(join(out, readdirSync(out)[0]));
+}
+
+/** Drags over the stage. */
+async function drag(page, dx, dy) {
+  const box = await page.locator("irr-stage .overlay").boundingBox();
+  const [x, y] = [box.x + box.width / 2, box.y + box.height / 2];
+  await page.mouse.move(x, y);
+  await page.mouse.down();
+  await page.mouse.move(x + dx / 2, y + dy / 2, { steps: 4 });
+  await page.mouse.move(x + dx, y + dy, { steps: 4 });
+  await page.mouse.up();
+  await sharp(page);
+}
+
+const SIZE = { width: 560, height: 400 };
+
+test("a drag changes the served picture as the renderer says", async () => {
+  const scene = trained();
+  const server = await serve("view", scene, "--port", "0");
+  const { page, problems } = await open(browser, server.address, SIZE);
+  await set(page, { drawing: "served", axes: false });
+  await sharp(page);
+  const first = await picture(page);
+  assert.ok(psnr(first, await rendered(page, scene, first)) >= 38);
+  await drag(page, 120, 40);
+  const second = await picture(page);
+  assert.ok(psnr(first, second) < 30, "the drag did not change the picture");
+  const db = psnr(second, await rendered(page, scene, second));
+  assert.ok(db >= 38, `${db} dB`);
+  assert.deepEqual(problems, []);
+  await server.stop();
+});
+
+for (const [name, make, least] of [["a field", field, 38], ["splats with a residual field", shiny, 38]]) {
+  test(`${name} is served like splats`, async () => {
+    const scene = make();
+    const server = await serve("view", scene, "--port", "0");
+    const { page } = await open(browser, server.address, { width: 400, height: 300 });
+    await set(page, { drawing: "local", axes: false });
+    await sharp(page);
+    assert.equal(await page.evaluate(() => document.querySelector("irr-stage").drawsLocally), false);
+    const shown = await picture(page);
+    const db = psnr(shown, await rendered(page, scene, shown));
+    assert.ok(db >= least, `${db} dB`);
+    for (const mode of ["depth", "normals", "alpha"]) {
+      await set(page, { mode });
+      await sharp(page);
+      assert.ok(psnr(shown, await picture(page)) < 25, `${mode} is no other picture`);
+    }
+    await server.stop();
+  });
+}
+
+for (const [name, make] of [["a trained scene", trained], ["random splats", () => random(4000)], ["photographs", fox]]) {
+  test(`${name} drawn in the browser are those of the renderer`, async (context) => {
+    const scene = make();
+    if (!scene) return context.skip("SKIPPED (no ../shared)");
+    const server = await serve("view", scene, "--port", "0");
+    const { page, problems } = await open(browser, server.address, SIZE);
+    await set(page, { drawing: "local", axes: false });
+    await sharp(page);
+    for (const [dx, dy] of [[0, 0], [150, -30]]) {
+      if (dx) await drag(page, dx, dy);
+      assert.equal(await page.evaluate(() => document.querySelector("irr-stage").drawsLocally), true);
+      const shown = await picture(page);
+      const db = psnr(shown, await rendered(page, scene, shown));
+      console.log(`${name}: ${db.toFixed(2)} dB`);
+      assert.ok(db >= 35, `${db} dB`);
+    }
+    assert.deepEqual(problems, []);
+    await server.stop();
+  });
+}
+
+test("the page and the program agree about camera paths", async () => {
+  const server = await serve("view", trained(), "--port", "0");
+  const { page } = await open(browser, server.address, { width: 300, height: 200 });
+  const saved = await page.evaluate(async () => {
+    const { path } = await import("/page/js/path.js");
+    document.querySelector("irr-path-panel").fromViews();
+    path.keys = path.keys.slice(0, 4);
+    path.fps = 1;
+    return { file: JSON.parse(JSON.stringify(path)), middle: path.at(3) };
+  });
+  const file = join(scratch, "path.json");
+  writeFileSync(file, JSON.stringify(saved.file));
+  const out = join(scratch, "film");
+  run("render", trained(), "--path", file, "--size", "300x200", "--out", out);
+  assert.equal(readdirSync(out).length, 7);
+  await set(page, { camera: saved.middle, drawing: "served", axes: false, sidebar: false });
+  const box = await page.evaluate(() => [document.querySelector("irr-stage").clientWidth, document.querySelector("irr-stage").clientHeight]);
+  run("render", trained(), "--path", file, "--size", `${box[0]}x${box[1]}`, "--out", join(scratch, "film2"));
+  await sharp(page);
+  const db = psnr(await picture(page), readPng(join(scratch, "film2", readdirSync(join(scratch, "film2"))[3])));
+  assert.ok(db >= 38, `${db} dB`);
+  await server.stop();
+});

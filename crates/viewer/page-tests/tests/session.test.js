@@ -1,0 +1,201 @@
+// The page as a new user meets it: views, tools, a live training, several pages, a server that dies.
+
+import assert from "node:assert/strict";
+import { join } from "node:path";
+import { createHash } from "node:crypto";
+import { readFileSync } from "node:fs";
+import { after, before, test } from "node:test";
+import { OUT, browse, get, open, picture, psnr, run, scratch, serve, set, sharp, stopAll } from "./harness.js";
+import { dataset, trained } from "./scenes.js";
+
+/** @type {import("playwright-core").Browser} */
+let browser;
+before(async () => (browser = await browse()));
+after(async () => {
+  stopAll();
+  await browser.close();
+});
+
+const settled = (page) => sharp(page);
+
+test("views, comparison, tools and modes", async () => {
+  const server = await serve("view", trained(), "--port", "0");
+  const { page, problems } = await open(browser, server.address, { width: 1000, height: 700 });
+  await set(page, { drawing: "served" });
+  await page.getByRole("tab", { name: "Views" }).click();
+  await page.locator(".views button").nth(3).click();
+  await settled(page);
+  assert.equal(await get(page, "view"), 3);
+  await page.getByRole("button", { name: "Slider" }).click();
+  await page.locator("img.photo").waitFor({ state: "visible" });
+  // The picture lies exactly over the photograph.
+  const size = await page.evaluate(() => [document.querySelector("irr-stage").served.width, document.querySelector("irr-stage").served.height]);
+  assert.ok(Math.abs(size[0] / size[1] - 160 / 120) < 0.01);
+  await page.getByRole("button", { name: "Error", exact: true }).click();
+  await settled(page);
+  await page.locator(".legend").getByText("Mean error").waitFor();
+  await page.keyboard.press("Escape");
+  assert.equal(await get(page, "view"), null);
+
+  await page.getByRole("button", { name: "Measure PSNR" }).click();
+  await page.waitForFunction(async () => (await import("/page/js/state.js")).state.get("scores").size === 27, null, { timeout: 30000 });
+  await page.getByRole("button", { name: "Worst first" }).click();
+  const listed = await page.locator(".views button > span:last-child").allTextContents();
+  const numbers = listed.map(Number);
+  assert.ok(numbers[0] > 10 && numbers.every((value, i) => i === 0 || value >= numbers[i - 1]));
+
+  await page.keyboard.press("h");
+  await settled(page);
+  const color = await picture(page);
+  for (const [key, mode] of [["2", "depth"], ["3", "alpha"], ["4", "normals"], ["5", "count"], ["6", "ellipses"], ["7", "rings"], ["8", "points"]]) {
+    await page.keyboard.press(key);
+    assert.equal(await get(page, "mode"), mode);
+    await settled(page);
+    assert.ok(psnr(color, await picture(page)) < 25, mode);
+  }
+  await page.keyboard.press("1");
+  await settled(page);
+
+  const box = await page.locator("irr-stage .overlay").boundingBox();
+  const middle = { x: box.width / 2, y: box.height / 2 };
+  const before = await get(page, "pivot");
+  await page.locator("irr-stage .overlay").dblclick({ position: { x: middle.x + 60, y: middle.y + 20 } });
+  await page.waitForFunction(async (before) => `${(await import("/page/js/state.js")).state.get("pivot")}` !== `${before}`, before);
+  await settled(page);
+  await page.keyboard.press("i");
+  await page.locator("irr-stage .overlay").click({ position: middle });
+  await page.waitForFunction(async () => (await import("/page/js/state.js")).state.get("picked")?.splat?.opacity > 0);
+  await page.keyboard.press("m");
+  await page.locator("irr-stage .overlay").click({ position: middle });
+  await page.waitForFunction(async () => (await import("/page/js/state.js")).state.get("measured").length === 1);
+  await page.locator("irr-stage .overlay").click({ position: { x: middle.x + 80, y: middle.y } });
+  await page.waitForFunction(async () => (await import("/page/js/state.js")).state.get("measured").length === 2);
+  await page.getByRole("tab", { name: "Scene" }).click();
+  await page.getByLabel("True length in metres").fill("1");
+  await page.getByRole("button", { name: "Set scale" }).click();
+  await page.waitForFunction(async () => (await import("/page/js/state.js")).state.get("metres") > 0);
+  assert.ok(JSON.parse(readFileSync(join(trained(), "unit.json"), "utf8")).metres_per_unit > 0);
+
+  await page.keyboard.press("Escape");
+  await set(page, { clip: [[-0.5, -0.5, -0.5], [0.5, 0.5, 0.5]] });
+  await settled(page);
+  assert.ok(psnr(color, await picture(page)) < 30, "the box clips");
+  await page.keyboard.press("?");
+  await page.getByText("Keys and gestures").waitFor();
+  await page.keyboard.press("Escape");
+  assert.deepEqual(problems, []);
+  await server.stop();
+});
+
+test("a live training is paused, stepped, resumed and left alone, and its bytes stay the same", async () => {
+  const out = join(scratch, "live");
+  const server = await serve("train", dataset(), "--out", out, "--steps", "900", "--view", "--port", "0");
+  const first = await open(browser, server.address, { width: 900, height: 600 });
+  const second = await open(browser, server.address, { width: 400, height: 300 });
+  const { page } = first;
+  await page.getByRole("tab", { name: "Training" }).click();
+  await page.getByRole("button", { name: "Pause" }).click();
+  await page.waitForFunction(async () => (await import("/page/js/state.js")).state.get("train")?.phase === "paused");
+  const step = (await get(page, "train")).step;
+  assert.ok(step > 0 && step < 900);
+  await page.getByRole("button", { name: "Save now" }).click();
+  await page.waitForFunction(async (step) => (await import("/page/js/state.js")).state.get("train").saved === step, step);
+  await page.waitForTimeout(400);
+  assert.equal((await get(page, "train")).step, step, "it stands still");
+  await page.getByRole("button", { name: "One step" }).click();
+  await page.waitForFunction(async (step) => {
+    const train = (await import("/page/js/state.js")).state.get("train");
+    return train.phase === "paused" && train.step === step + 1;
+  }, step);
+  await sharp(page);
+  const before = await picture(page);
+  await page.screenshot({ path: join(OUT, "training-1440-dark.jpg"), quality: 80 });
+  await page.getByRole("button", { name: "Resume" }).click();
+  await page.waitForFunction(async (step) => (await import("/page/js/state.js")).state.get("train").step > step + 60, step);
+  // A page that closes disturbs nothing; the other one sees the scene improve.
+  await second.page.close();
+  await page.waitForFunction(async () => (await import("/page/js/state.js")).state.get("train").phase === "finished", null, { timeout: 120000 });
+  await sharp(page);
+  assert.ok(psnr(before, await picture(page)) < 45, "the scene has changed");
+  assert.ok((await get(page, "train")).curve.length > 100);
+  assert.deepEqual([...first.problems, ...second.problems], []);
+  await page.close();
+  assert.equal(await server.ended, 0, server.lines.join(""));
+
+  const alone = join(scratch, "alone");
+  run("train", dataset(), "--out", alone, "--steps", "900");
+  const hash = (folder) => createHash("sha256").update(readFileSync(join(folder, "scene.ply"))).digest("hex");
+  assert.equal(hash(out), hash(alone), "pages change no byte");
+});
+
+test("two pages have a camera each, and come back after the server died", async () => {
+  const server = await serve("view", trained(), "--port", "0");
+  const port = new URL(server.address).port;
+  const [a, b] = [await open(browser, server.address, { width: 500, height: 400 }), await open(browser, server.address, { width: 500, height: 400 })];
+  for (const { page } of [a, b]) await set(page, { drawing: "served" });
+  await set(a.page, { view: null, camera: { ...(await get(a.page, "camera")), fov: 0.4 } });
+  await Promise.all([sharp(a.page), sharp(b.page)]);
+  assert.ok(psnr(await picture(a.page), await picture(b.page)) < 30);
+  await server.stop("SIGKILL");
+  await a.page.getByText("Connection lost").waitFor();
+  const again = await serve("view", trained(), "--port", port);
+  assert.equal(again.address, server.address);
+  await a.page.waitForFunction(async () => (await import("/page/js/state.js")).state.get("connection") === "open", null, { timeout: 15000 });
+  await sharp(a.page);
+  assert.ok(Math.abs((await get(a.page, "camera")).fov - 0.4) < 1e-6, "the camera stays");
+  await again.stop();
+});
+
+test("an address holds the camera", async () => {
+  const server = await serve("view", trained(), "--port", "0");
+  const { page } = await open(browser, server.address, { width: 500, height: 400 });
+  await page.locator("irr-stage .overlay").hover();
+  await page.mouse.wheel(0, -300);
+  await page.keyboard.press("u");
+  const address = page.url();
+  assert.match(address, /#p=/);
+  const other = await open(browser, address, { width: 500, height: 400 });
+  const [here, there] = [await get(page, "camera"), await get(other.page, "camera")];
+  assert.ok(here.position.every((v, i) => Math.abs(v - there.position[i]) < 1e-4));
+  await server.stop();
+});
+
+test("every screen at 1440 and 360 pixels", async () => {
+  // SCREENS_OF names a run to take pictures of, such as that of README.md: views-1440-dark.jpg.
+  const server = await serve("view", process.env.SCREENS_OF ?? trained(), "--port", "0");
+  for (const [width, height] of [[1440, 900], [360, 740]]) {
+    for (const theme of ["dark", "light"]) {
+      const { page, problems } = await open(browser, server.address, { width, height, theme });
+      await set(page, { drawing: "served" });
+      const shoot = async (name) => {
+        await sharp(page);
+        await page.screenshot({ path: join(OUT, `${name}-${width}-${theme}.jpg`), quality: 80 });
+        const wide = await page.evaluate(() => document.documentElement.scrollWidth);
+        assert.ok(wide <= width, `${name} is ${wide} pixels wide`);
+      };
+      await shoot("start");
+      await set(page, { sidebar: true, tab: "display" });
+      await shoot("scene");
+      if (theme === "light") {
+        await page.close();
+        continue;
+      }
+      await set(page, { tab: "views", frusta: true });
+      await page.waitForTimeout(300);
+      await shoot("views");
+      await page.locator(".views button").nth(3).click();
+      await set(page, { compare: "slider" });
+      await page.waitForTimeout(300);
+      await shoot("compare");
+      await set(page, { compare: "none", view: null, tab: "path", mode: "depth" });
+      await page.evaluate(() => document.querySelector("irr-path-panel").fromViews());
+      await page.keyboard.press("h");
+      await shoot("path");
+      await page.keyboard.press("?");
+      await shoot("help");
+      assert.deepEqual(problems, []);
+      await page.close();
+    }
+  }
+  await server.stop();
+});

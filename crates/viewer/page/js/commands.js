@@ -1,0 +1,107 @@
+// What the page can do, with its keys: the toolbar, the keyboard and the help sheet use this list.
+
+import { connection } from "./connection.js";
+import { path } from "./path.js";
+import { shareAddress } from "./share.js";
+import { state } from "./state.js";
+
+/** @typedef {import("./math.js").Vec3} Vec3 */
+
+/** What is drawn: value, name, key. @type {[string, string, string][]} */
+export const MODES = [
+  ["color", "Colour", "1"], ["depth", "Depth", "2"], ["alpha", "Alpha", "3"], ["normals", "Normals", "4"],
+  ["count", "Splats per pixel", "5"], ["ellipses", "Ellipses", "6"], ["rings", "Rings", "7"], ["points", "Points", "8"],
+];
+/** Modes for which there must be splats. */
+export const SPLAT_MODES = ["count", "ellipses", "rings", "points"];
+
+/** @returns {import("./stage.js").Stage} */
+export const stage = () => /** @type {any} */ (document.querySelector("irr-stage"));
+const navigation = () => stage().navigation;
+
+/** The next view, or the previous one. @param {number} by */
+function step(by) {
+  const count = state.get("views").length;
+  if (!count) return;
+  const at = state.get("view");
+  navigation()?.enter(at === null ? (by > 0 ? 0 : count - 1) : (at + by + count) % count);
+}
+
+/** @param {string} action */
+export const train = (action) => connection.send({ do: "train", action });
+
+/** @param {"measure" | "inspect"} tool */
+const toggleTool = (tool) => state.set({ tool: state.get("tool") === tool ? "none" : tool, ...(tool === "measure" && { measured: [] }) });
+
+/** Puts the address of the present view on the clipboard. */
+export async function share() {
+  const address = shareAddress();
+  history.replaceState(null, "", address);
+  try {
+    await navigator.clipboard.writeText(address);
+    state.set({ problem: "The address of this view is on the clipboard" });
+  } catch {
+    state.set({ problem: "The address bar holds this view now" });
+  }
+}
+
+export function toggleTheme() {
+  const dark = matchMedia("(prefers-color-scheme: dark)").matches;
+  const now = state.get("theme") || (dark ? "dark" : "light");
+  state.set({ theme: now === "dark" ? "light" : "dark" });
+}
+
+/** @typedef {{ keys: string, name: string, run: () => void }} Command */
+/** @type {Record<string, Command[]>} */
+export const COMMANDS = {
+  Camera: [
+    { keys: "h", name: "Home", run: () => navigation()?.home() },
+    { keys: "x", name: "Look along x (shift: from the other side)", run: () => navigation()?.along([1, 0, 0]) },
+    { keys: "X", name: "", run: () => navigation()?.along([-1, 0, 0]) },
+    { keys: "y", name: "Look along y", run: () => navigation()?.along([0, 1, 0]) },
+    { keys: "Y", name: "", run: () => navigation()?.along([0, -1, 0]) },
+    { keys: "z", name: "Look along z", run: () => navigation()?.along([0, 0, 1]) },
+    { keys: "Z", name: "", run: () => navigation()?.along([0, 0, -1]) },
+    { keys: "o", name: "Orbit", run: () => state.set({ navigation: "orbit" }) },
+    { keys: "f", name: "Fly", run: () => state.set({ navigation: "fly" }) },
+    { keys: "g", name: "Walk", run: () => state.set({ navigation: "walk" }) },
+    { keys: "]", name: "Next view", run: () => step(1) },
+    { keys: "[", name: "Previous view", run: () => step(-1) },
+  ],
+  Picture: [
+    ...MODES.map(([mode, name, key]) => ({ keys: key, name, run: () => state.set({ mode }) })),
+    { keys: "c", name: "Compare with the photograph", run: () => {
+      const next = /** @type {const} */ ({ none: "slider", slider: "blink", blink: "error", error: "none" });
+      state.set({ compare: next[state.get("compare")] });
+    } },
+    { keys: "l", name: "Draw here or on the server", run: () => state.set({ drawing: stage().drawsLocally ? "served" : "local" }) },
+    { keys: "v", name: "Show cameras", run: () => state.set({ frusta: !state.get("frusta") }) },
+  ],
+  Tools: [
+    { keys: "m", name: "Measure a distance", run: () => toggleTool("measure") },
+    { keys: "i", name: "Inspect a splat", run: () => toggleTool("inspect") },
+    { keys: "k", name: "Set a key frame", run: () => {
+      state.set({ tab: "path" });
+      path.add(state.get("camera"));
+    } },
+    { keys: " ", name: "Play the path", run: () => path.dispatchEvent(new Event("toggle")) },
+    { keys: "p", name: "Pause or resume the training", run: () => train(state.get("train")?.phase === "paused" ? "resume" : "pause") },
+  ],
+  Page: [
+    { keys: "b", name: "Show or hide the panel", run: () => state.set({ sidebar: !state.get("sidebar") }) },
+    { keys: "t", name: "Dark or light", run: toggleTheme },
+    { keys: "u", name: "Share this view", run: share },
+    { keys: "?", name: "This sheet", run: () => document.querySelector("irr-help")?.dispatchEvent(new Event("open")) },
+    { keys: "Escape", name: "Leave the view or the tool", run: () => state.set({ tool: "none", view: null, compare: "none" }) },
+  ],
+};
+
+addEventListener("keydown", (event) => {
+  const target = /** @type {HTMLElement} */ (event.target);
+  if (event.ctrlKey || event.metaKey || event.altKey || target.matches("input:not([type=range]):not([type=checkbox]), select, dialog *")) return;
+  if (event.key === " " && target.matches("button, [role=button]")) return;
+  const command = Object.values(COMMANDS).flat().find(({ keys }) => keys === event.key);
+  if (!command) return;
+  event.preventDefault();
+  command.run();
+});

@@ -1,0 +1,89 @@
+// A worker that keeps the splats' positions and sorts those in view by depth, farthest first.
+//
+// One counting pass over 16 bits of depth. The keys are the top bits of the depth's floating-point pattern, from the nearest to
+// the farthest splat: evenly spaced in the logarithm, thousands of them between a depth and its double.
+
+/** @typedef {{ count: number, positions: Float32Array, radii: Float32Array, first: number }} Block */
+/** @typedef {{ forward: number[], right: number[], down: number[], position: number[], limits: number[], near: number }} Look */
+
+const KEYS = 1 << 16;
+
+let positions = new Float32Array(0);
+/** Three standard deviations along the largest axis. */
+let radii = new Float32Array(0);
+let count = 0;
+let depths = new Float32Array(0);
+let bits = new Uint32Array(0);
+let inView = new Uint32Array(0);
+const places = new Uint32Array(KEYS + 1);
+
+/** @param {number} size */
+function reserve(size) {
+  positions = new Float32Array(3 * size);
+  radii = new Float32Array(size);
+  depths = new Float32Array(size);
+  bits = new Uint32Array(depths.buffer);
+  inView = new Uint32Array(size);
+  count = 0;
+}
+
+/** Indices of the splats in view, farthest first. @param {Look} look @returns {Uint32Array} */
+export function order({ forward: [fx, fy, fz], right: [rx, ry, rz], down: [dx, dy, dz], position: [px, py, pz], limits, near }) {
+  const [left, most, top, bottom] = limits;
+  let n = 0;
+  let least = 0xffffffff;
+  let largest = 0;
+  for (let i = 0, at = 0; i < count; i += 1, at += 3) {
+    const x = positions[at] - px;
+    const y = positions[at + 1] - py;
+    const z = positions[at + 2] - pz;
+    const depth = fx * x + fy * y + fz * z;
+    if (depth <= near) continue;
+    const across = rx * x + ry * y + rz * z;
+    const radius = radii[i];
+    if (across < left * depth - radius || across > most * depth + radius) continue;
+    const along = dx * x + dy * y + dz * z;
+    if (along < top * depth - radius || along > bottom * depth + radius) continue;
+    depths[n] = depth;
+    inView[n] = i;
+    const key = bits[n];
+    if (key < least) least = key;
+    if (key > largest) largest = key;
+    n += 1;
+  }
+  const sorted = new Uint32Array(n);
+  if (n === 0) return sorted;
+  const scale = (KEYS - 1) / Math.max(largest - least, 1);
+  places.fill(0);
+  for (let i = 0; i < n; i += 1) {
+    // Farthest first: the largest pattern gets key 0.
+    const key = ((largest - bits[i]) * scale) | 0;
+    bits[i] = key;
+    places[key + 1] += 1;
+  }
+  for (let key = 1; key < KEYS; key += 1) places[key] += places[key - 1];
+  for (let i = 0; i < n; i += 1) sorted[places[bits[i]]++] = inView[i];
+  return sorted;
+}
+
+/** @param {Block} block */
+export function take(block) {
+  positions.set(block.positions, 3 * block.first);
+  radii.set(block.radii, block.first);
+  count = Math.max(count, block.first + block.count);
+}
+
+if (typeof document === "undefined" && "onmessage" in globalThis) {
+  self.onmessage = ({ data }) => {
+    if (data.reserve !== undefined) reserve(data.reserve);
+    else if (data.block) take(data.block);
+    else if (data.look) {
+      const started = performance.now();
+      const sorted = order(data.look);
+      const milliseconds = performance.now() - started;
+      /** @type {any} */ (self).postMessage({ sorted, milliseconds, of: count, generation: data.generation }, [sorted.buffer]);
+    }
+  };
+}
+
+export { reserve };

@@ -1,0 +1,37 @@
+// The page: loads its parts, and begins.
+
+import "./stage.js";
+import "./hud.js";
+import "./toolbar.js";
+import "./sidebar.js";
+import "./timeline.js";
+import "./help.js";
+import "./commands.js";
+import { connection } from "./connection.js";
+import { homeOf } from "./navigation.js";
+import { sharedValues } from "./share.js";
+import { state } from "./state.js";
+
+state.watch(["theme"], () => {
+  const theme = state.get("theme");
+  if (theme) document.documentElement.dataset.theme = theme;
+  else document.documentElement.dataset.theme = matchMedia("(prefers-color-scheme: light)").matches ? "light" : "dark";
+});
+
+state.watch(["hello"], () => {
+  const hello = state.get("hello");
+  if (hello) document.title = `${hello.title} · Irradia`;
+});
+
+// The first scene decides the first camera; later versions keep it.
+let placed = false;
+state.watch(["scene", "views"], () => {
+  const scene = state.get("scene");
+  if (!scene || placed) return;
+  placed = true;
+  const { camera, pivot } = homeOf();
+  const empty = scene.count === 0;
+  state.set({ up: scene.up, camera, pivot, ...(empty && { frusta: true }), ...sharedValues() });
+});
+
+connection.open();

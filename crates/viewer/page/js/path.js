@@ -1,0 +1,128 @@
+// A camera path: key frames, and the camera at any time between them. Its twin is crates/runs/src/path.rs; a test compares both.
+//
+// Positions and fields of view follow a Catmull-Rom spline through the keys with tangents from the times of the neighbours;
+// rotations are interpolated by squad (Shoemake 1987): slerp of slerps with inner quaternions.
+
+import { clamp, multiply, slerp, unit } from "./math.js";
+
+/** @typedef {import("./math.js").Vec3} Vec3 */
+/** @typedef {import("./math.js").Quat} Quat */
+/** @typedef {import("./camera.js").Camera} Camera */
+/** @typedef {{ time: number, position: Vec3, rotation: Quat, fov: number }} Key */
+
+/** Seconds between key frames at first. */
+export const APART = 2;
+
+/** @param {Quat} q @returns {Quat} */
+const conjugate = ([w, x, y, z]) => [w, -x, -y, -z];
+
+/** Logarithm of a unit quaternion: axis times half the angle. @param {Quat} q @returns {Vec3} */
+function log([w, x, y, z]) {
+  const sine = Math.hypot(x, y, z);
+  if (sine < 1e-9) return [0, 0, 0];
+  const factor = Math.atan2(sine, w) / sine;
+  return [x * factor, y * factor, z * factor];
+}
+
+/** @param {readonly number[]} v @returns {Quat} */
+function exp(v) {
+  const angle = Math.hypot(v[0], v[1], v[2]);
+  const factor = angle < 1e-9 ? 1 : Math.sin(angle) / angle;
+  return [Math.cos(angle), v[0] * factor, v[1] * factor, v[2] * factor];
+}
+
+/** @param {Quat} a @param {Quat} b the same rotation as b, on the side of a @returns {Quat} */
+const near = (a, b) => (a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3] < 0 ? [-b[0], -b[1], -b[2], -b[3]] : b);
+
+/** @param {number} t eased in and out: the smooth step of degree 3 */
+const eased = (t) => t * t * (3 - 2 * t);
+
+class Path extends EventTarget {
+  /** @type {Key[]} in order of time, from 0 */
+  keys = [];
+  loop = false;
+  ease = true;
+  fps = 30;
+  shown = false;
+  /** Seconds of a loop's way back to its first key. */
+  closing = 2;
+
+  /** Length in seconds. */
+  get seconds() {
+    const last = this.keys[this.keys.length - 1]?.time ?? 0;
+    return last + (this.loop && this.keys.length > 1 ? this.closing : 0);
+  }
+
+  /** Adds a camera as the last key frame. @param {Camera} camera */
+  add({ position, rotation, fov }) {
+    const last = this.keys[this.keys.length - 1];
+    this.keys.push({ time: last ? last.time + APART : 0, position, rotation, fov });
+    this.changed();
+  }
+
+  changed() {
+    this.dispatchEvent(new Event("change"));
+  }
+
+  /** The camera at a time. @param {number} seconds @returns {Camera} */
+  at(seconds) {
+    const keys = this.keys;
+    const n = keys.length;
+    if (n === 1) return { position: keys[0].position, rotation: keys[0].rotation, fov: keys[0].fov };
+    const total = this.seconds;
+    const along = clamp(seconds, 0, total) / Math.max(total, 1e-9);
+    const time = (this.ease && !this.loop ? eased(along) : along) * total;
+    let i = 0;
+    while (i + 1 < n && keys[i + 1].time <= time) i += 1;
+    if (!this.loop) i = Math.min(i, n - 2);
+    // Key j with its time, beyond the ends around the loop, or the last one again.
+    const key = (/** @type {number} */ j) => {
+      if (!this.loop) {
+        const kept = clamp(j, 0, n - 1);
+        return { ...keys[kept], time: keys[kept].time };
+      }
+      const rounds = Math.floor(j / n);
+      return { ...keys[j - rounds * n], time: keys[j - rounds * n].time + rounds * total };
+    };
+    const [k0, k1, k2, k3] = [key(i - 1), key(i), key(i + 1), key(i + 2)];
+    const span = Math.max(k2.time - k1.time, 1e-9);
+    const t = clamp((time - k1.time) / span, 0, 1);
+    const spline = (/** @type {number} */ p0, /** @type {number} */ p1, /** @type {number} */ p2, /** @type {number} */ p3) => {
+      const m1 = (span * (p2 - p0)) / Math.max(k2.time - k0.time, 1e-9);
+      const m2 = (span * (p3 - p1)) / Math.max(k3.time - k1.time, 1e-9);
+      const [t2, t3] = [t * t, t * t * t];
+      return (2 * t3 - 3 * t2 + 1) * p1 + (t3 - 2 * t2 + t) * m1 + (3 * t2 - 2 * t3) * p2 + (t3 - t2) * m2;
+    };
+    const position = /** @type {Vec3} */ ([0, 1, 2].map((c) => spline(k0.position[c], k1.position[c], k2.position[c], k3.position[c])));
+    const q1 = unit(k1.rotation);
+    const q0 = near(q1, unit(k0.rotation));
+    const q2 = near(q1, unit(k2.rotation));
+    const q3 = near(q2, unit(k3.rotation));
+    const inner = (/** @type {Quat} */ before, /** @type {Quat} */ q, /** @type {Quat} */ after) => {
+      const inverse = conjugate(q);
+      const [a, b] = [log(multiply(inverse, near(q, after))), log(multiply(inverse, near(q, before)))];
+      return multiply(q, exp([-(a[0] + b[0]) / 4, -(a[1] + b[1]) / 4, -(a[2] + b[2]) / 4]));
+    };
+    const rotation = slerp(slerp(q1, q2, t), slerp(inner(q0, q1, q2), inner(q1, q2, q3), t), 2 * t * (1 - t));
+    return { position, rotation, fov: spline(k0.fov, k1.fov, k2.fov, k3.fov) };
+  }
+
+  /** As it is saved and read by irradia render --path. */
+  toJSON() {
+    return { irradia_path: 1, fps: this.fps, loop: this.loop, ease: this.ease, closing: this.closing, keys: this.keys };
+  }
+
+  /** Reads what toJSON wrote. @param {any} saved */
+  read(saved) {
+    const fits = (/** @type {any} */ key) =>
+      [key?.time, key?.fov, ...(key?.position ?? [null]), ...(key?.rotation ?? [null])].every(Number.isFinite) &&
+      key.position.length === 3 && key.rotation.length === 4;
+    if (saved?.irradia_path !== 1 || !Array.isArray(saved.keys) || !saved.keys.every(fits)) throw new Error("This is no camera path of Irradia");
+    this.keys = saved.keys.map((/** @type {Key} */ { time, position, rotation, fov }) => ({ time, position, rotation, fov }));
+    this.keys.sort((a, b) => a.time - b.time);
+    [this.fps, this.loop, this.ease, this.closing] = [saved.fps ?? 30, Boolean(saved.loop), Boolean(saved.ease), saved.closing ?? 2];
+    this.changed();
+  }
+}
+
+export const path = new Path();

@@ -1,0 +1,313 @@
+// The picture, the overlay and the comparison with photographs: <irr-stage>.
+
+import { frameOn, intrinsics } from "./camera.js";
+import { connection } from "./connection.js";
+import { el } from "./dom.js";
+import { LocalRenderer } from "./local/renderer.js";
+import { Navigation } from "./navigation.js";
+import { drawOverlay, frustumAt, thumbnails } from "./overlay.js";
+import { path } from "./path.js";
+import { state } from "./state.js";
+
+/** @typedef {import("./camera.js").Camera} Camera */
+/** @typedef {import("./camera.js").Intrinsics} Intrinsics */
+/** @typedef {import("./connection.js").Header} Header */
+
+/** Modes that the page can draw itself. */
+export const LOCAL_MODES = ["color", "ellipses", "rings", "points"];
+/** Splats beyond which the server draws, unless the user says otherwise. */
+const MANY = 3e6;
+/** Largest number of device pixels per CSS pixel. */
+const DENSITY = 2;
+/** Milliseconds between the two pictures of a blink. */
+const BLINK = 700;
+
+/** What lines and layout depend on. @type {(keyof import("./state.js").Values)[]} */
+const LINES = ["camera", "pivot", "view", "views", "frusta", "axes", "clip", "measured", "metres", "scores", "compare", "tab", "scene", "sidebar"];
+
+export class Stage extends HTMLElement {
+  /** What is on the screen now. @type {{ camera: Camera, k: Intrinsics, header: Header | null } | null} */
+  shown = null;
+  /** Shots on the way, by id. @type {Map<number, { camera: Camera, k: Intrinsics, at: number }>} */
+  sent = new Map();
+  ids = 0;
+  /** Whether another picture is wanted. */
+  dirty = true;
+  /** Whether lines and layout must be renewed. */
+  stale = true;
+  split = 0.5;
+  /** Where the pointer went down. */
+  pressed = { x: 0, y: 0 };
+  /** Of the last second. */
+  times = /** @type {number[]} */ ([]);
+  /** Milliseconds from the change of the camera to the picture, newest last. */
+  delays = /** @type {number[]} */ ([]);
+
+  connectedCallback() {
+    this.served = /** @type {HTMLCanvasElement} */ (el("canvas", { className: "served" }));
+    this.context = this.served.getContext("bitmaprenderer");
+    this.localCanvas = /** @type {HTMLCanvasElement} */ (el("canvas", { className: "local", hidden: true }));
+    this.photo = /** @type {HTMLImageElement} */ (el("img", { className: "photo", hidden: true, alt: "" }));
+    this.overlay = /** @type {HTMLCanvasElement} */ (el("canvas", { className: "overlay", tabIndex: 0 }));
+    this.overlay.setAttribute("role", "img");
+    this.overlay.setAttribute("aria-label", "The scene. Drag to turn, scroll to come nearer, question mark for all keys");
+    this.handle = el("button", { className: "handle", hidden: true });
+    this.handle.setAttribute("aria-label", "Border between photograph and picture");
+    this.empty = el("div", { className: "empty" });
+    this.prepend(this.served, this.localCanvas, this.photo, this.overlay, this.handle, this.empty);
+    const local = new LocalRenderer(this.localCanvas, () => (this.dirty = true));
+    this.local = local;
+    this.navigation = new Navigation(this.overlay, (x, y) => this.pickAt(x, y));
+    new ResizeObserver(() => this.resize()).observe(this);
+    for (const key of /** @type {const} */ (["camera", "view", "mode", "background", "clip", "drawing", "compare", "scene"])) {
+      state.addEventListener(key, () => (this.dirty = true));
+    }
+    const touch = () => (this.stale = true);
+    for (const key of LINES) state.addEventListener(key, touch);
+    for (const source of [this, path, thumbnails]) for (const kind of ["drawing", "change", "load"]) source.addEventListener(kind, touch);
+    state.addEventListener("scene", () => local.load(state.get("scene")));
+    state.watch(["view", "compare", "views"], () => this.showPhoto());
+    state.watch(["tool"], () => this.classList.toggle("picking", state.get("tool") !== "none"));
+    state.watch(["connection", "scene"], () => this.tellEmpty());
+    connection.addEventListener("open", () => {
+      this.sent.clear();
+      this.dirty = true;
+    });
+    connection.addEventListener("picture", (event) => this.receive(/** @type {CustomEvent} */ (event).detail));
+    this.overlay.addEventListener("pointerdown", (event) => (this.pressed = { x: event.clientX, y: event.clientY }));
+    this.overlay.addEventListener("click", (event) => this.useTool(event));
+    this.handle.addEventListener("pointermove", (event) => this.dragHandle(event));
+    this.handle.addEventListener("pointerdown", (event) => this.handle?.setPointerCapture(event.pointerId));
+    this.handle.addEventListener("keydown", (event) => this.keyHandle(event));
+    const frame = (/** @type {number} */ now) => {
+      this.frame(now);
+      requestAnimationFrame(frame);
+    };
+    requestAnimationFrame(frame);
+  }
+
+  tellEmpty() {
+    if (!this.empty) return;
+    const scene = state.get("scene");
+    this.empty.textContent = scene ? (scene.count === 0 ? "Nothing to draw yet" : "") : state.get("connection") === "open" ? "Waiting for the first step" : "";
+  }
+
+  resize() {
+    this.density = Math.min(devicePixelRatio || 1, DENSITY);
+    if (this.overlay) {
+      this.overlay.width = Math.round(this.clientWidth * this.density);
+      this.overlay.height = Math.round(this.clientHeight * this.density);
+    }
+    this.dirty = this.stale = true;
+  }
+
+  /** Whether this page draws. */
+  get drawsLocally() {
+    const scene = state.get("scene");
+    if (!scene?.travels || !this.local?.works || !LOCAL_MODES.includes(state.get("mode")) || state.get("compare") === "error") return false;
+    const drawing = state.get("drawing");
+    if (drawing !== "auto") return drawing === "local";
+    return this.local.accelerated && scene.count <= MANY && !state.get("hello")?.live;
+  }
+
+  /** The picture's place on the stage. */
+  get frameRect() {
+    return frameOn(Math.max(this.clientWidth, 1), Math.max(this.clientHeight, 1), state.insideView);
+  }
+
+  /** The request for the present picture. */
+  shot() {
+    const camera = state.get("camera");
+    const rect = this.frameRect;
+    const density = this.density ?? 1;
+    const [width, height] = [Math.max(1, Math.round(rect.width * density)), Math.max(1, Math.round(rect.height * density))];
+    const k = intrinsics(width, height, camera.fov, state.insideView);
+    const error = state.get("compare") === "error" && state.get("view") !== null;
+    const background = state.get("background");
+    return {
+      id: this.ids, position: camera.position, rotation: camera.rotation, ...k,
+      mode: error ? "error" : state.get("mode"),
+      view: state.get("view"),
+      background: background && rgb(background),
+      clip: state.get("clip"),
+    };
+  }
+
+  /** @param {number} now */
+  frame(now) {
+    this.navigation?.tick(now);
+    if (!this.served || !this.localCanvas || !this.local) return;
+    const local = this.drawsLocally;
+    if (this.dirty) {
+      this.dirty = false;
+      this.ids += 1;
+      const shot = this.shot();
+      const { width, height, fx, fy, cx, cy } = shot;
+      const k = { width, height, fx, fy, cx, cy };
+      if (local) {
+        if (this.localCanvas.hidden) connection.send({ do: "rest" });
+        this.local.want(state.get("camera"), k, shot);
+        this.shown = { camera: state.get("camera"), k, header: null };
+      } else if (state.get("scene")) {
+        connection.send({ do: "shot", ...shot });
+        this.sent.set(shot.id, { camera: state.get("camera"), k, at: performance.now() });
+        if (this.sent.size > 400) this.sent.delete(this.sent.keys().next().value ?? 0);
+        if (this.localCanvas.hidden === false) this.dispatchEvent(new Event("drawing"));
+      }
+      this.localCanvas.hidden = !local;
+      this.served.hidden = local;
+    }
+    if (local && this.local.draw(now)) this.count(now);
+    // A page at rest draws nothing.
+    if (!this.stale) return;
+    this.stale = false;
+    this.layOut();
+    this.drawOverlay();
+  }
+
+  layOut() {
+    const rect = this.frameRect;
+    const style = { left: `${rect.left}px`, top: `${rect.top}px`, width: `${rect.width}px`, height: `${rect.height}px` };
+    for (const element of [this.localCanvas, this.photo]) if (element) Object.assign(element.style, style);
+    if (this.served) {
+      // Until a picture of the stage's new size is here, the old one keeps its proportions; the vertical field of view stays.
+      const k = this.shown?.header ? this.shown.k : rect;
+      const width = (rect.height * k.width) / k.height;
+      Object.assign(this.served.style, style, { left: `${rect.left + (rect.width - width) / 2}px`, width: `${width}px` });
+    }
+    if (this.handle && !this.handle.hidden) {
+      Object.assign(this.handle.style, { left: `${rect.left + this.split * rect.width}px`, top: style.top, height: style.height });
+    }
+  }
+
+  /** @param {{ header: Header, jpeg: Blob }} picture */
+  async receive({ header, jpeg }) {
+    const bitmap = await createImageBitmap(jpeg);
+    connection.send({ do: "shown", id: header.id });
+    const shot = this.sent.get(header.id);
+    const current = this.shown?.header?.id ?? 0;
+    if (!shot || !this.served || header.id < current) return bitmap.close();
+    this.served.width = bitmap.width;
+    this.served.height = bitmap.height;
+    this.context?.transferFromImageBitmap(bitmap);
+    for (const id of this.sent.keys()) if (id < header.id) this.sent.delete(id);
+    const now = performance.now();
+    if (!header.sharp && current !== header.id) {
+      this.delays.push(now - shot.at);
+      if (this.delays.length > 2000) this.delays.shift();
+    }
+    this.shown = { camera: shot.camera, k: shot.k, header };
+    this.count(now);
+    this.dispatchEvent(new Event("drawing"));
+  }
+
+  /** @param {number} now */
+  count(now) {
+    this.times = [...this.times.filter((time) => time > now - 1000), now];
+    this.dispatchEvent(new Event("drawing"));
+  }
+
+  drawOverlay() {
+    const context = this.overlay?.getContext("2d");
+    if (!context || !this.overlay) return;
+    // Over a served picture its own camera, so that lines and picture move together.
+    const shown = this.drawsLocally ? { camera: state.get("camera"), k: this.local?.k } : this.shown;
+    context.setTransform(1, 0, 0, 1, 0, 0);
+    context.clearRect(0, 0, this.overlay.width, this.overlay.height);
+    if (!shown?.k) return;
+    const rect = this.frameRect;
+    const density = this.density ?? 1;
+    const factor = rect.width / shown.k.width;
+    context.setTransform(density * factor, 0, 0, density * factor, rect.left * density, rect.top * density);
+    drawOverlay(context, shown.camera, shown.k, 1 / factor);
+  }
+
+  /** @param {number} x @param {number} y CSS pixels on the stage @returns {Promise<any>} */
+  async pickAt(x, y) {
+    const rect = this.frameRect;
+    const shot = this.shot();
+    return connection.pick(shot, ((x - rect.left) / rect.width) * shot.width, ((y - rect.top) / rect.height) * shot.height);
+  }
+
+  /** @param {MouseEvent} event */
+  async useTool(event) {
+    const tool = state.get("tool");
+    if (tool === "none") {
+      const still = Math.hypot(event.clientX - this.pressed.x, event.clientY - this.pressed.y) < 4;
+      if (still) this.enterFrustum(event.offsetX, event.offsetY);
+      return;
+    }
+    const picked = await this.pickAt(event.offsetX, event.offsetY);
+    if (tool === "inspect") state.set({ picked });
+    if (tool === "measure" && picked?.point) {
+      const before = state.get("measured");
+      state.set({ measured: [...(before.length >= 2 ? [] : before), picked.point] });
+    }
+  }
+
+  /** Enters the view whose camera is drawn at a point of the stage. @param {number} x @param {number} y */
+  enterFrustum(x, y) {
+    const shown = this.drawsLocally ? { camera: state.get("camera"), k: this.local?.k } : this.shown;
+    if (!shown?.k) return;
+    const rect = this.frameRect;
+    const factor = shown.k.width / rect.width;
+    const index = frustumAt(shown.camera, shown.k, (x - rect.left) * factor, (y - rect.top) * factor, 14 * factor);
+    if (index !== null) this.navigation?.enter(index);
+  }
+
+  showPhoto() {
+    const index = state.get("view");
+    const view = state.insideView;
+    const compare = state.get("compare");
+    const shows = Boolean(view?.photo) && (compare === "slider" || compare === "blink");
+    if (!this.photo || !this.handle) return;
+    this.stale = true;
+    this.photo.hidden = !shows;
+    this.handle.hidden = !shows || compare !== "slider";
+    clearInterval(this.blinking);
+    if (!shows) return;
+    const address = `view/${index}/photo${location.search}`;
+    if (this.photo.getAttribute("src") !== address) this.photo.src = address;
+    this.clipPhoto();
+    this.photo.style.visibility = "visible";
+    if (compare === "blink") {
+      const photo = this.photo;
+      photo.style.clipPath = "none";
+      this.blinking = setInterval(() => {
+        photo.style.visibility = photo.style.visibility === "visible" ? "hidden" : "visible";
+      }, BLINK);
+    }
+  }
+
+  clipPhoto() {
+    if (this.photo) this.photo.style.clipPath = `inset(0 ${100 * (1 - this.split)}% 0 0)`;
+  }
+
+  /** @param {PointerEvent} event */
+  dragHandle(event) {
+    if (!event.buttons) return;
+    const rect = this.frameRect;
+    this.stale = true;
+    this.split = Math.min(1, Math.max(0, (event.clientX - this.getBoundingClientRect().left - rect.left) / rect.width));
+    this.clipPhoto();
+  }
+
+  /** @param {KeyboardEvent} event */
+  keyHandle(event) {
+    const by = { ArrowLeft: -0.02, ArrowRight: 0.02 }[event.key];
+    if (!by) return;
+    event.stopPropagation();
+    event.preventDefault();
+    this.split = Math.min(1, Math.max(0, this.split + by));
+    this.stale = true;
+    this.clipPhoto();
+  }
+}
+
+/** @param {string} hex @returns {[number, number, number]} */
+export function rgb(hex) {
+  const value = parseInt(hex.slice(1), 16);
+  return [((value >> 16) & 255) / 255, ((value >> 8) & 255) / 255, (value & 255) / 255];
+}
+
+customElements.define("irr-stage", Stage);

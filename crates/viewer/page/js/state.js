@@ -1,0 +1,100 @@
+// The state of the page in one object, with an event for each change.
+
+/** @typedef {import("./camera.js").Camera} Camera */
+/** @typedef {import("./camera.js").View} View */
+/** @typedef {import("./math.js").Vec3} Vec3 */
+
+/** What the server says of the scene.
+ * @typedef {{ version: number, step: number | null, kind: string, count: number, sh_degree: number, travels: boolean,
+ *   antialias: boolean, background: Vec3, center: Vec3, up: Vec3, radius: number, height: number, fov: number }} Scene */
+
+/**
+ * @typedef {object} Values
+ * @property {Scene | null} scene
+ * @property {View[]} views
+ * @property {Camera} camera
+ * @property {Vec3} pivot
+ * @property {Vec3} up
+ * @property {number | null} view index of the view that the camera is in, exactly
+ * @property {string} mode what is drawn
+ * @property {"auto" | "served" | "local"} drawing where it is drawn
+ * @property {"orbit" | "fly" | "walk"} navigation
+ * @property {string | null} background as #rrggbb; the scene's own if null
+ * @property {[Vec3, Vec3] | null} clip
+ * @property {"none" | "slider" | "blink" | "error"} compare
+ * @property {boolean} frusta
+ * @property {boolean} axes
+ * @property {boolean} sidebar
+ * @property {string} tab
+ * @property {string} theme
+ * @property {number} speed factor on the speed of flying
+ * @property {"none" | "measure" | "inspect"} tool
+ * @property {Vec3[]} measured
+ * @property {number | null} metres per world unit
+ * @property {object | null} picked
+ * @property {any} train
+ * @property {any} hello
+ * @property {Map<number, number | null>} scores
+ * @property {string} connection
+ * @property {string | null} problem
+ */
+
+/** Values that are kept from visit to visit. */
+const KEPT = ["drawing", "navigation", "frusta", "axes", "sidebar", "tab", "theme", "speed"];
+const STORE = "irradia-viewer";
+
+class State extends EventTarget {
+  constructor() {
+    super();
+    /** @type {Values} */
+    this.values = {
+      scene: null, views: [], camera: { position: [0, 0, -3], rotation: [1, 0, 0, 0], fov: 0.9 }, pivot: [0, 0, 0], up: [0, -1, 0],
+      view: null, mode: "color", drawing: "auto", navigation: "orbit", background: null, clip: null, compare: "none",
+      frusta: false, axes: true, sidebar: innerWidth > 720, tab: "display", theme: "", speed: 1, tool: "none", measured: [],
+      metres: null, picked: null, train: null, hello: null, scores: new Map(), connection: "connecting", problem: null,
+    };
+    try {
+      const kept = JSON.parse(localStorage.getItem(STORE) ?? "{}");
+      for (const key of KEPT) if (key in kept) Object.assign(this.values, { [key]: kept[key] });
+      if (innerWidth <= 720) this.values.sidebar = false;
+    } catch {
+      // Without a store, or with one of another version, the page begins afresh.
+    }
+  }
+
+  /** @template {keyof Values} K @param {K} key @returns {Values[K]} */
+  get(key) {
+    return this.values[key];
+  }
+
+  /** Changes values, then announces each by its name. @param {Partial<Values>} changes */
+  set(changes) {
+    const changed = /** @type {(keyof Values)[]} */ (Object.keys(changes)).filter((key) => this.values[key] !== changes[key]);
+    Object.assign(this.values, changes);
+    for (const key of changed) this.dispatchEvent(new Event(key));
+    if (changed.some((key) => KEPT.includes(key))) this.keep();
+  }
+
+  /** Calls back now, and whenever one of the values changes. @param {(keyof Values)[]} keys @param {() => void} call */
+  watch(keys, call) {
+    for (const key of keys) this.addEventListener(key, call);
+    call();
+  }
+
+  keep() {
+    try {
+      const values = /** @type {any} */ (this.values);
+      localStorage.setItem(STORE, JSON.stringify(Object.fromEntries(KEPT.map((key) => [key, values[key]]))));
+    } catch {
+      // A private window may have no store.
+    }
+  }
+
+  /** The view that the camera is in, exactly. @returns {View | null} */
+  get insideView() {
+    const index = this.values.view;
+    return index === null ? null : (this.values.views[index] ?? null);
+  }
+}
+
+export const state = new State();

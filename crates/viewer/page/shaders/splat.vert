@@ -1,0 +1,33 @@
+#version 300 es
+// A quad around each splat's ellipse, as far as its alpha reaches 1/255.
+precision highp float;
+precision highp int;
+precision highp usampler2D;
+
+layout(location = 0) in uint a_splat;
+uniform usampler2D u_place;
+uniform usampler2D u_look;
+uniform vec2 u_size; // pixels
+uniform int u_shape; // 0 splats, 1 ellipses, 2 rings, 3 points
+
+flat out vec4 v_color;
+out vec2 v_at; // standard deviations; pixels for points
+
+void main() {
+  ivec2 texel = ivec2(int(a_splat & 1023u), int(a_splat >> 10));
+  uvec4 look = texelFetch(u_look, texel, 0);
+  vec2 blue_opacity = unpackHalf2x16(look.y);
+  gl_Position = vec4(2.0, 2.0, 2.0, 1.0);
+  v_at = vec2(0.0);
+  v_color = vec4(0.0);
+  if (blue_opacity.y == 0.0) return;
+  uvec4 place = texelFetch(u_place, texel, 0);
+  float reach = uintBitsToFloat(look.z);
+  if (u_shape != 0) reach = u_shape == 3 ? 2.0 : min(reach, 1.55);
+  vec2 corner = vec2((gl_VertexID & 1) == 0 ? -1.0 : 1.0, (gl_VertexID & 2) == 0 ? -1.0 : 1.0);
+  v_at = reach * corner;
+  vec2 pixel = uintBitsToFloat(place.xy);
+  pixel += u_shape == 3 ? v_at : v_at.x * unpackHalf2x16(place.z) + v_at.y * unpackHalf2x16(place.w);
+  v_color = vec4(unpackHalf2x16(look.x), blue_opacity);
+  gl_Position = vec4(pixel.x / u_size.x * 2.0 - 1.0, 1.0 - pixel.y / u_size.y * 2.0, 0.0, 1.0);
+}

@@ -1,0 +1,234 @@
+//! Splats as they travel to a browser that draws them itself: most important first, so that a picture stands early.
+//!
+//! Little endian. A header of 32 bytes: `IRS1`, number of splats, SH degree, splats per block, four words of zero; then blocks.
+//! A block holds for each of its splats, 32 bytes: mean (3 x f32, world), ln of the standard deviations (3 x f16), opacity (f16),
+//! rotation (48 bits), colour of degree 0 (3 x f16, sRGB); then for each of them the higher bands, see [`band_bytes`]: a factor
+//! (f16), and the coefficients in units of the factor / 127 (i8; coefficient by coefficient, red, green, blue).
+//!
+//! A rotation is the unit quaternion w, x, y, z without its largest component, which is made positive: its index in the top two
+//! of 48 bits (one is unused), then the others in order, 15 bits each, from -1/sqrt(2) to 1/sqrt(2).
+
+use irradia_scene::sh;
+use irradia_splat::Splats;
+use irradia_splat::render::ALPHA_MIN;
+use rayon::prelude::*;
+
+/// Splats per block: of 500,000 the first block is 1.6 %.
+pub(crate) const BLOCK: usize = 8192;
+/// Bytes of the header.
+const HEADER: usize = 32;
+/// Bytes of a splat without its higher bands.
+const CORE: usize = 32;
+
+/// Bytes of the bands above 0 of a splat, a multiple of 16.
+pub(crate) const fn band_bytes(degree: u32) -> usize {
+    16 * degree as usize
+}
+
+/// `splats` in compact form, with bands up to `degree`. Splats that can never be seen are left out.
+pub(crate) fn compact(splats: &Splats, degree: u32) -> Vec<u8> {
+    let degree = degree.min(splats.sh_degree());
+    // Light that a splat may cover: opacity times the area of its largest cross section.
+    let importance = |i: usize| {
+        let mut scales: [f32; 3] = std::array::from_fn(|c| splats.log_scales.get(c, i));
+        scales.sort_unstable_by(f32::total_cmp);
+        splats.opacity(i).ln() + scales[2] + scales[1]
+    };
+    let is_drawn = |i: &u32| {
+        let i = *i as usize;
+        let values = splats
+            .columns()
+            .into_iter()
+            .take(4)
+            .flat_map(|column| (0..column.count()).map(move |c| column.get(c, i)));
+        splats.opacity(i) >= ALPHA_MIN as f32 && values.into_iter().all(f32::is_finite)
+    };
+    let mut order: Vec<(f32, u32)> = (0..splats.len() as u32)
+        .into_par_iter()
+        .filter(is_drawn)
+        .map(|i| (importance(i as usize), i))
+        .collect();
+    order.par_sort_unstable_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
+
+    let band = band_bytes(degree);
+    let mut bytes = vec![0; HEADER + order.len() * (CORE + band)];
+    bytes[..4].copy_from_slice(b"IRS1");
+    for (at, value) in [order.len() as u32, degree, BLOCK as u32].into_iter().enumerate() {
+        bytes[4 + 4 * at..][..4].copy_from_slice(&value.to_le_bytes());
+    }
+    bytes[HEADER..]
+        .par_chunks_mut(BLOCK * (CORE + band))
+        .zip(order.par_chunks(BLOCK))
+        .for_each(|(to, order)| {
+            let (cores, bands) = to.split_at_mut(order.len() * CORE);
+            for (to, (_, i)) in cores.chunks_exact_mut(CORE).zip(order) {
+                write_core(splats, *i as usize, to);
+            }
+            if band > 0 {
+                for (to, (_, i)) in bands.chunks_exact_mut(band).zip(order) {
+                    write_bands(splats, *i as usize, degree, to);
+                }
+            }
+        });
+    bytes
+}
+
+fn write_core(splats: &Splats, i: usize, to: &mut [u8]) {
+    let halves = |to: &mut [u8], values: &[f32]| {
+        for (to, value) in to.chunks_exact_mut(2).zip(values) {
+            to.copy_from_slice(&half(*value).to_le_bytes());
+        }
+    };
+    for (to, value) in to.chunks_exact_mut(4).zip(splats.mean(i)) {
+        to.copy_from_slice(&value.to_le_bytes());
+    }
+    let scale = |c| splats.log_scales.get(c, i);
+    halves(&mut to[12..20], &[scale(0), scale(1), scale(2), splats.opacity(i)]);
+    let rotation = packed_rotation(std::array::from_fn(|c| splats.quats.get(c, i)));
+    to[20..26].copy_from_slice(&rotation.to_le_bytes()[..6]);
+    let color = |c| sh::color_from_dc(splats.sh.get(c, i));
+    halves(&mut to[26..32], &[color(0), color(1), color(2)]);
+}
+
+fn write_bands(splats: &Splats, i: usize, degree: u32, to: &mut [u8]) {
+    let value = |n: usize| splats.sh.get(3 + n, i);
+    let count = 3 * (sh::coefficients(degree) - 1);
+    let largest = (0..count).map(|n| value(n).abs()).fold(0.0, f32::max);
+    // The factor as the browser reads it, rounded up, so that no coefficient exceeds it.
+    let factor = half(largest * 1.001);
+    to[..2].copy_from_slice(&factor.to_le_bytes());
+    let unit = 127.0 / from_half(factor).max(1e-20);
+    for (n, to) in to[2..2 + count].iter_mut().enumerate() {
+        *to = ((value(n) * unit).round() as i8) as u8;
+    }
+}
+
+/// A quaternion in 47 bits, see above.
+fn packed_rotation(q: [f32; 4]) -> u64 {
+    let length = q.iter().map(|v| v * v).sum::<f32>().sqrt();
+    let largest = (0..4).max_by(|a, b| q[*a].abs().total_cmp(&q[*b].abs())).unwrap_or(0);
+    let sign = if q[largest] < 0.0 { -1.0 } else { 1.0 } / length.max(1e-20);
+    let others = (0..4).filter(|c| *c != largest);
+    others.fold((largest as u64) << 45, |bits, c| {
+        // The place of the component follows from how many are left.
+        let value = (q[c] * sign * std::f32::consts::SQRT_2).clamp(-1.0, 1.0);
+        let place = 15 * ((0..4).filter(|d| *d != largest && *d > c).count());
+        bits | ((((value * 0.5 + 0.5) * 32767.0).round() as u64) << place)
+    })
+}
+
+/// The nearest IEEE 754 half-precision number; beyond its range the largest one.
+fn half(value: f32) -> u16 {
+    let bits = value.to_bits();
+    let sign = (bits >> 16 & 0x8000) as u16;
+    let value = f32::from_bits(bits & 0x7fff_ffff);
+    if value.is_nan() {
+        return sign | 0x7e00;
+    }
+    if value >= 65504.0 {
+        return sign | 0x7bff;
+    }
+    if value < 2f32.powi(-14) {
+        // Subnormal: a whole number of 2^-24.
+        return sign | (value * 2f32.powi(24)).round_ties_even() as u16;
+    }
+    // Rebias the exponent from 127 to 15, and round 13 bits to even.
+    let bits = value.to_bits() - (112 << 23);
+    sign | ((bits + 0x0fff + (bits >> 13 & 1)) >> 13) as u16
+}
+
+/// The value of a half-precision number.
+fn from_half(bits: u16) -> f32 {
+    let (sign, magnitude) = (f32::from(1 - 2 * (bits >> 15) as i16), u32::from(bits & 0x7fff));
+    let value = match magnitude {
+        ..0x0400 => magnitude as f32 * 2f32.powi(-24),
+        _ => f32::from_bits((magnitude << 13) + (112 << 23)),
+    };
+    sign * value
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use irradia_splat::logit;
+
+    #[test]
+    fn halves_are_the_nearest() {
+        for (value, bits) in [
+            (0.0, 0),
+            (1.0, 0x3c00),
+            (-2.0, 0xc000),
+            (65504.0, 0x7bff),
+            (1e9, 0x7bff),
+            (6.103_515_6e-5, 0x0400),
+            (5.960_464_5e-8, 1),
+            (0.1, 0x2e66),
+            (1.0 + 2f32.powi(-11), 0x3c00),
+            (1.0 + 3.0 * 2f32.powi(-11), 0x3c02),
+        ] {
+            assert_eq!(half(value), bits, "{value}");
+        }
+        for bits in (0..0x7c00).step_by(7) {
+            assert_eq!(half(from_half(bits)), bits);
+            assert_eq!(half(-from_half(bits)), bits | 0x8000);
+        }
+    }
+
+    /// The inverse of [`packed_rotation`].
+    fn unpacked(bits: u64) -> [f32; 4] {
+        let largest = (bits >> 45 & 3) as usize;
+        let mut q = [0.0; 4];
+        let mut place = 45;
+        for c in (0..4).filter(|c| *c != largest) {
+            place -= 15;
+            q[c] = ((bits >> place & 32767) as f32 / 32767.0 * 2.0 - 1.0) * std::f32::consts::FRAC_1_SQRT_2;
+        }
+        q[largest] = (1.0 - q.iter().map(|v| v * v).sum::<f32>()).max(0.0).sqrt();
+        q
+    }
+
+    #[test]
+    fn rotations_survive() {
+        for q in [
+            [1.0, 0.0, 0.0, 0.0],
+            [0.0, 0.0, 0.0, -3.0],
+            [0.5, -0.5, 0.5, -0.5],
+            [0.1, 0.9, -0.3, 0.2],
+        ] {
+            let length = q.iter().map(|v: &f32| v * v).sum::<f32>().sqrt();
+            let back = unpacked(packed_rotation(q));
+            // Either sign is the same rotation.
+            let dot: f32 = q.iter().zip(back).map(|(a, b)| a * b / length).sum();
+            assert!((dot.abs() - 1.0).abs() < 1e-6, "{q:?} {back:?}");
+        }
+    }
+
+    #[test]
+    fn the_most_important_come_first_and_the_invisible_not_at_all() {
+        let mut splats = Splats::zeros(4, 1);
+        for i in 0..4 {
+            splats.means.set(0, i, i as f32);
+            splats.quats.set(0, i, 1.0);
+            splats.opacity_logits.set(0, i, logit(0.5));
+            for n in 0..9 {
+                splats.sh.set(3 + n, i, (n as f32 - 4.0) * 0.1);
+            }
+        }
+        splats.log_scales.set(1, 2, 2.0);
+        splats.log_scales.set(2, 2, 2.0);
+        splats.opacity_logits.set(0, 0, -9.0);
+        splats.means.set(1, 1, f32::NAN);
+        let bytes = compact(&splats, 3);
+        let word = |at: usize| u32::from_le_bytes(bytes[at..at + 4].try_into().expect("four"));
+        assert_eq!((&bytes[..4], word(4), word(8)), (&b"IRS1"[..], 2, 1));
+        assert_eq!(bytes.len(), HEADER + 2 * (CORE + 16));
+        let x = |splat: usize| f32::from_bits(word(HEADER + splat * CORE));
+        assert_eq!((x(0), x(1)), (2.0, 3.0));
+        let band = &bytes[HEADER + 2 * CORE..];
+        let factor = from_half(u16::from_le_bytes([band[0], band[1]]));
+        for n in 0..9 {
+            let value = f32::from(band[2 + n] as i8) / 127.0 * factor;
+            assert!((value - (n as f32 - 4.0) * 0.1).abs() < 0.002, "{n}: {value}");
+        }
+    }
+}

@@ -1,0 +1,452 @@
+//! Who wants which picture. A page takes a seat, names the picture it wants, and gets it when it is drawn; a newer wish replaces
+//! an older one. At most [`IN_FLIGHT`] pictures travel to a page that has not shown them, so that a slow page gets fewer
+//! pictures, and its own only.
+
+use crate::message::{RawShot, Shot};
+use crate::pace::Pace;
+use std::collections::{BTreeMap, VecDeque};
+use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+use tokio::sync::mpsc;
+
+/// Pages at once.
+pub(crate) const SEATS: usize = 8;
+/// Pictures on the way to a page.
+const IN_FLIGHT: usize = 2;
+/// A camera without a new position for this long is at rest.
+const REST: Duration = Duration::from_millis(100);
+/// Wishes other than pictures that wait.
+const JOBS: usize = 4;
+/// Between two copies of a training's scene passes this many times what a copy and its picture take.
+const AT_REST: u32 = 15;
+/// Least time between two copies of a training's scene.
+const COPIES: Duration = Duration::from_millis(700);
+
+/// A message to a page.
+pub(crate) enum Out {
+    Text(String),
+    Binary(Vec<u8>),
+}
+
+/// A thing to draw or to find out for a page.
+pub(crate) enum Task {
+    Picture {
+        shot: Shot,
+        /// Share of the window's pixels.
+        share: f32,
+        moving: bool,
+        sharp: bool,
+    },
+    Pick {
+        x: f32,
+        y: f32,
+        tag: String,
+        shot: RawShot,
+    },
+    Score {
+        view: usize,
+    },
+}
+
+struct Drawn {
+    id: u64,
+    version: u64,
+    share: f32,
+    sharp: bool,
+}
+
+struct Seat {
+    shot: Option<Shot>,
+    shot_at: Instant,
+    drawn: Option<Drawn>,
+    in_flight: VecDeque<u64>,
+    pace: Pace,
+    jobs: VecDeque<Task>,
+    /// The view to measure next, and the number of views.
+    scores: Option<(usize, usize)>,
+    outbox: mpsc::Sender<Out>,
+}
+
+#[derive(Default)]
+struct State {
+    seats: BTreeMap<u64, Seat>,
+    /// Seats taken so far.
+    taken: u64,
+    /// The seat served last.
+    served: u64,
+    closing: bool,
+    /// Nothing is drawn before this, for the sake of a training.
+    rest_until: Option<Instant>,
+    /// No picture is renewed for a newer scene before this.
+    renew_after: Option<Instant>,
+}
+
+#[derive(Default)]
+pub(crate) struct Desk {
+    state: Mutex<State>,
+    changed: Condvar,
+}
+
+/// Version of the scene, and whether a training competes for the processor.
+#[derive(Clone, Copy)]
+pub(crate) struct Now {
+    pub version: u64,
+    pub training: bool,
+}
+
+impl Desk {
+    fn lock(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Takes a seat, if one is free.
+    pub fn sit(&self, outbox: mpsc::Sender<Out>) -> Option<u64> {
+        let mut state = self.lock();
+        if state.seats.len() >= SEATS || state.closing {
+            return None;
+        }
+        state.taken += 1;
+        let id = state.taken;
+        state.seats.insert(
+            id,
+            Seat {
+                shot: None,
+                shot_at: Instant::now(),
+                drawn: None,
+                in_flight: VecDeque::new(),
+                pace: Pace::default(),
+                jobs: VecDeque::new(),
+                scores: None,
+                outbox,
+            },
+        );
+        Some(id)
+    }
+
+    pub fn leave(&self, seat: u64) {
+        self.lock().seats.remove(&seat);
+        self.changed.notify_all();
+    }
+
+    /// Seats taken.
+    pub fn len(&self) -> usize {
+        self.lock().seats.len()
+    }
+
+    fn with_seat(&self, seat: u64, change: impl FnOnce(&mut Seat)) {
+        if let Some(seat) = self.lock().seats.get_mut(&seat) {
+            change(seat);
+        }
+        self.changed.notify_all();
+    }
+
+    /// The page wants this picture, or none.
+    pub fn want(&self, seat: u64, shot: Option<Shot>) {
+        self.with_seat(seat, |seat| {
+            // The same camera again, after a reconnection for example, is no motion.
+            (seat.shot, seat.shot_at) = (shot, Instant::now());
+        });
+    }
+
+    /// The page shows the picture `id`.
+    pub fn shown(&self, seat: u64, id: u64) {
+        self.with_seat(seat, |seat| {
+            if let Some(at) = seat.in_flight.iter().position(|sent| *sent == id) {
+                seat.in_flight.drain(..=at);
+            }
+        });
+    }
+
+    /// Adds a wish other than a picture; the oldest is dropped if too many wait.
+    pub fn ask(&self, seat: u64, task: Task) {
+        self.with_seat(seat, |seat| {
+            if seat.jobs.len() >= JOBS {
+                seat.jobs.pop_front();
+            }
+            seat.jobs.push_back(task);
+        });
+    }
+
+    /// Measures `views` views for the page.
+    pub fn score(&self, seat: u64, views: usize) {
+        self.with_seat(seat, |seat| seat.scores = (views > 0).then_some((0, views)));
+    }
+
+    /// Something outside has changed: the scene, or the training's state.
+    pub fn wake(&self) {
+        // With the lock, so that no sleeper misses it.
+        drop(self.lock());
+        self.changed.notify_all();
+    }
+
+    pub fn close(&self) {
+        self.lock().closing = true;
+        self.changed.notify_all();
+    }
+
+    /// Whether the picture of `shot` is still wanted by `seat`.
+    pub fn is_wanted(&self, seat: u64, shot: &Shot) -> bool {
+        let state = self.lock();
+        let newest = state.seats.get(&seat).and_then(|seat| seat.shot.as_ref());
+        !state.closing && newest.is_some_and(|newest| newest.id == shot.id)
+    }
+
+    /// Waits for the next task, seats in turn; `None` when closing. `now` is asked again at every wake-up.
+    pub fn next(&self, now: impl Fn() -> Now) -> Option<(u64, Task)> {
+        let mut state = self.lock();
+        loop {
+            if state.closing {
+                return None;
+            }
+            // Not under the lock of the desk: `now` takes others.
+            drop(state);
+            let at = now();
+            state = self.lock();
+            let clock = Instant::now();
+            let mut wake_at: Option<Instant> = None;
+            let mut sooner = |at: Instant| wake_at = Some(wake_at.map_or(at, |other| other.min(at)));
+            match state.rest_until.filter(|until| at.training && *until > clock) {
+                Some(until) => sooner(until),
+                None => {
+                    let after: Vec<u64> = state.seats.range(state.served + 1..).map(|(id, _)| *id).collect();
+                    let before: Vec<u64> = state.seats.range(..=state.served).map(|(id, _)| *id).collect();
+                    for id in after.into_iter().chain(before) {
+                        let renew_after = state.renew_after.filter(|_| at.training);
+                        let seat = state.seats.get_mut(&id).expect("listed");
+                        match seat.next(at, renew_after, clock) {
+                            Next::Now(task) => {
+                                state.served = id;
+                                return Some((id, *task));
+                            }
+                            Next::At(at) => sooner(at),
+                            Next::Nothing => {}
+                        }
+                    }
+                }
+            }
+            state = match wake_at {
+                Some(at) => {
+                    let wait = at.saturating_duration_since(Instant::now());
+                    let waited = self.changed.wait_timeout(state, wait);
+                    waited.unwrap_or_else(PoisonError::into_inner).0
+                }
+                None => self.changed.wait(state).unwrap_or_else(PoisonError::into_inner),
+            };
+        }
+    }
+
+    /// Delivers a picture drawn in `seconds`.
+    #[expect(clippy::too_many_arguments, reason = "a picture and how it came about")]
+    pub fn deliver(
+        &self,
+        seat: u64,
+        shot: &Shot,
+        bytes: Vec<u8>,
+        pixels: f32,
+        seconds: f32,
+        share: f32,
+        moving: bool,
+        sharp: bool,
+        version: u64,
+    ) {
+        self.with_seat(seat, |seat| {
+            seat.pace.learn(pixels, seconds, moving);
+            seat.drawn = Some(Drawn {
+                id: shot.id,
+                version,
+                share,
+                sharp,
+            });
+            // The outbox has more room than pictures may be in flight: a full one belongs to a page that is being closed.
+            if seat.outbox.try_send(Out::Binary(bytes)).is_ok() {
+                seat.in_flight.push_back(shot.id);
+            }
+        });
+    }
+
+    /// Tells a page something.
+    pub fn tell(&self, seat: u64, text: String) {
+        self.with_seat(seat, |seat| drop(seat.outbox.try_send(Out::Text(text))));
+    }
+
+    /// Leaves time to a training after `seconds` of drawing a moving camera.
+    pub fn rest(&self, seconds: f32) {
+        self.lock().rest_until = Some(Instant::now() + Duration::from_secs_f32(0.6 * seconds));
+    }
+
+    /// When the next copy of a training's scene is due, after a picture of the present one that took `seconds` and a copy that took
+    /// `copying`; never while nobody looks.
+    pub fn renewal(&self, seconds: f32, copying: f32) -> Option<Instant> {
+        let mut state = self.lock();
+        if state.seats.is_empty() {
+            return None;
+        }
+        let pause = Duration::from_secs_f32(seconds + copying) * AT_REST;
+        let due = Instant::now() + pause.max(COPIES);
+        state.renew_after = Some(due);
+        Some(due)
+    }
+}
+
+enum Next {
+    Now(Box<Task>),
+    At(Instant),
+    Nothing,
+}
+
+impl Seat {
+    fn next(&mut self, now: Now, renew_after: Option<Instant>, clock: Instant) -> Next {
+        if let Some(job) = self.jobs.pop_front() {
+            return Next::Now(Box::new(job));
+        }
+        let picture = self.picture(now, renew_after, clock);
+        if matches!(picture, Next::Now(_)) {
+            return picture;
+        }
+        // A camera at rest leaves time for measurements.
+        let at_rest = clock.duration_since(self.shot_at) >= REST;
+        match self.scores.filter(|_| at_rest && self.outbox.capacity() > 2) {
+            Some((view, count)) => {
+                self.scores = (view + 1 < count).then_some((view + 1, count));
+                Next::Now(Box::new(Task::Score { view }))
+            }
+            None => picture,
+        }
+    }
+
+    fn picture(&self, now: Now, renew_after: Option<Instant>, clock: Instant) -> Next {
+        let Some(shot) = self
+            .shot
+            .filter(|_| now.version > 0 && self.in_flight.len() < IN_FLIGHT)
+        else {
+            return Next::Nothing;
+        };
+        let same = self.drawn.as_ref().filter(|drawn| drawn.id == shot.id);
+        let picture = |moving: bool, last: Option<f32>| {
+            let (share, sharp) = self.pace.share(&shot, moving, last);
+            Next::Now(Box::new(Task::Picture {
+                shot,
+                share,
+                moving,
+                sharp,
+            }))
+        };
+        let rests_at = self.shot_at + REST;
+        match same {
+            None => picture(true, None),
+            Some(drawn) if drawn.version != now.version => match renew_after.filter(|after| *after > clock) {
+                // The camera has just stopped: it becomes sharp first.
+                _ if !drawn.sharp && rests_at <= clock => picture(false, None),
+                Some(after) => Next::At(after.min(rests_at.max(clock))),
+                None => picture(false, Some(drawn.share)),
+            },
+            Some(drawn) if !drawn.sharp && rests_at <= clock => picture(false, Some(drawn.share)),
+            Some(drawn) if !drawn.sharp => Next::At(rests_at),
+            Some(_) => Next::Nothing,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::message::Mode;
+    use irradia_scene::{Camera, Intrinsics, Pose};
+    use std::sync::Arc;
+
+    fn shot(id: u64) -> Shot {
+        let pose = Pose {
+            rotation: glam::Quat::IDENTITY,
+            position: glam::Vec3::ZERO,
+        };
+        Shot {
+            id,
+            camera: Camera::new(pose, Intrinsics::from_fov_x(100, 100, 1.0)),
+            mode: Mode::Color,
+            background: None,
+            clip: None,
+            view: None,
+        }
+    }
+
+    const STILL: Now = Now {
+        version: 1,
+        training: false,
+    };
+
+    fn next(desk: &Desk) -> (u64, Shot, bool, bool) {
+        match desk.next(|| STILL) {
+            Some((
+                seat,
+                Task::Picture {
+                    shot, moving, sharp, ..
+                },
+            )) => (seat, shot, moving, sharp),
+            _ => panic!("a picture"),
+        }
+    }
+
+    fn deliver(desk: &Desk, seat: u64, shot: &Shot, moving: bool, sharp: bool) {
+        desk.deliver(seat, shot, vec![], 1e4, 0.001, 1.0, moving, sharp, 1);
+    }
+
+    #[test]
+    fn the_newest_wish_wins_and_becomes_sharp_at_rest() {
+        let desk = Desk::default();
+        let (outbox, mut inbox) = mpsc::channel(8);
+        let seat = desk.sit(outbox).expect("free");
+        desk.want(seat, Some(shot(1)));
+        desk.want(seat, Some(shot(2)));
+        let (_, drawn, moving, sharp) = next(&desk);
+        assert!(drawn.id == 2 && moving && !sharp);
+        desk.want(seat, Some(shot(3)));
+        assert!(!desk.is_wanted(seat, &drawn));
+        deliver(&desk, seat, &drawn, true, false);
+        let (_, drawn, ..) = next(&desk);
+        assert_eq!(drawn.id, 3);
+        deliver(&desk, seat, &drawn, true, false);
+        desk.shown(seat, 2);
+        // Nothing newer: the next one, after a moment, is the sharp one of the same wish.
+        let (_, drawn, moving, sharp) = next(&desk);
+        assert!(drawn.id == 3 && !moving && sharp);
+        assert!(inbox.try_recv().is_ok() && inbox.try_recv().is_ok() && inbox.try_recv().is_err());
+    }
+
+    #[test]
+    fn a_page_that_shows_nothing_gets_no_more_and_hurts_no_other() {
+        let desk = Desk::default();
+        let (slow, _slow) = mpsc::channel(8);
+        let (fast, _fast) = mpsc::channel(8);
+        let [slow, fast] = [slow, fast].map(|outbox| desk.sit(outbox).expect("free"));
+        for id in 1..=6 {
+            desk.want(slow, Some(shot(id)));
+            desk.want(fast, Some(shot(id)));
+            let (first, drawn, ..) = next(&desk);
+            deliver(&desk, first, &drawn, true, false);
+            if id <= IN_FLIGHT as u64 {
+                let (second, drawn, ..) = next(&desk);
+                assert_ne!(first, second, "in turn");
+                deliver(&desk, second, &drawn, true, false);
+            } else {
+                assert_eq!(first, fast);
+            }
+            desk.shown(fast, id);
+        }
+    }
+
+    #[test]
+    fn seats_are_bounded_and_closing_ends_the_wait() {
+        let desk = Arc::new(Desk::default());
+        let (outbox, _inbox) = mpsc::channel(8);
+        let seats: Vec<u64> = std::iter::from_fn(|| desk.sit(outbox.clone())).collect();
+        assert_eq!(seats.len(), SEATS);
+        desk.leave(seats[0]);
+        assert!(desk.sit(outbox).is_some());
+        let waiting = std::thread::spawn({
+            let desk = desk.clone();
+            move || desk.next(|| STILL).is_none()
+        });
+        desk.close();
+        assert!(waiting.join().expect("no panic"));
+    }
+}

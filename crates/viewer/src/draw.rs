@@ -1,0 +1,145 @@
+//! The thread that draws: takes one task after the other from the desk.
+
+use crate::desk::{Desk, Now, Task};
+use crate::message::{PictureHeader, Shot, picture};
+use crate::paint::{Painter, Picture};
+use crate::subject::{Edition, Subject};
+use jpeg_encoder::{ColorType, Encoder, SamplingFactor};
+use serde_json::json;
+use std::time::Instant;
+
+/// JPEG quality of a moving camera's pictures.
+const MOVING_QUALITY: u8 = 75;
+/// JPEG quality of a camera at rest: the loss is below what 8 bits show.
+const SHARP_QUALITY: u8 = 96;
+/// Bytes of splats copied per second, for the time that a training loses by it.
+const COPY_RATE: f32 = 1.5e9;
+
+/// Draws until the desk closes.
+pub(crate) fn draw(subject: &Subject, desk: &Desk) {
+    let mut painter = Painter::default();
+    // The version whose successor has been asked for.
+    let mut renewed = 0;
+    let now = || Now {
+        version: subject.edition().map_or(0, |edition| edition.version),
+        training: subject.live.as_ref().is_some_and(|live| live.is_training()),
+    };
+    while let Some((seat, task)) = desk.next(now) {
+        let Some(edition) = subject.edition() else { continue };
+        match task {
+            Task::Picture {
+                shot,
+                share,
+                moving,
+                sharp,
+            } => draw_picture(
+                subject,
+                desk,
+                &mut painter,
+                &edition,
+                seat,
+                &shot,
+                share,
+                moving,
+                sharp,
+                &mut renewed,
+            ),
+            Task::Pick { x, y, tag, shot } => {
+                if let Some(shot) = shot.check() {
+                    let picked = painter.pick(&edition, &shot, x, y, tag);
+                    let mut told = serde_json::to_value(&picked).expect("plain data");
+                    told["tell"] = "picked".into();
+                    desk.tell(seat, told.to_string());
+                }
+            }
+            Task::Score { view } => {
+                let psnr = painter.score(edition.scene(), &subject.views.0[view]);
+                let told = json!({ "tell": "score", "view": view, "psnr": psnr, "step": edition.step() });
+                desk.tell(seat, told.to_string());
+            }
+        }
+    }
+}
+
+fn draw_picture(
+    subject: &Subject,
+    desk: &Desk,
+    painter: &mut Painter,
+    edition: &Edition,
+    seat: u64,
+    shot: &Shot,
+    share: f32,
+    moving: bool,
+    sharp: bool,
+    renewed: &mut u64,
+) {
+    let started = Instant::now();
+    let k = shot.camera.intrinsics.scaled(share.sqrt());
+    let view = shot.view.and_then(|view| subject.views.0.get(view));
+    // Its photograph may be missing: then there is no picture of errors.
+    let shot_drawn = match view.is_some_and(|view| view.photo.is_some()) {
+        true => *shot,
+        false => Shot {
+            mode: if shot.mode == crate::message::Mode::Error {
+                Default::default()
+            } else {
+                shot.mode
+            },
+            ..*shot
+        },
+    };
+    let wanted = || desk.is_wanted(seat, shot);
+    let Some(drawn) = painter.paint(edition, &shot_drawn, (k.width, k.height), view, &wanted) else {
+        return;
+    };
+    let jpeg = to_jpeg(&drawn, if sharp { SHARP_QUALITY } else { MOVING_QUALITY });
+    let seconds = started.elapsed().as_secs_f32();
+    let header = PictureHeader {
+        id: shot.id,
+        width: drawn.width,
+        height: drawn.height,
+        sharp,
+        version: edition.version,
+        milliseconds: 1e3 * seconds,
+        range: drawn.range,
+    };
+    let pixels = drawn.width as f32 * drawn.height as f32;
+    let bytes = picture(&header, &jpeg);
+    desk.deliver(
+        seat,
+        shot,
+        bytes,
+        pixels,
+        seconds,
+        share,
+        moving,
+        sharp,
+        edition.version,
+    );
+    if let Some(live) = &subject.live {
+        if moving {
+            desk.rest(seconds);
+        }
+        if *renewed < edition.version {
+            *renewed = edition.version;
+            let copied = edition.scene().model.splats().map_or(0, |splats| splats.bytes());
+            live.set_due(desk.renewal(seconds, copied as f32 / COPY_RATE));
+        }
+    }
+}
+
+/// A JPEG with colour at full resolution: splats are often a few pixels wide.
+pub(crate) fn to_jpeg(picture: &Picture, quality: u8) -> Vec<u8> {
+    encode(&picture.rgb, picture.width, picture.height, quality)
+}
+
+/// `rgb [H, W, 3]` as a JPEG.
+pub(crate) fn encode(rgb: &[u8], width: u32, height: u32, quality: u8) -> Vec<u8> {
+    let mut bytes = Vec::new();
+    let mut encoder = Encoder::new(&mut bytes, quality);
+    encoder.set_sampling_factor(SamplingFactor::F_1_1);
+    encoder
+        .encode(rgb, width as u16, height as u16, ColorType::Rgb)
+        .expect("sides are below 65,536, and a Vec takes every byte");
+    bytes
+}

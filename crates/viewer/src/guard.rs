@@ -1,0 +1,232 @@
+//! Who may talk to the server: only the page that it served, and beyond this machine only who knows the token.
+//!
+//! - `Host` must be an address, `localhost` or the host that was asked for: a name that an attacker points at this machine (DNS
+//!   rebinding) is refused.
+//! - `Origin`, where a browser sends it, must be this server: no page of another site can open the socket. Fetches of another
+//!   site that carry no origin, such as images, are known by `Sec-Fetch-Site`.
+//! - Beyond loopback every request needs the token: in the address at first, from then on in a cookie.
+
+use axum::http::header::{COOKIE, HOST, ORIGIN};
+use axum::http::{HeaderMap, Method, Uri};
+use std::net::IpAddr;
+
+/// Name of the cookie, and of the parameter of the address.
+pub const TOKEN: &str = "token";
+
+/// Why a request is refused.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Refusal {
+    Method,
+    Host,
+    Origin,
+    Token,
+}
+
+impl Refusal {
+    /// In words, for the log and the answer.
+    pub fn reason(self) -> &'static str {
+        match self {
+            Self::Method => "only GET is answered",
+            Self::Host => "the Host of the request is not this server",
+            Self::Origin => "the request comes from a page of another site",
+            Self::Token => "the address lacks the token: use the one that was printed",
+        }
+    }
+}
+
+/// How a request was let in.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Entry {
+    Plain,
+    /// With the token in its address: the answer sets the cookie.
+    ByAddress,
+}
+
+pub(crate) struct Guard {
+    /// The host asked for with `--host`.
+    pub host: String,
+    /// `None` on loopback.
+    pub token: Option<String>,
+}
+
+impl Guard {
+    /// Checks one request.
+    pub fn check(&self, method: &Method, uri: &Uri, headers: &HeaderMap) -> Result<Entry, Refusal> {
+        if method != Method::GET {
+            return Err(Refusal::Method);
+        }
+        let text = |name: &str| headers.get(name).and_then(|value| value.to_str().ok());
+        let host = text(HOST.as_str()).ok_or(Refusal::Host)?;
+        if headers.get_all(HOST).iter().count() != 1 || !self.is_ours(host) {
+            return Err(Refusal::Host);
+        }
+        match headers.get(ORIGIN) {
+            Some(origin) if origin.as_bytes() != format!("http://{host}").as_bytes() => return Err(Refusal::Origin),
+            _ => {}
+        }
+        // A link on another site may lead to the page; nothing else of it may be used there.
+        let foreign = matches!(text("sec-fetch-site"), Some("cross-site" | "same-site"));
+        if foreign && !(uri.path() == "/" && text("sec-fetch-mode") == Some("navigate")) {
+            return Err(Refusal::Origin);
+        }
+        let Some(token) = &self.token else {
+            return Ok(Entry::Plain);
+        };
+        let query = uri.query().unwrap_or_default().split('&');
+        let in_address = query
+            .filter_map(|pair| pair.split_once('='))
+            .any(|(name, value)| name == TOKEN && same(value, token));
+        if in_address {
+            return Ok(Entry::ByAddress);
+        }
+        let cookies = headers.get_all(COOKIE).iter().filter_map(|value| value.to_str().ok());
+        let mut pairs = cookies
+            .flat_map(|line| line.split(';'))
+            .filter_map(|pair| pair.trim().split_once('='));
+        match pairs.any(|(name, value)| name == TOKEN && same(value, token)) {
+            true => Ok(Entry::Plain),
+            false => Err(Refusal::Token),
+        }
+    }
+
+    /// Whether `host`, with or without a port, names this server. The port may be that of a tunnel.
+    fn is_ours(&self, host: &str) -> bool {
+        let name = match host.rsplit_once(':') {
+            Some((name, port)) if port.parse::<u16>().is_ok() && !name.ends_with(':') => name,
+            _ => host,
+        };
+        let address = name
+            .trim_start_matches('[')
+            .trim_end_matches(']')
+            .parse::<IpAddr>()
+            .ok();
+        match address {
+            Some(address) => self.token.is_some() || address.is_loopback(),
+            None => name.eq_ignore_ascii_case("localhost") || name.eq_ignore_ascii_case(&self.host),
+        }
+    }
+}
+
+/// Compares in a time that does not tell how much is right.
+fn same(a: &str, b: &str) -> bool {
+    a.len() == b.len()
+        && a.bytes()
+            .zip(b.bytes())
+            .fold(0, |different, (a, b)| different | (a ^ b))
+            == 0
+}
+
+/// 128 random bits from the operating system, as hexadecimal digits.
+pub(crate) fn random_token() -> Result<String, getrandom::Error> {
+    let mut bytes = [0; 16];
+    getrandom::fill(&mut bytes)?;
+    Ok(bytes.iter().map(|byte| format!("{byte:02x}")).collect())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn check(guard: &Guard, uri: &str, headers: &[(&'static str, &str)]) -> Result<Entry, Refusal> {
+        let mut map = HeaderMap::new();
+        for (name, value) in headers {
+            map.append(*name, value.parse().expect("a header"));
+        }
+        guard.check(&Method::GET, &uri.parse().expect("a path"), &map)
+    }
+
+    fn local() -> Guard {
+        Guard {
+            host: "127.0.0.1".into(),
+            token: None,
+        }
+    }
+
+    #[test]
+    fn on_loopback_only_its_own_names_and_page_pass() {
+        for host in [
+            "localhost:7979",
+            "127.0.0.1:7979",
+            "[::1]:7979",
+            "LOCALHOST",
+            "127.0.0.1:9000",
+        ] {
+            assert_eq!(check(&local(), "/", &[("host", host)]), Ok(Entry::Plain), "{host}");
+        }
+        for host in [
+            "evil.example",
+            "evil.example:7979",
+            "10.0.0.1:7979",
+            "localhost.evil.example",
+            "",
+            "::1:x",
+        ] {
+            assert_eq!(check(&local(), "/", &[("host", host)]), Err(Refusal::Host), "{host}");
+        }
+        assert_eq!(check(&local(), "/", &[]), Err(Refusal::Host));
+        let twice = [("host", "localhost"), ("host", "localhost")];
+        assert_eq!(check(&local(), "/", &twice), Err(Refusal::Host));
+        let own = [("host", "localhost:7979"), ("origin", "http://localhost:7979")];
+        assert_eq!(check(&local(), "/socket", &own), Ok(Entry::Plain));
+        for origin in [
+            "http://localhost:3000",
+            "https://localhost:7979",
+            "null",
+            "http://evil.example",
+        ] {
+            let foreign = [("host", "localhost:7979"), ("origin", origin)];
+            assert_eq!(check(&local(), "/socket", &foreign), Err(Refusal::Origin), "{origin}");
+        }
+        let image = [
+            ("host", "localhost"),
+            ("sec-fetch-site", "cross-site"),
+            ("sec-fetch-mode", "no-cors"),
+        ];
+        assert_eq!(check(&local(), "/view/0/photo", &image), Err(Refusal::Origin));
+        let link = [
+            ("host", "localhost"),
+            ("sec-fetch-site", "cross-site"),
+            ("sec-fetch-mode", "navigate"),
+        ];
+        assert_eq!(check(&local(), "/", &link), Ok(Entry::Plain));
+        assert_eq!(check(&local(), "/splats", &link), Err(Refusal::Origin));
+        assert_eq!(
+            local().check(&Method::POST, &Uri::from_static("/"), &HeaderMap::new()),
+            Err(Refusal::Method)
+        );
+    }
+
+    #[test]
+    fn beyond_loopback_the_token_is_needed_and_a_name_must_be_asked_for() {
+        let guard = Guard {
+            host: "box".into(),
+            token: Some("0123abcd".into()),
+        };
+        let host = ("host", "10.0.0.7:7979");
+        assert_eq!(check(&guard, "/", &[host]), Err(Refusal::Token));
+        assert_eq!(check(&guard, "/?token=0123abcc", &[host]), Err(Refusal::Token));
+        assert_eq!(check(&guard, "/?a=1&token=0123abcd", &[host]), Ok(Entry::ByAddress));
+        assert_eq!(
+            check(&guard, "/", &[host, ("cookie", "a=b; token=0123abcd")]),
+            Ok(Entry::Plain)
+        );
+        assert_eq!(
+            check(&guard, "/", &[host, ("cookie", "token=0123abcd0")]),
+            Err(Refusal::Token)
+        );
+        assert_eq!(
+            check(&guard, "/?token=0123abcd", &[("host", "box:7979")]),
+            Ok(Entry::ByAddress)
+        );
+        assert_eq!(
+            check(&guard, "/?token=0123abcd", &[("host", "evil.example")]),
+            Err(Refusal::Host)
+        );
+    }
+
+    #[test]
+    fn tokens_differ() {
+        let tokens = [random_token(), random_token()].map(|token| token.expect("random numbers"));
+        assert!(tokens[0] != tokens[1] && tokens[0].len() == 32);
+    }
+}

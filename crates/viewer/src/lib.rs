@@ -1,0 +1,48 @@
+//! A viewer in any browser: for splats and radiance fields, after training and while it runs.
+//!
+//! ```no_run
+//! use irradia_viewer::{Listen, Subject, Viewer};
+//!
+//! let subject = Subject::open("run".as_ref(), None, &Default::default())?;
+//! let viewer = Viewer::start(subject, &Listen::default(), Box::new(|line| eprintln!("{line}")))?;
+//! println!("{}", viewer.address());
+//! viewer.wait(&|| false);
+//! # Ok::<(), irradia_viewer::ViewerError>(())
+//! ```
+//!
+//! | file | idea |
+//! |---|---|
+//! | `subject.rs`, `views.rs`, `live.rs` | what is looked at: a scene, its photographs, a training |
+//! | `desk.rs`, `pace.rs`, `draw.rs` | who wants which picture, when it is drawn, at which size |
+//! | `paint.rs`, `palette.rs` | a camera's picture: colours, depth, normals, counts, ellipses, errors |
+//! | `compact.rs` | splats as they travel to a browser that draws them itself |
+//! | `listen.rs`, `guard.rs`, `serve.rs`, `page.rs` | addresses, who may talk to us, and what is answered |
+//! | `client.rs`, `message.rs` | the socket of one page |
+//!
+//! The page itself is in `page/`: plain modules, styles and shaders, embedded as they are.
+#![forbid(unsafe_code)]
+
+mod client;
+mod compact;
+mod desk;
+mod draw;
+mod error;
+mod guard;
+mod listen;
+mod live;
+mod message;
+mod notices;
+mod pace;
+mod page;
+mod paint;
+mod palette;
+mod serve;
+mod subject;
+mod viewer;
+mod views;
+
+pub use error::ViewerError;
+pub use listen::{DEFAULT_PORT, Listen};
+pub use live::Watcher;
+pub use subject::Subject;
+pub use viewer::Viewer;

@@ -1,0 +1,369 @@
+//! A running training: its state for the pages, and their wishes for it.
+
+use crate::message::Action;
+use irradia_runs::{Run, Snapshot, Snapshots};
+use irradia_train::Trainer;
+use irradia_train::event::{Event, Observer, Signal, StepReport};
+use irradia_train::recipe::Param;
+use irradia_train::report::CurvePoint;
+use irradia_train::schedule::outline;
+use serde::Serialize;
+use serde_json::{Value, json};
+use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
+use std::time::{Duration, Instant};
+
+/// Points of a curve at most: more would not be visible. Beyond it every second one is dropped.
+const CURVE_POINTS: usize = 1024;
+/// Points of the plan.
+const PLAN_POINTS: usize = 200;
+/// Time over which the speed is averaged, seconds.
+const SPEED_OVER: f64 = 3.0;
+
+/// What the training does.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub(crate) enum Phase {
+    Preparing,
+    Training,
+    Paused,
+    Finished,
+}
+
+/// The pages' wishes.
+#[derive(Default)]
+struct Control {
+    paused: bool,
+    one_step: bool,
+    save: bool,
+    stop: bool,
+}
+
+struct History {
+    phase: Phase,
+    newest: Option<StepReport>,
+    total_steps: u64,
+    curve: Vec<CurvePoint>,
+    /// Steps between points of the curve.
+    apart: u64,
+    /// Changes when points were dropped.
+    thinned: u64,
+    stages: Vec<(u64, String)>,
+    /// Moving average of the training views' squared error.
+    mse: Option<f64>,
+    steps_per_second: f64,
+    last_step_at: Option<Instant>,
+    saved: Option<u64>,
+    warning: Option<String>,
+}
+
+/// A part of the history for a page that has the rest.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(crate) struct Known {
+    points: usize,
+    thinned: u64,
+}
+
+pub(crate) struct Live {
+    snapshots: Snapshots,
+    control: Mutex<Control>,
+    history: Mutex<History>,
+    /// When the next copy of the scene may be taken; `None` while nobody looks.
+    due: Mutex<Option<Instant>>,
+    /// Called when the scene may have changed.
+    pub on_change: OnceLock<Box<dyn Fn() + Send + Sync>>,
+    plan: Value,
+}
+
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+impl Live {
+    pub fn new(run: &Run) -> Self {
+        let trainer = run.trainer();
+        let recipe = &trainer.recipe;
+        let points = outline(recipe, PLAN_POINTS);
+        let total = recipe.total_steps().max(1) as f64;
+        let series = |param: Param| -> Value {
+            let point = |at: &irradia_train::schedule::OutlinePoint| json!([at.time / total, at.values[param]]);
+            points.iter().map(point).collect()
+        };
+        let mut from = 0;
+        let stages: Vec<Value> = recipe
+            .stage
+            .iter()
+            .map(|stage| {
+                let start = from;
+                from += stage.steps;
+                json!({ "name": stage.name, "from": start as f64 / total, "to": from as f64 / total })
+            })
+            .collect();
+        let snapshots = run.snapshots();
+        // The first state is taken when training begins.
+        snapshots.request();
+        Self {
+            snapshots,
+            control: Mutex::default(),
+            history: Mutex::new(History {
+                phase: Phase::Preparing,
+                newest: None,
+                total_steps: trainer.total_steps(),
+                curve: Vec::new(),
+                apart: 1,
+                thinned: 0,
+                stages: Vec::new(),
+                mse: None,
+                steps_per_second: 0.0,
+                last_step_at: None,
+                saved: None,
+                warning: None,
+            }),
+            due: Mutex::new(None),
+            on_change: OnceLock::new(),
+            plan: json!({
+                "recipe": recipe.name,
+                "stages": stages,
+                "image_scale": series(Param::ImageScale),
+                "sh_degree": series(Param::ShDegree),
+            }),
+        }
+    }
+
+    /// The last copy of the scene that was taken.
+    pub fn newest(&self) -> Option<Arc<Snapshot>> {
+        self.snapshots.last()
+    }
+
+    /// Whether drawing takes time from the training.
+    pub fn is_training(&self) -> bool {
+        lock(&self.history).phase == Phase::Training
+    }
+
+    /// The next copy of the scene is taken after this time; never if `None`.
+    pub fn set_due(&self, due: Option<Instant>) {
+        *lock(&self.due) = due;
+    }
+
+    /// Someone has begun to look: a copy is taken now unless one is awaited.
+    pub fn look(&self) {
+        lock(&self.due).get_or_insert_with(Instant::now);
+    }
+
+    pub fn act(&self, action: Action) {
+        let mut control = lock(&self.control);
+        match action {
+            Action::Pause => control.paused = true,
+            Action::Resume => control.paused = false,
+            Action::Step => (control.paused, control.one_step) = (true, true),
+            Action::Save => control.save = true,
+            Action::Stop => control.stop = true,
+        }
+    }
+
+    /// The schedule's plan.
+    pub fn plan(&self) -> &Value {
+        &self.plan
+    }
+
+    /// The state of the training, with the points of the curves after `known`, which is updated.
+    pub fn report(&self, known: &mut Known) -> Value {
+        let history = lock(&self.history);
+        if known.thinned != history.thinned {
+            *known = Known {
+                points: 0,
+                thinned: history.thinned,
+            };
+        }
+        let from = known.points.min(history.curve.len());
+        // The last point may still change.
+        known.points = history.curve.len().saturating_sub(1);
+        let newest = history.newest.as_ref();
+        json!({
+            "tell": "train",
+            "phase": history.phase,
+            "step": newest.map_or(0, |report| report.step),
+            "total": history.total_steps,
+            "seconds": newest.map_or(0.0, |report| report.seconds),
+            "left": newest.map(|report| report.seconds_left_range),
+            "loss": newest.map(|report| report.loss),
+            "splats": newest.map_or(0, |report| report.splats),
+            "parameters": newest.and_then(|report| report.parameters),
+            "psnr": history.mse.map(|mse| -10.0 * mse.log10()),
+            "rate": history.steps_per_second,
+            "memory": memory(),
+            "stages": history.stages,
+            "saved": history.saved,
+            "warning": history.warning,
+            "from": from,
+            "curve": history.curve[from..],
+        })
+    }
+
+    fn step(&self, report: &StepReport, trainer: &Trainer) {
+        let mut history = lock(&self.history);
+        let history = &mut *history;
+        let now = Instant::now();
+        if let Some(last) = history.last_step_at {
+            let seconds = now.duration_since(last).as_secs_f64().max(1e-6);
+            let share = 1.0 - (-seconds / SPEED_OVER).exp();
+            let fresh = if history.steps_per_second == 0.0 { 1.0 } else { share };
+            history.steps_per_second += fresh * (1.0 / seconds - history.steps_per_second);
+        }
+        history.last_step_at = Some(now);
+        history.phase = Phase::Training;
+        history.total_steps = trainer.total_steps();
+        history.mse = Some(history.mse.map_or(report.mse, |mean| 0.95 * mean + 0.05 * report.mse));
+        history.newest = Some(*report);
+        let after = history.curve.last().map_or(0, |last| last.step + history.apart);
+        if report.step >= after {
+            history.push(CurvePoint {
+                step: report.step,
+                seconds: report.seconds,
+                loss: report.loss,
+                psnr: None,
+                splats: report.splats as u64,
+            });
+        }
+    }
+
+    fn see(&self, event: &Event, trainer: &Trainer) {
+        match event {
+            Event::Step(report) => self.step(report, trainer),
+            Event::Evaluated {
+                step,
+                seconds,
+                psnr,
+                splats,
+                ..
+            } => lock(&self.history).push(CurvePoint {
+                step: *step,
+                seconds: *seconds,
+                loss: f64::NAN,
+                psnr: Some(*psnr),
+                splats: *splats as u64,
+            }),
+            Event::StageEntered { stage, step, .. } => lock(&self.history).stages.push((*step, stage.clone())),
+            Event::Saved { step, .. } => lock(&self.history).saved = Some(*step),
+            Event::Warned { message } => lock(&self.history).warning = Some(message.clone()),
+            Event::Paused { .. } => lock(&self.history).phase = Phase::Paused,
+            Event::Resumed { .. } => {
+                let mut history = lock(&self.history);
+                (history.phase, history.last_step_at) = (Phase::Training, None);
+            }
+            Event::Finished { .. } => lock(&self.history).phase = Phase::Finished,
+            Event::Started { total_steps, .. } => lock(&self.history).total_steps = *total_steps,
+            Event::Densified { .. } | Event::Decided { .. } => {}
+        }
+        self.take_copies();
+        if matches!(event, Event::Finished { .. } | Event::Paused { .. }) {
+            self.changed();
+        }
+    }
+
+    /// Requests a copy of the scene if one is due, and announces one that was taken.
+    fn take_copies(&self) {
+        let mut due = lock(&self.due);
+        if due.is_some_and(|due| due <= Instant::now()) {
+            // The desk sets the next time when it has drawn this copy; until then one a minute.
+            *due = Some(Instant::now() + Duration::from_secs(60));
+            self.snapshots.request();
+        }
+        drop(due);
+        self.changed();
+    }
+
+    fn changed(&self) {
+        if let Some(on_change) = self.on_change.get() {
+            on_change();
+        }
+    }
+
+    fn signal(&self, role: Role) -> Signal {
+        let mut control = lock(&self.control);
+        match role {
+            Role::Saves if std::mem::take(&mut control.save) => Signal::Save,
+            Role::Saves => Signal::Continue,
+            Role::Controls if control.stop => Signal::Stop,
+            Role::Controls if control.paused => Signal::Pause,
+            Role::Controls => Signal::Continue,
+        }
+    }
+}
+
+impl History {
+    fn push(&mut self, point: CurvePoint) {
+        match self.curve.last_mut() {
+            Some(last) if last.step == point.step => last.psnr = point.psnr.or(last.psnr),
+            _ => self.curve.push(point),
+        }
+        if self.curve.len() > CURVE_POINTS {
+            let mut index = 0;
+            self.curve.retain(|point| {
+                index += 1;
+                point.psnr.is_some() || index % 2 == 1
+            });
+            self.apart *= 2;
+            self.thinned += 1;
+        }
+    }
+}
+
+/// Memory in use, bytes; 0 where the system does not report it.
+fn memory() -> u64 {
+    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
+    let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:"));
+    let kib = line.and_then(|line| line.split_ascii_whitespace().next()?.parse::<u64>().ok());
+    kib.unwrap_or(0) * 1024
+}
+
+/// What a [`Watcher`] answers for: a request to save must not end a pause.
+#[derive(Clone, Copy)]
+enum Role {
+    Controls,
+    Saves,
+}
+
+/// The observers that connect a training with its viewer, to be given to [`Run::train`].
+pub struct Watcher {
+    controls: Observing,
+    saves: Observing,
+}
+
+struct Observing(Arc<Live>, Role);
+
+impl Watcher {
+    pub(crate) fn new(live: Arc<Live>) -> Self {
+        Self {
+            controls: Observing(live.clone(), Role::Controls),
+            saves: Observing(live, Role::Saves),
+        }
+    }
+
+    /// Both observers.
+    pub fn observers(&mut self) -> [&mut dyn Observer; 2] {
+        [&mut self.controls, &mut self.saves]
+    }
+}
+
+impl Observer for Observing {
+    fn on_event(&mut self, event: &Event, trainer: &Trainer) -> Signal {
+        if matches!(self.1, Role::Controls) {
+            self.0.see(event, trainer);
+        }
+        self.0.signal(self.1)
+    }
+
+    fn wants_stop(&self) -> bool {
+        lock(&self.0.control).stop
+    }
+
+    fn while_paused(&mut self, _trainer: &Trainer) -> Signal {
+        if matches!(self.1, Role::Controls) {
+            self.0.take_copies();
+            if std::mem::take(&mut lock(&self.0.control).one_step) {
+                return Signal::Continue;
+            }
+        }
+        self.0.signal(self.1)
+    }
+}

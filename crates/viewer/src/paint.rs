@@ -1,0 +1,485 @@
+//! The picture of a camera: colours, depth, alpha, normals, counts, ellipses, or the error against a photograph.
+
+use crate::message::{Mode, Picked, PickedSplat, Shot};
+use crate::palette;
+use crate::subject::Edition;
+use crate::views::SeenView;
+use glam::{Vec2, Vec3};
+use irradia_field::{Field, render_view};
+use irradia_runs::Scene;
+use irradia_scene::{Camera, Intrinsics, Photo, sh};
+use irradia_splat::render::Shape;
+use irradia_splat::{RenderOptions, Renderer, Splats};
+use irradia_train::model::{Model, render_splats};
+use rayon::prelude::*;
+use std::sync::Arc;
+
+/// Rows of a field that are drawn between two looks at whether the picture is still wanted.
+const ROWS: u32 = 32;
+/// Opacity of a splat outside the clipping box, before the sigmoid: far below 1/255.
+const HIDDEN: f32 = -30.0;
+/// Error that is drawn in the last colour.
+const WORST: f32 = 0.25;
+/// Pixels below this coverage have no depth.
+const COVERED: f32 = 0.5;
+
+/// A picture, 8 bits, `[H, W, 3]`.
+pub(crate) struct Picture {
+    pub width: u32,
+    pub height: u32,
+    pub rgb: Vec<u8>,
+    /// Values at both ends of the colour map, if there is one.
+    pub range: Option<[f32; 2]>,
+}
+
+/// A frame as planes of `[H * W]`.
+struct Planes {
+    /// Three planes.
+    color: Vec<f32>,
+    alpha: Vec<f32>,
+    /// Expected depth; empty if not requested.
+    depth: Vec<f32>,
+}
+
+/// Draws pictures; reuses its buffers from picture to picture.
+#[derive(Default)]
+pub(crate) struct Painter {
+    renderer: Renderer,
+    /// Splats that differ from the scene's: clipped, or coloured by their normals.
+    altered: Option<(Alteration, Splats)>,
+    /// The last photograph that was read, by its view.
+    photo: Option<(usize, Arc<Photo>)>,
+}
+
+#[derive(Clone, Copy, PartialEq)]
+struct Alteration {
+    version: u64,
+    clip: Option<[[f32; 3]; 2]>,
+    normals: bool,
+}
+
+impl Painter {
+    /// Draws `shot` with `width` x `height` pixels; `None` if it is abandoned meanwhile, or its photograph cannot be read.
+    pub fn paint(
+        &mut self,
+        edition: &Edition,
+        shot: &Shot,
+        (width, height): (u32, u32),
+        view: Option<&SeenView>,
+        wanted: &(dyn Fn() -> bool + Sync),
+    ) -> Option<Picture> {
+        let scene = edition.scene();
+        let mut camera = shot.camera;
+        camera.intrinsics = camera.intrinsics.resized(width, height);
+        let options = RenderOptions {
+            background: shot.background.unwrap_or(scene.options.background),
+            depth: shot.mode == Mode::Depth,
+            ..scene.options
+        };
+        let (rgb, range) = match (&scene.model, shot.mode) {
+            (Model::Splats { splats, residual }, mode) => {
+                let altered = self.altered(edition, splats, shot, &camera);
+                let options = RenderOptions {
+                    sh_degree: if mode == Mode::Normals { 0 } else { options.sh_degree },
+                    ..options
+                };
+                let splats = altered.as_ref().map_or(splats.as_ref(), |(_, splats)| splats);
+                let residual = residual.as_deref().filter(|_| mode != Mode::Normals);
+                render_splats(splats, residual, &mut self.renderer, &camera, &options);
+                let drawn = self.splats_picture(mode, &options, (width, height), shot, view);
+                self.altered = altered;
+                drawn?
+            }
+            (Model::Field(field), mode) => {
+                let planes = field_planes(field, &camera, &options, mode == Mode::Normals, wanted)?;
+                self.planes_picture(mode, &planes, options.background, (width, height), shot, view)?
+            }
+        };
+        Some(Picture {
+            width,
+            height,
+            rgb,
+            range,
+        })
+    }
+
+    /// The splats to draw instead of the scene's, made for this camera.
+    fn altered(
+        &mut self,
+        edition: &Edition,
+        splats: &Splats,
+        shot: &Shot,
+        camera: &Camera,
+    ) -> Option<(Alteration, Splats)> {
+        let alteration = Alteration {
+            version: edition.version,
+            clip: shot.clip,
+            normals: shot.mode == Mode::Normals,
+        };
+        if alteration.clip.is_none() && !alteration.normals {
+            return None;
+        }
+        let kept = self.altered.take().filter(|(kept, _)| *kept == alteration);
+        let (_, mut altered) = kept.unwrap_or_else(|| (alteration, alter(splats, &alteration)));
+        if alteration.normals {
+            face(&mut altered, camera.pose.position);
+        }
+        Some((alteration, altered))
+    }
+
+    fn splats_picture(
+        &mut self,
+        mode: Mode,
+        options: &RenderOptions,
+        size: (u32, u32),
+        shot: &Shot,
+        view: Option<&SeenView>,
+    ) -> Option<(Vec<u8>, Option<[f32; 2]>)> {
+        let shape = match mode {
+            Mode::Ellipses => Some(Shape::Ellipses),
+            Mode::Rings => Some(Shape::Rings),
+            Mode::Points => Some(Shape::Points),
+            _ => None,
+        };
+        if let Some(shape) = shape {
+            return Some((to_rgb(&self.renderer.shapes(shape, options.background)), None));
+        }
+        if mode == Mode::Count {
+            return Some(counts_picture(&self.renderer.counts()));
+        }
+        if mode == Mode::Color || mode == Mode::Normals {
+            return Some((to_rgb(self.renderer.color()), None));
+        }
+        let alpha = self.renderer.alpha().to_vec();
+        let depth = self
+            .renderer
+            .depth()
+            .iter()
+            .zip(&alpha)
+            .map(|(d, a)| d / a.max(1e-6))
+            .collect();
+        let planes = Planes {
+            color: self.renderer.color().to_vec(),
+            alpha,
+            depth,
+        };
+        self.planes_picture(mode, &planes, options.background, size, shot, view)
+    }
+
+    fn planes_picture(
+        &mut self,
+        mode: Mode,
+        planes: &Planes,
+        background: [f32; 3],
+        size: (u32, u32),
+        shot: &Shot,
+        view: Option<&SeenView>,
+    ) -> Option<(Vec<u8>, Option<[f32; 2]>)> {
+        Some(match mode {
+            Mode::Depth => depth_picture(&planes.depth, &planes.alpha),
+            Mode::Alpha => {
+                let grey = planes.alpha.iter().map(|a| [to_8_bits(*a); 3]);
+                (grey.flatten().collect(), Some([0.0, 1.0]))
+            }
+            Mode::Error => {
+                let photo = self.photo(shot.view?, view?)?;
+                let truth = photo.resized(size.0, size.1).over(background);
+                error_picture(&planes.color, &truth)
+            }
+            // A field has no splats: their number and shapes are drawn as its colours.
+            _ => (to_rgb(&planes.color), None),
+        })
+    }
+
+    /// The photograph of view `index`.
+    fn photo(&mut self, index: usize, view: &SeenView) -> Option<Arc<Photo>> {
+        if let Some((_, photo)) = self.photo.as_ref().filter(|(kept, _)| *kept == index) {
+            return Some(photo.clone());
+        }
+        let photo = Arc::new(view.photo.as_ref()?.load().ok()?);
+        self.photo = Some((index, photo.clone()));
+        Some(photo)
+    }
+
+    /// PSNR of `scene` against the photograph of `view`, dB; `None` if there is none.
+    pub fn score(&mut self, scene: &Scene, view: &SeenView) -> Option<f64> {
+        let photo = view.photo.as_ref()?.load().ok()?;
+        let k = &view.camera.intrinsics;
+        let truth = photo.resized(k.width, k.height);
+        let (truth, mask) = (truth.over(scene.options.background), truth.mask);
+        let frame = scene.model.render(&mut self.renderer, &view.camera, &scene.options);
+        let render = frame.color.to_u8();
+        let (mut sum, mut count) = (0u64, 0u64);
+        for (i, (a, b)) in render.chunks_exact(3).zip(truth.chunks_exact(3)).enumerate() {
+            if mask.as_ref().is_none_or(|mask| mask[i] != 0) {
+                sum += a
+                    .iter()
+                    .zip(b)
+                    .map(|(a, b)| u64::from(a.abs_diff(*b)).pow(2))
+                    .sum::<u64>();
+                count += 3;
+            }
+        }
+        (count > 0).then(|| -10.0 * (sum.max(1) as f64 / (count as f64 * 255.0 * 255.0)).log10())
+    }
+
+    /// What is at the pixel `(x, y)` of `shot`.
+    pub fn pick(&mut self, edition: &Edition, shot: &Shot, x: f32, y: f32, tag: String) -> Picked {
+        let scene = edition.scene();
+        let k = &shot.camera.intrinsics;
+        let nothing = Picked {
+            tag,
+            ..Picked::default()
+        };
+        if !(x >= 0.0 && y >= 0.0 && x < k.width as f32 && y < k.height as f32) {
+            return nothing;
+        }
+        let pixel = Vec2::new(x.floor() + 0.5, y.floor() + 0.5);
+        let (depth, splat) = match &scene.model {
+            Model::Splats { splats, residual } => {
+                let altered = self.altered(
+                    edition,
+                    splats,
+                    &Shot {
+                        mode: Mode::Color,
+                        ..*shot
+                    },
+                    &shot.camera,
+                );
+                let drawn = altered.as_ref().map_or(splats.as_ref(), |(_, splats)| splats);
+                render_splats(
+                    drawn,
+                    residual.as_deref(),
+                    &mut self.renderer,
+                    &shot.camera,
+                    &scene.options,
+                );
+                self.altered = altered;
+                let hits = self.renderer.hits(x as u32, y as u32);
+                let mut transmittance = 1.0;
+                let surface = hits.iter().find(|hit| {
+                    transmittance -= hit.weight;
+                    transmittance < 0.5
+                });
+                let best = hits.iter().max_by(|a, b| a.weight.total_cmp(&b.weight));
+                let depth = surface.map(|hit| hit.depth);
+                (depth, best.map(|best| picked_splat(splats, best, hits.len())))
+            }
+            Model::Field(field) => {
+                let camera = pixel_of(&shot.camera, x.floor(), y.floor());
+                let options = irradia_field::RenderOptions::default();
+                let depth = render_view(field, &camera, &options).median_depth[0];
+                ((depth > 0.0).then_some(depth), None)
+            }
+        };
+        let direction = shot.camera.ray_direction(pixel);
+        let along = direction.dot(shot.camera.pose.rotation * Vec3::Z);
+        Picked {
+            point: depth.map(|depth| (shot.camera.pose.position + direction * (depth / along)).to_array()),
+            depth,
+            splat,
+            ..nothing
+        }
+    }
+}
+
+fn picked_splat(splats: &Splats, hit: &irradia_splat::render::Hit, of: usize) -> PickedSplat {
+    let i = hit.splat as usize;
+    let mut scales: [f32; 3] = std::array::from_fn(|c| splats.log_scales.get(c, i).exp());
+    scales.sort_unstable_by(|a, b| b.total_cmp(a));
+    PickedSplat {
+        index: hit.splat,
+        of,
+        mean: splats.mean(i),
+        scales,
+        opacity: splats.opacity(i),
+        color: hit.color.map(|c| c.min(1.0)),
+        depth: hit.depth,
+        weight: hit.weight,
+    }
+}
+
+/// The camera of the single pixel `(x, y)`.
+fn pixel_of(camera: &Camera, x: f32, y: f32) -> Camera {
+    let k = camera.intrinsics;
+    Camera {
+        intrinsics: Intrinsics {
+            width: 1,
+            height: 1,
+            cx: k.cx - x,
+            cy: k.cy - y,
+            ..k
+        },
+        ..*camera
+    }
+}
+
+/// A copy of `splats`: outside the box hidden, coloured by normals if requested.
+fn alter(splats: &Splats, alteration: &Alteration) -> Splats {
+    let n = splats.len();
+    let mut altered = if alteration.normals {
+        let mut plain = Splats::zeros(n, 0);
+        plain.means.clone_from(&splats.means);
+        plain.quats.clone_from(&splats.quats);
+        plain.log_scales.clone_from(&splats.log_scales);
+        plain.opacity_logits.clone_from(&splats.opacity_logits);
+        let normals: Vec<[f32; 3]> = (0..n).into_par_iter().map(|i| splats.shortest_axis(i)).collect();
+        for c in 0..3 {
+            for (to, normal) in plain.sh.plane_mut(c).iter_mut().zip(&normals) {
+                // The colour is half of the normal plus a half.
+                *to = sh::dc_from_color(0.5 + 0.5 * normal[c]);
+            }
+        }
+        plain
+    } else {
+        splats.clone()
+    };
+    if let Some([low, high]) = alteration.clip {
+        for i in 0..n {
+            let mean = splats.mean(i);
+            if (0..3).any(|c| mean[c] < low[c] || mean[c] > high[c]) {
+                altered.opacity_logits.set(0, i, HIDDEN);
+            }
+        }
+    }
+    altered
+}
+
+/// Turns normals, kept as harmonics of degree 0, towards the camera at `center`.
+fn face(splats: &mut Splats, center: Vec3) {
+    for i in 0..splats.len() {
+        let outward = Vec3::from(splats.mean(i)) - center;
+        let normal = Vec3::from_array(std::array::from_fn(|c| splats.sh.get(c, i)));
+        if normal.dot(outward) > 0.0 {
+            for (c, value) in normal.to_array().into_iter().enumerate() {
+                splats.sh.set(c, i, -value);
+            }
+        }
+    }
+}
+
+/// A field's view, strip by strip while it is wanted.
+fn field_planes(
+    field: &Field,
+    camera: &Camera,
+    options: &RenderOptions,
+    normals: bool,
+    wanted: &(dyn Fn() -> bool + Sync),
+) -> Option<Planes> {
+    let k = camera.intrinsics;
+    let row = k.width as usize;
+    let pixels = row * k.height as usize;
+    let mut planes = Planes {
+        color: vec![0.0; 3 * pixels],
+        alpha: Vec::with_capacity(pixels),
+        depth: Vec::with_capacity(pixels),
+    };
+    for top in (0..k.height).step_by(ROWS as usize) {
+        if !wanted() {
+            return None;
+        }
+        let strip = Camera {
+            intrinsics: Intrinsics {
+                height: ROWS.min(k.height - top),
+                cy: k.cy - top as f32,
+                ..k
+            },
+            ..*camera
+        };
+        let drawn = render_view(
+            field,
+            &strip,
+            &irradia_field::RenderOptions {
+                background: options.background,
+                image: None,
+                normals,
+            },
+        );
+        let (from, len) = (top as usize * row, drawn.alpha.len());
+        for c in 0..3 {
+            let to = &mut planes.color[c * pixels + from..][..len];
+            if normals {
+                let plane = drawn.normals[c * len..][..len].iter().zip(&drawn.alpha);
+                for (to, (normal, alpha)) in to.iter_mut().zip(plane) {
+                    *to = (0.5 + 0.5 * normal) * alpha + options.background[c] * (1.0 - alpha);
+                }
+            } else {
+                to.copy_from_slice(&drawn.color[c * len..][..len]);
+            }
+        }
+        planes.alpha.extend(drawn.alpha);
+        planes.depth.extend(drawn.depth);
+    }
+    Some(planes)
+}
+
+fn to_8_bits(value: f32) -> u8 {
+    (value.clamp(0.0, 1.0) * 255.0).round() as u8
+}
+
+fn mapped(color: [f32; 3]) -> [u8; 3] {
+    color.map(to_8_bits)
+}
+
+/// Three planes as interleaved 8 bits.
+fn to_rgb(planes: &[f32]) -> Vec<u8> {
+    let pixels = planes.len() / 3;
+    let [red, green, blue] = [0, 1, 2].map(|c| &planes[c * pixels..][..pixels]);
+    let mut rgb = vec![0; 3 * pixels];
+    rgb.par_chunks_mut(3 * 4096).enumerate().for_each(|(chunk, to)| {
+        let from = chunk * 4096;
+        for (i, to) in to.chunks_exact_mut(3).enumerate() {
+            to[0] = to_8_bits(red[from + i]);
+            to[1] = to_8_bits(green[from + i]);
+            to[2] = to_8_bits(blue[from + i]);
+        }
+    });
+    rgb
+}
+
+/// The next value below (or above, if `up`) of a grid of ten per decade, so that a scale does not flicker.
+fn snapped(value: f32, up: bool) -> f32 {
+    let at = 10.0 * value.log10();
+    10f32.powf(if up { at.ceil() } else { at.floor() } / 10.0)
+}
+
+/// Depth in logarithmic colours, near is light, between its first and its last percent.
+fn depth_picture(depth: &[f32], alpha: &[f32]) -> (Vec<u8>, Option<[f32; 2]>) {
+    let covered = || depth.iter().zip(alpha).filter(|(d, a)| **a > COVERED && **d > 0.0);
+    let mut sample: Vec<f32> = covered().step_by(7).map(|(d, _)| *d).collect();
+    sample.sort_unstable_by(f32::total_cmp);
+    let at = |share: f32| sample.get((sample.len() as f32 * share) as usize).copied();
+    let (Some(near), Some(far)) = (at(0.01), at(0.99)) else {
+        return (vec![0; 3 * depth.len()], None);
+    };
+    let (near, far) = (snapped(near, false), snapped(far, true));
+    let scale = 1.0 / (far / near).ln().max(1e-6);
+    let color = |(d, a): (&f32, &f32)| {
+        if *a > COVERED && *d > 0.0 {
+            mapped(palette::even(1.0 - (d / near).ln() * scale))
+        } else {
+            [0; 3]
+        }
+    };
+    let rgb = depth.iter().zip(alpha).flat_map(color).collect();
+    (rgb, Some([near, far]))
+}
+
+/// Counts in logarithmic colours up to the next power of two.
+fn counts_picture(counts: &[f32]) -> (Vec<u8>, Option<[f32; 2]>) {
+    let most = counts.iter().copied().fold(1.0, f32::max);
+    let most = 2f32.powf(most.log2().ceil());
+    let scale = 1.0 / (1.0 + most).ln();
+    let color = |count: &f32| mapped(palette::even((1.0 + count).ln() * scale));
+    (counts.iter().flat_map(color).collect(), Some([0.0, most]))
+}
+
+/// The mean absolute difference over the channels.
+fn error_picture(color: &[f32], truth: &[u8]) -> (Vec<u8>, Option<[f32; 2]>) {
+    let pixels = color.len() / 3;
+    let error = |i: usize| {
+        let channel = |c: usize| (color[c * pixels + i].clamp(0.0, 1.0) - f32::from(truth[3 * i + c]) / 255.0).abs();
+        mapped(palette::heat((0..3).map(channel).sum::<f32>() / 3.0 / WORST))
+    };
+    ((0..pixels).flat_map(error).collect(), Some([0.0, WORST]))
+}

@@ -1,0 +1,182 @@
+//! What is looked at: a scene that stays, or the state of a training.
+
+use crate::ViewerError;
+use crate::live::{Live, Watcher};
+use crate::views::Views;
+use irradia_runs::{Reading, Run, RunFolder, Scene, Snapshot, TrainInput, scene_of};
+use irradia_scene::Dataset;
+use irradia_splat::Splats;
+use irradia_splat::init::{InitOptions, from_points};
+use irradia_train::model::{Model, RenderOptions};
+use std::borrow::Cow;
+use std::path::Path;
+use std::sync::{Arc, Mutex, PoisonError};
+
+/// A version of the scene.
+#[derive(Clone)]
+pub(crate) struct Edition {
+    /// Counts up from 1.
+    pub version: u64,
+    held: Held,
+}
+
+#[derive(Clone)]
+enum Held {
+    Scene(Arc<Scene>),
+    Snapshot(Arc<Snapshot>),
+}
+
+impl Edition {
+    /// The scene.
+    pub fn scene(&self) -> &Scene {
+        match &self.held {
+            Held::Scene(scene) => scene,
+            Held::Snapshot(snapshot) => &snapshot.scene,
+        }
+    }
+
+    /// Steps of training, if it is a training's.
+    pub fn step(&self) -> Option<u64> {
+        match &self.held {
+            Held::Scene(_) => None,
+            Held::Snapshot(snapshot) => Some(snapshot.step),
+        }
+    }
+}
+
+/// What a [`Viewer`](crate::Viewer) shows.
+pub struct Subject {
+    pub(crate) title: String,
+    pub(crate) views: Views,
+    pub(crate) live: Option<Arc<Live>>,
+    /// Where the length of the unit is kept.
+    pub(crate) folder: Option<RunFolder>,
+    /// The recipe as TOML, if known.
+    pub(crate) recipe: Option<String>,
+    edition: Mutex<Option<Edition>>,
+    /// Omissions, one line each.
+    pub warnings: Vec<String>,
+}
+
+impl Subject {
+    /// Reads the run, the scene or the dataset at `path`. Photographs come from `data`, else from the dataset of the run; a dataset
+    /// itself is shown by its points.
+    ///
+    /// # Errors
+    /// When there is nothing to show, or it cannot be read.
+    pub fn open(path: &Path, data: Option<&Path>, reading: &Reading) -> Result<Self, ViewerError> {
+        let folder = RunFolder::containing(path);
+        let file = scene_of(path);
+        if file.is_dir() {
+            if folder.is_some() {
+                return Err(ViewerError::Unfinished { path: path.to_owned() });
+            }
+            return Ok(Self::of_dataset(path, reading.read(path)?));
+        }
+        let scene = Scene::read(&file)?;
+        let mut warnings = Vec::new();
+        let dataset = match (data, &folder) {
+            (Some(data), _) => Some(reading.read(data)?),
+            // A run's photographs may have moved: its scene can be looked at without them.
+            (None, Some(folder)) => TrainInput::of_run(folder.path())
+                .and_then(|input| input.reading.read(&input.data))
+                .map_err(|error| warnings.push(format!("no photographs: {error}")))
+                .ok(),
+            (None, None) => None,
+        };
+        let cameras = scene.cameras.clone();
+        let views = match dataset.map(|dataset| scene.place(dataset)) {
+            Some(dataset) => Views::of_dataset(&Arc::new(dataset), cameras.as_deref()),
+            None => Views::of_cameras(cameras.as_deref().unwrap_or(&[])),
+        };
+        let recipe = folder
+            .as_ref()
+            .and_then(|folder| std::fs::read_to_string(folder.file("recipe.toml")).ok());
+        Ok(Self {
+            title: title(path),
+            views,
+            live: None,
+            folder,
+            recipe,
+            edition: Mutex::new(Some(Edition {
+                version: 1,
+                held: Held::Scene(Arc::new(scene)),
+            })),
+            warnings,
+        })
+    }
+
+    /// The points of a dataset as small opaque splats.
+    fn of_dataset(path: &Path, dataset: Dataset) -> Self {
+        let options = InitOptions {
+            opacity: 0.9,
+            scale: 0.3,
+            sh_degree: 0,
+        };
+        let splats = match &dataset.points {
+            Some(points) if !points.is_empty() => from_points(points, &options),
+            _ => Splats::zeros(0, 0),
+        };
+        let cameras: Arc<[_]> = dataset.views.iter().map(|view| view.camera).collect();
+        let scene = Scene {
+            model: Model::Splats {
+                splats: Cow::Owned(splats),
+                residual: None,
+            },
+            options: RenderOptions::default(),
+            cameras: Some(cameras),
+            world_from_dataset: dataset.world_from_dataset,
+        };
+        let warnings = dataset.warnings.clone();
+        Self {
+            title: title(path),
+            views: Views::of_dataset(&Arc::new(dataset), None),
+            live: None,
+            folder: None,
+            recipe: None,
+            edition: Mutex::new(Some(Edition {
+                version: 1,
+                held: Held::Scene(Arc::new(scene)),
+            })),
+            warnings,
+        }
+    }
+
+    /// A training, and the observer to give to [`Run::train`].
+    pub fn of_run(run: &Run) -> (Self, Watcher) {
+        let trainer = run.trainer();
+        let cameras: Vec<_> = trainer.dataset.train.iter().map(|view| trainer.camera(*view)).collect();
+        let live = Arc::new(Live::new(run));
+        let subject = Self {
+            title: title(run.folder().path()),
+            views: Views::of_dataset(&trainer.dataset, Some(&cameras)),
+            live: Some(live.clone()),
+            folder: Some(run.folder().clone()),
+            recipe: Some(trainer.recipe.to_toml()),
+            edition: Mutex::default(),
+            warnings: Vec::new(),
+        };
+        (subject, Watcher::new(live))
+    }
+
+    /// The newest version, if there is one: a training has none before its first step.
+    pub(crate) fn edition(&self) -> Option<Edition> {
+        let mut edition = self.edition.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(snapshot) = self.live.as_ref().and_then(|live| live.newest()) {
+            let known = edition.as_ref().and_then(Edition::step);
+            if known != Some(snapshot.step) {
+                *edition = Some(Edition {
+                    version: edition.as_ref().map_or(1, |old| old.version + 1),
+                    held: Held::Snapshot(snapshot),
+                });
+            }
+        }
+        edition.clone()
+    }
+}
+
+fn title(path: &Path) -> String {
+    let path = path.canonicalize().unwrap_or(path.to_owned());
+    let parts: Vec<_> = path.iter().rev().take(2).map(|part| part.to_string_lossy()).collect();
+    parts.into_iter().rev().collect::<Vec<_>>().join("/")
+}

@@ -1,0 +1,158 @@
+//! The running server.
+
+use crate::draw::draw;
+use crate::guard::{Guard, TOKEN, random_token};
+use crate::listen::{Listen, accept, open_browser, reachable};
+use crate::notices::{Notices, Tell};
+use crate::serve::{Shared, router};
+use crate::{Subject, ViewerError};
+use std::io;
+use std::sync::Arc;
+use std::thread::{self, JoinHandle};
+use std::time::{Duration, Instant};
+use tokio::sync::Notify;
+
+/// Interval at which a waiting program looks whether it should stop: no load that could be measured.
+const LOOK: Duration = Duration::from_millis(100);
+/// Time without pages after which nobody watches: a page that is reloaded comes back sooner.
+const GONE: Duration = Duration::from_secs(4);
+
+/// A server with its thread, and the thread that draws; both end when it is dropped.
+pub struct Viewer {
+    shared: Arc<Shared>,
+    address: String,
+    closing: Arc<Notify>,
+    threads: Vec<JoinHandle<()>>,
+}
+
+impl Viewer {
+    /// Serves `subject`. `tell` receives lines for the user of the program, such as each kind of refused request once.
+    ///
+    /// # Errors
+    /// When no address can be listened on, or the system refuses threads or random numbers.
+    pub fn start(
+        subject: Subject,
+        listen: &Listen,
+        tell: Box<dyn Fn(&str) + Send + Sync>,
+    ) -> Result<Self, ViewerError> {
+        let refused = |error: io::Error| ViewerError::Start(error.to_string());
+        let notices = Arc::new(Notices::new(tell as Tell));
+        let listener = listen.bind()?;
+        let bound = listener.local_addr().map_err(refused)?;
+        let token = if bound.ip().is_loopback() {
+            None
+        } else {
+            Some(random_token().map_err(|error| ViewerError::Start(error.to_string()))?)
+        };
+        let query = token
+            .as_ref()
+            .map_or(String::new(), |token| format!("?{TOKEN}={token}"));
+        let address = format!("http://{}/{query}", reachable(bound));
+        if listen.port != 0 && bound.port() != listen.port {
+            notices.always(format_args!("port {} is taken: using {}", listen.port, bound.port()));
+        }
+        let guard = Guard {
+            host: listen.host.clone(),
+            token,
+        };
+        let shared = Arc::new(Shared::new(subject, guard, notices.clone()));
+        if let Some(live) = &shared.subject.live {
+            let desk = Arc::downgrade(&shared);
+            let wake = move || {
+                if let Some(shared) = desk.upgrade() {
+                    shared.desk.wake();
+                }
+            };
+            // A subject is shown by one viewer.
+            let _ = live.on_change.set(Box::new(wake));
+        }
+        let closing = Arc::new(Notify::new());
+        // Threads of their own: a training keeps its pool, and the system shares the processor between both.
+        let pool = rayon::ThreadPoolBuilder::new()
+            .num_threads(rayon::current_num_threads())
+            .thread_name(|i| format!("draw-{i}"))
+            .build()
+            .map_err(|error| ViewerError::Start(error.to_string()))?;
+        let runtime = tokio::runtime::Builder::new_current_thread()
+            .enable_all()
+            .max_blocking_threads(4)
+            .build()
+            .map_err(refused)?;
+        let serving = {
+            let (router, closing) = (router(shared.clone()), closing.clone());
+            move || {
+                if let Err(error) = runtime.block_on(accept(listener, router, notices.clone(), closing)) {
+                    notices.always(format_args!("the viewer has stopped: {error}"));
+                }
+                // Photographs that are being decoded must not delay the end.
+                runtime.shutdown_background();
+            }
+        };
+        let drawing = {
+            let shared = shared.clone();
+            move || pool.install(|| draw(&shared.subject, &shared.desk))
+        };
+        let viewer = Self {
+            threads: vec![
+                thread::Builder::new()
+                    .name("serve".into())
+                    .spawn(serving)
+                    .map_err(refused)?,
+                thread::Builder::new()
+                    .name("draw".into())
+                    .spawn(drawing)
+                    .map_err(refused)?,
+            ],
+            shared,
+            address,
+            closing,
+        };
+        if listen.open
+            && let Err(error) = open_browser(&viewer.address)
+        {
+            viewer
+                .shared
+                .notices
+                .always(format_args!("cannot start a browser: {error}"));
+        }
+        Ok(viewer)
+    }
+
+    /// The address of the page, with its token if it has one.
+    pub fn address(&self) -> &str {
+        &self.address
+    }
+
+    /// Whether a page is open.
+    pub fn is_watched(&self) -> bool {
+        self.shared.desk.len() > 0
+    }
+
+    /// Serves until `stop`.
+    pub fn wait(&self, stop: &dyn Fn() -> bool) {
+        while !stop() {
+            thread::sleep(LOOK);
+        }
+    }
+
+    /// Serves until `stop`, or until no page has been open for a few seconds.
+    pub fn wait_while_watched(&self, stop: &dyn Fn() -> bool) {
+        let mut seen = Instant::now();
+        while !stop() && seen.elapsed() < GONE {
+            thread::sleep(LOOK);
+            if self.is_watched() {
+                seen = Instant::now();
+            }
+        }
+    }
+}
+
+impl Drop for Viewer {
+    fn drop(&mut self) {
+        self.shared.desk.close();
+        self.closing.notify_one();
+        for thread in self.threads.drain(..) {
+            let _ = thread.join();
+        }
+    }
+}

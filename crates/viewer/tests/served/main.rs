@@ -1,0 +1,5 @@
+//! The server as its clients see it, good and bad ones.
+
+mod client;
+mod live;
+mod security;

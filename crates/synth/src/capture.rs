@@ -18,6 +18,8 @@ const POINT_ERROR: f32 = 0.001;
 
 /// Pixels to each side of a point among which structure from motion looks for contrast.
 const PATCH: u32 = 2;
+/// Depth from which points are not triangulated, world units: cameras a few metres apart see no parallax.
+const FAR: f32 = 100.0;
 /// Least contrast of such a patch, largest less smallest green in \[0, 1\]: a plain wall has less.
 const CONTRAST: f32 = 0.06;
 
@@ -191,7 +193,9 @@ impl Capture {
             direction: camera.ray_direction(Vec2::new(x as f32 + 0.5, y as f32 + 0.5)),
         };
         let hit = self.scene.hit(&ray, camera.near);
-        high - low >= CONTRAST && hit.is_some_and(|hit| !hit.object.material.texture.is_emissive())
+        frame.depth.pixel(x, y)[0] < FAR
+            && high - low >= CONTRAST
+            && hit.is_some_and(|hit| !hit.object.material.texture.is_emissive())
     }
 }
 

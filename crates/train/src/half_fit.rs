@@ -65,7 +65,7 @@ pub fn half_fit_psnr(model: &Model, renderer: &mut Renderer, view: &HeldOut, fit
     };
     let render = model.render(renderer, &camera, options).color;
     let render = if fit.exposure {
-        Affine::fit(&render, truth, |i| counts(i) && is_left(i, width)).apply_to(&render)
+        Affine::fit_unclipped(&render, truth, |i| counts(i) && is_left(i, width)).apply_to(&render)
     } else {
         render
     };
@@ -116,7 +116,7 @@ fn fitted_pose(model: &Model, renderer: &mut Renderer, view: &HeldOut, fit: Half
         let counts = |i: usize| is_left(i, width as usize) && mask.as_ref().is_none_or(|mask| mask[i] != 0);
         let render = model.render(renderer, &camera, options).color;
         let map = if fit.exposure {
-            Affine::fit(&render, truth, counts)
+            Affine::fit_unclipped(&render, truth, counts)
         } else {
             Affine::IDENTITY
         };

@@ -107,7 +107,7 @@ impl Needs {
                 },
             all_photos: working + all,
             first_splats: 0,
-            most_splats: recipe.max_splats,
+            most_splats: 0,
         }
     }
 }
@@ -188,12 +188,13 @@ impl fmt::Display for MemoryPlan {
         let Some(limit) = self.limit else {
             return write!(f, "memory: {} for photographs", in_gib(self.photos));
         };
+        write!(f, "memory: at most {}: ", in_gib(limit))?;
+        if self.wanted_splats > 0 {
+            write!(f, "{} for up to {} splats, ", in_gib(SPLAT * self.splats), self.splats)?;
+        }
         write!(
             f,
-            "memory: at most {}: {} for up to {} splats, {} for photographs (all: {}), {} for images, {} for the program",
-            in_gib(limit),
-            in_gib(SPLAT * self.splats),
-            self.splats,
+            "{} for photographs (all: {}), {} for images, {} for the program",
             in_gib(self.photos),
             in_gib(self.all_photos),
             in_gib(self.images),

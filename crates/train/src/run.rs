@@ -150,14 +150,19 @@ pub fn run(
     Ok(reason)
 }
 
-/// A warning where a run ends with fewer splats than it began with.
+/// What became of the first splats, where a run ends with fewer: a warning where hardly any are left.
 fn fewer_than_at_first(trainer: &Trainer) -> Option<Event> {
     let (first, last) = (first_count(&trainer.dataset, &trainer.recipe), trainer.engine.len());
-    let reduced = trainer.field.is_none() && trainer.finished() && last < first;
-    reduced.then(|| Event::Warned {
-        message: format!(
-            "{last} splats are left of {first} at first: the others had faded or showed in no photograph; if the scene is a blur, photographs disagree on it (light, poses, moving objects)"
-        ),
+    if trainer.field.is_some() || !trainer.finished() || last >= first {
+        return None;
+    }
+    let left = format!("{last} splats are left of {first} at first: the others faded or showed in no photograph");
+    Some(if 10 * last < first {
+        Event::Warned {
+            message: format!("{left}; if the scene is a blur, photographs disagree (light, poses, moving objects)"),
+        }
+    } else {
+        Event::Decided { message: left }
     })
 }
 

@@ -182,7 +182,11 @@ impl Trainer {
         let total = recipe.total_steps() as f64;
         let needs = Needs {
             first_splats,
-            most_splats: cap(&recipe, &cameras).max(first_splats),
+            most_splats: if (0..recipe.stage.len()).all(|stage| is_field(&recipe, stage)) {
+                0
+            } else {
+                cap(&recipe, &cameras).max(first_splats)
+            },
             ..Needs::of(&dataset, &recipe, options.lpips.as_ref().map(|lpips| lpips.net()))
         };
         let memory = MemoryPlan::new(&needs, options.memory)?;

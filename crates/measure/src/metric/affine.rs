@@ -33,16 +33,21 @@ impl Affine {
         Image::new(image.width, image.height, 3, data)
     }
 
-    /// The least-squares map from `from` to `to` over the pixels whose index satisfies `counts`. Pixels at which either image is
-    /// clipped (below 1/255 or above 254/255 in any channel) carry no information and are skipped. The identity if too few
-    /// pixels remain.
+    /// [`Self::fit`] without the pixels at which either image is clipped (below 1/255 or above 254/255 in any channel), which carry
+    /// no information on the map.
+    pub fn fit_unclipped(from: &Image, to: &Image, counts: impl Fn(usize) -> bool) -> Self {
+        let (x, y) = (from.data.as_chunks::<3>().0, to.data.as_chunks::<3>().0);
+        let clipped = |x: &[f32; 3]| x.iter().any(|v| *v < 1.0 / 255.0 || *v > 254.0 / 255.0);
+        Self::fit(from, to, |i| counts(i) && !clipped(&x[i]) && !clipped(&y[i]))
+    }
+
+    /// The least-squares map from `from` to `to` over the pixels whose index satisfies `counts`. The identity if they are too few.
     pub fn fit(from: &Image, to: &Image, counts: impl Fn(usize) -> bool) -> Self {
         // Normal equations of four unknowns per channel: [r, g, b, 1].
         let (mut normal, mut right, mut count) = ([[0.0f64; 4]; 4], [[0.0f64; 3]; 4], 0usize);
-        let clipped = |x: &[f32; 3]| x.iter().any(|v| *v < 1.0 / 255.0 || *v > 254.0 / 255.0);
         let pixels = from.data.as_chunks::<3>().0.iter().zip(to.data.as_chunks::<3>().0);
         for (i, (x, y)) in pixels.enumerate() {
-            if !counts(i) || clipped(x) || clipped(y) {
+            if !counts(i) {
                 continue;
             }
             let row = [f64::from(x[0]), f64::from(x[1]), f64::from(x[2]), 1.0];
@@ -138,7 +143,7 @@ mod tests {
         let from = noise(2);
         let mut to = from.clone();
         to.data[..384].fill(1.0);
-        let found = Affine::fit(&from, &to, |_| true);
+        let found = Affine::fit_unclipped(&from, &to, |_| true);
         assert!((found.matrix[0][0] - 1.0).abs() < 1e-5, "{found:?}");
         let flat = Image::new(16, 16, 3, vec![0.5; 768]);
         let found = Affine::fit(&flat, &Image::new(16, 16, 3, vec![0.25; 768]), |_| true);

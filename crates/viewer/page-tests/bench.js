@@ -39,7 +39,9 @@ const turn = (page, seconds) => page.evaluate(async (seconds) => {
   return { fps: pictures / seconds, delays: stage.delays, size: stage.drawsLocally ? stage.localCanvas.width : stage.served.width };
 }, seconds);
 
+// The served picture is measured as a browser without a GPU shows it; WebGL needs the software rasteriser.
 const browser = await browse();
+const drawing = wants("local") ? await browse({ webgl: true }) : null;
 
 if (wants("served")) {
   const server = await serve("view", random(SPLATS), "--port", "0");
@@ -73,7 +75,7 @@ if (wants("served")) {
 
 if (wants("local")) {
   const server = await serve("view", random(SPLATS), "--port", "0");
-  const { page } = await open(browser, server.address, { width: 640, height: 400 });
+  const { page } = await open(drawing, server.address, { width: 640, height: 400 });
   const sort = await page.evaluate(async () => {
     const { order, reserve, take } = await import("/page/js/local/order.js");
     const count = 1_000_000;
@@ -132,3 +134,4 @@ if (wants("train")) {
 }
 
 await browser.close();
+await drawing?.close();

@@ -53,11 +53,11 @@ export async function serve(...args) {
 
 const CHROMIUM = [process.env.CHROMIUM, "/usr/bin/chromium", "/usr/bin/chromium-browser", "/usr/bin/google-chrome"].find((path) => path && existsSync(path));
 
-/** A headless browser that draws WebGL in software. */
-export const browse = () => chromium.launch({
+/** A headless browser; with WebGL it draws everything by a software rasteriser, which is slower. */
+export const browse = ({ webgl = false } = {}) => chromium.launch({
   executablePath: CHROMIUM,
   args: ["--headless", "--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking", "--disable-component-update", "--disable-sync",
-    "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist", "--mute-audio"],
+    ...(webgl ? ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"] : ["--disable-gpu", "--disable-software-rasterizer"])],
 });
 
 /** Opens the page and waits until it shows a sharp picture. @param {import("playwright-core").Browser} browser */

@@ -9,7 +9,7 @@ import { field, fox, random, shiny, trained } from "./scenes.js";
 
 /** @type {import("playwright-core").Browser} */
 let browser;
-before(async () => (browser = await browse()));
+before(async () => (browser = await browse({ webgl: true })));
 after(async () => {
   stopAll();
   await browser.close();

@@ -82,6 +82,15 @@ export async function sharp(page) {
   }, null, { timeout: 120000 });
 }
 
+/** Waits until `holds`, which may be asynchronous, is true in the page. @param {import("playwright-core").Page} page */
+export async function until(page, holds, argument = null, seconds = 120) {
+  const end = Date.now() + 1000 * seconds;
+  while (!(await page.evaluate(holds, argument))) {
+    if (Date.now() > end) throw new Error(`it never held: ${holds}`);
+    await page.waitForTimeout(50);
+  }
+}
+
 /** The picture on the stage, without the overlay. */
 export async function picture(page) {
   const address = await page.evaluate(() => {

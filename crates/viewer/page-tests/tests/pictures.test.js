@@ -7,12 +7,12 @@ import { after, before, test } from "node:test";
 import { browse, get, open, picture, psnr, readPng, run, scratch, serve, set, sharp, stopAll } from "./harness.js";
 import { field, fox, random, shiny, trained } from "./scenes.js";
 
-/** @type {import("playwright-core").Browser} */
-let browser;
-before(async () => (browser = await browse({ webgl: true })));
+/** One shows pictures, the other draws them: @type {[import("playwright-core").Browser, import("playwright-core").Browser]} */
+let [browser, drawing] = [];
+before(async () => ([browser, drawing] = [await browse(), await browse({ webgl: true })]));
 after(async () => {
   stopAll();
-  await browser.close();
+  await Promise.all([browser.close(), drawing.close()]);
 });
 
 let frames = 0;
@@ -84,7 +84,7 @@ for (const [name, make] of [["a trained scene", trained], ["random splats", () =
     const scene = make();
     if (!scene) return context.skip("SKIPPED (no ../shared)");
     const server = await serve("view", scene, "--port", "0");
-    const { page, problems } = await open(browser, server.address, SIZE);
+    const { page, problems } = await open(drawing, server.address, SIZE);
     await set(page, { drawing: "local", axes: false });
     await sharp(page);
     for (const [dx, dy] of [[0, 0], [150, -30]]) {

@@ -7,6 +7,7 @@ import { browse, open, run, scratch, serve, set } from "./tests/harness.js";
 import { random } from "./tests/scenes.js";
 
 const SPLATS = 500_000;
+const STEPS = 500;
 const wanted = process.argv.slice(2);
 const wants = (name) => wanted.length === 0 || wanted.includes(name);
 const say = (name, value) => console.log(`${name.padEnd(58)} ${value}`);
@@ -108,11 +109,11 @@ if (wants("train")) {
   else {
     const args = (name) => {
       rmSync(join(scratch, name), { recursive: true, force: true });
-      return ["train", data, "--out", join(scratch, name), "--steps", "300", "--downscale", "2", "--holdout", "0"];
+      return ["train", data, "--out", join(scratch, name), "--steps", `${STEPS}`, "--downscale", "2", "--holdout", "0"];
     };
     const seconds = (name) => JSON.parse(readFileSync(join(scratch, name, "report.json"), "utf8")).training_seconds;
     const rows = { alone: [], resting: [], moving: [] };
-    for (let round = 0; round < 3; round += 1) {
+    for (let round = 0; round < 2; round += 1) {
       run(...args("alone"));
       rows.alone.push(seconds("alone"));
       for (const kind of /** @type {const} */ (["resting", "moving"])) {
@@ -129,7 +130,7 @@ if (wants("train")) {
         rows[kind].push(seconds(kind));
       }
     }
-    for (const [name, values] of Object.entries(rows)) say(`train: seconds of 300 steps, ${name}`, values.map((value) => value.toFixed(2)).join(" "));
+    for (const [name, values] of Object.entries(rows)) say(`train: seconds of ${STEPS} steps, ${name}`, values.map((value) => value.toFixed(2)).join(" "));
   }
 }
 

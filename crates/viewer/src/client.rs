@@ -59,7 +59,7 @@ pub(crate) async fn serve(mut socket: WebSocket, shared: Arc<Shared>) {
         live.look();
     }
     let mut known = Known::default();
-    let mut version = 0;
+    let (mut version, mut reported) = (0, Value::Null);
     let mut news = interval(NEWS);
     news.set_missed_tick_behavior(MissedTickBehavior::Delay);
     let mut allowance = Allowance::new();
@@ -97,7 +97,11 @@ pub(crate) async fn serve(mut socket: WebSocket, shared: Arc<Shared>) {
             _ = news.tick() => {
                 let mut told = Vec::new();
                 if let Some(live) = &shared.subject.live {
-                    told.push(live.report(&mut known));
+                    let report = live.report(&mut known);
+                    if report != reported {
+                        told.push(report.clone());
+                        reported = report;
+                    }
                 }
                 if let Some(edition) = shared.subject.edition().filter(|edition| edition.version != version) {
                     version = edition.version;

@@ -271,7 +271,7 @@ impl Desk {
 
     /// Leaves time to a training after `seconds` of drawing a moving camera.
     pub fn rest(&self, seconds: f32) {
-        self.lock().rest_until = Some(Instant::now() + Duration::from_secs_f32(0.6 * seconds));
+        self.lock().rest_until = Some(Instant::now() + Duration::from_secs_f32(2.0 * seconds));
     }
 
     /// When the next copy of a training's scene is due, after a picture of the present one that took `seconds` and a copy that took

@@ -308,12 +308,12 @@ impl History {
     }
 }
 
-/// Memory in use, bytes; 0 where the system does not report it.
+/// Memory in use, bytes, to a few MiB; 0 where the system does not report it.
 fn memory() -> u64 {
     let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
     let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:"));
     let kib = line.and_then(|line| line.split_ascii_whitespace().next()?.parse::<u64>().ok());
-    kib.unwrap_or(0) * 1024
+    (kib.unwrap_or(0) >> 13) << 23
 }
 
 /// What a [`Watcher`] answers for: a request to save must not end a pause.

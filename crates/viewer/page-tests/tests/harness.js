@@ -53,11 +53,11 @@ export async function serve(...args) {
 
 const CHROMIUM = [process.env.CHROMIUM, "/usr/bin/chromium", "/usr/bin/chromium-browser", "/usr/bin/google-chrome"].find((path) => path && existsSync(path));
 
-/** A headless browser that draws WebGL in software. */
-export const browse = () => chromium.launch({
+/** A headless browser; with WebGL it draws everything by a software rasteriser, which is slower. */
+export const browse = ({ webgl = false } = {}) => chromium.launch({
   executablePath: CHROMIUM,
   args: ["--headless", "--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking", "--disable-component-update", "--disable-sync",
-    "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist", "--mute-audio"],
+    ...(webgl ? ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"] : ["--disable-gpu", "--disable-software-rasterizer"])],
 });
 
 /** Opens the page and waits until it shows a sharp picture. @param {import("playwright-core").Browser} browser */
@@ -80,6 +80,15 @@ export async function sharp(page) {
     if (stage.drawsLocally) return stage.local.sharp && stage.local.total > 0 && stage.local.loaded === stage.local.total && !stage.local.busy && !stage.dirty;
     return stage.shown?.header?.sharp && stage.shown.header.id === stage.ids && !stage.dirty;
   }, null, { timeout: 120000 });
+}
+
+/** Waits until `holds`, which may be asynchronous, is true in the page. @param {import("playwright-core").Page} page */
+export async function until(page, holds, argument = null, seconds = 120) {
+  const end = Date.now() + 1000 * seconds;
+  while (!(await page.evaluate(holds, argument))) {
+    if (Date.now() > end) throw new Error(`it never held: ${holds}`);
+    await page.waitForTimeout(50);
+  }
 }
 
 /** The picture on the stage, without the overlay. */

@@ -5,7 +5,7 @@ import { join } from "node:path";
 import { createHash } from "node:crypto";
 import { readFileSync } from "node:fs";
 import { after, before, test } from "node:test";
-import { OUT, browse, get, open, picture, psnr, run, scratch, serve, set, sharp, stopAll } from "./harness.js";
+import { OUT, browse, get, open, picture, psnr, run, scratch, serve, set, sharp, stopAll, until } from "./harness.js";
 import { dataset, trained } from "./scenes.js";
 
 /** @type {import("playwright-core").Browser} */
@@ -38,7 +38,7 @@ test("views, comparison, tools and modes", async () => {
   assert.equal(await get(page, "view"), null);
 
   await page.getByRole("button", { name: "Measure PSNR" }).click();
-  await page.waitForFunction(async () => (await import("/page/js/state.js")).state.get("scores").size === 27, null, { timeout: 30000 });
+  await until(page, async () => (await import("/page/js/state.js")).state.get("scores").size === 27);
   await page.getByRole("button", { name: "Worst first" }).click();
   const listed = await page.locator(".views button > span:last-child").allTextContents();
   const numbers = listed.map(Number);
@@ -60,20 +60,20 @@ test("views, comparison, tools and modes", async () => {
   const middle = { x: box.width / 2, y: box.height / 2 };
   const before = await get(page, "pivot");
   await page.locator("irr-stage .overlay").dblclick({ position: { x: middle.x + 60, y: middle.y + 20 } });
-  await page.waitForFunction(async (before) => `${(await import("/page/js/state.js")).state.get("pivot")}` !== `${before}`, before);
+  await until(page, async (before) => `${(await import("/page/js/state.js")).state.get("pivot")}` !== `${before}`, before);
   await settled(page);
   await page.keyboard.press("i");
   await page.locator("irr-stage .overlay").click({ position: middle });
-  await page.waitForFunction(async () => (await import("/page/js/state.js")).state.get("picked")?.splat?.opacity > 0);
+  await until(page, async () => (await import("/page/js/state.js")).state.get("picked")?.splat?.opacity > 0);
   await page.keyboard.press("m");
   await page.locator("irr-stage .overlay").click({ position: middle });
-  await page.waitForFunction(async () => (await import("/page/js/state.js")).state.get("measured").length === 1);
+  await until(page, async () => (await import("/page/js/state.js")).state.get("measured").length === 1);
   await page.locator("irr-stage .overlay").click({ position: { x: middle.x + 80, y: middle.y } });
-  await page.waitForFunction(async () => (await import("/page/js/state.js")).state.get("measured").length === 2);
+  await until(page, async () => (await import("/page/js/state.js")).state.get("measured").length === 2);
   await page.getByRole("tab", { name: "Scene" }).click();
   await page.getByLabel("True length in metres").fill("1");
   await page.getByRole("button", { name: "Set scale" }).click();
-  await page.waitForFunction(async () => (await import("/page/js/state.js")).state.get("metres") > 0);
+  await until(page, async () => (await import("/page/js/state.js")).state.get("metres") > 0);
   assert.ok(JSON.parse(readFileSync(join(trained(), "unit.json"), "utf8")).metres_per_unit > 0);
 
   await page.keyboard.press("Escape");
@@ -95,15 +95,15 @@ test("a live training is paused, stepped, resumed and left alone, and its bytes 
   const { page } = first;
   await page.getByRole("tab", { name: "Training" }).click();
   await page.getByRole("button", { name: "Pause" }).click();
-  await page.waitForFunction(async () => (await import("/page/js/state.js")).state.get("train")?.phase === "paused");
+  await until(page, async () => (await import("/page/js/state.js")).state.get("train")?.phase === "paused");
   const step = (await get(page, "train")).step;
   assert.ok(step > 0 && step < 900);
   await page.getByRole("button", { name: "Save now" }).click();
-  await page.waitForFunction(async (step) => (await import("/page/js/state.js")).state.get("train").saved === step, step);
+  await until(page, async (step) => (await import("/page/js/state.js")).state.get("train").saved === step, step);
   await page.waitForTimeout(400);
   assert.equal((await get(page, "train")).step, step, "it stands still");
   await page.getByRole("button", { name: "One step" }).click();
-  await page.waitForFunction(async (step) => {
+  await until(page, async (step) => {
     const train = (await import("/page/js/state.js")).state.get("train");
     return train.phase === "paused" && train.step === step + 1;
   }, step);
@@ -111,10 +111,10 @@ test("a live training is paused, stepped, resumed and left alone, and its bytes 
   const before = await picture(page);
   await page.screenshot({ path: join(OUT, "training-1440-dark.jpg"), quality: 80 });
   await page.getByRole("button", { name: "Resume" }).click();
-  await page.waitForFunction(async (step) => (await import("/page/js/state.js")).state.get("train").step > step + 60, step);
+  await until(page, async (step) => (await import("/page/js/state.js")).state.get("train").step > step + 60, step);
   // A page that closes disturbs nothing; the other one sees the scene improve.
   await second.page.close();
-  await page.waitForFunction(async () => (await import("/page/js/state.js")).state.get("train").phase === "finished", null, { timeout: 120000 });
+  await until(page, async () => (await import("/page/js/state.js")).state.get("train").phase === "finished");
   await sharp(page);
   assert.ok(psnr(before, await picture(page)) < 45, "the scene has changed");
   assert.ok((await get(page, "train")).curve.length > 100);
@@ -140,7 +140,7 @@ test("two pages have a camera each, and come back after the server died", async 
   await a.page.getByText("Connection lost").waitFor();
   const again = await serve("view", trained(), "--port", port);
   assert.equal(again.address, server.address);
-  await a.page.waitForFunction(async () => (await import("/page/js/state.js")).state.get("connection") === "open", null, { timeout: 15000 });
+  await until(a.page, async () => (await import("/page/js/state.js")).state.get("connection") === "open");
   await sharp(a.page);
   assert.ok(Math.abs((await get(a.page, "camera")).fov - 0.4) < 1e-6, "the camera stays");
   await again.stop();

@@ -28,10 +28,13 @@ class Chart extends HTMLElement {
     if (!canvas || !canvas.clientWidth) return;
     const density = devicePixelRatio || 1;
     const [width, height] = [canvas.clientWidth, canvas.clientHeight];
-    [canvas.width, canvas.height] = [width * density, height * density];
-    const context = canvas.getContext("2d");
+    const [w, h] = [Math.round(width * density), Math.round(height * density)];
+    if (canvas.width !== w || canvas.height !== h) [canvas.width, canvas.height] = [w, h];
+    // Small and rarely drawn: not worth the GPU.
+    const context = canvas.getContext("2d", { willReadFrequently: true });
     if (!context) return;
-    context.scale(density, density);
+    context.setTransform(density, 0, 0, density, 0, 0);
+    context.clearRect(0, 0, width, height);
     const scaled = (/** @type {number} */ value) => (this.logarithmic ? Math.log10(Math.max(value, 1e-9)) : value);
     const values = this.curves.flatMap(({ points }) => points.map(([, value]) => scaled(value))).filter(Number.isFinite).sort((a, b) => a - b);
     if (values.length === 0) return;

@@ -7,6 +7,8 @@ import { state } from "../state.js";
 
 /** @typedef {import("../chart.js").Chart} Chart */
 
+/** Milliseconds between two pictures of the curves. */
+const BETWEEN = 1000;
 const PHASES = { preparing: "Preparing", training: "Training", paused: "Paused", finished: "Finished" };
 
 class TrainingPanel extends HTMLElement {
@@ -58,9 +60,12 @@ class TrainingPanel extends HTMLElement {
     const loss = /** @type {Chart} */ (document.createElement("irr-chart"));
     const psnr = /** @type {Chart} */ (document.createElement("irr-chart"));
     const splats = /** @type {Chart} */ (document.createElement("irr-chart"));
-    state.watch(["train", "theme"], () => {
+    let shownAt = 0;
+    state.watch(["train", "theme", "tab", "sidebar"], () => {
       const now = state.get("train");
-      if (!now) return;
+      const recent = performance.now() - shownAt < BETWEEN && now?.phase === "training";
+      if (!now || recent || state.get("tab") !== "training" || !state.get("sidebar")) return;
+      shownAt = performance.now();
       const of = (/** @type {string} */ key) => now.curve.filter((/** @type {any} */ point) => typeof point[key] === "number")
         .map((/** @type {any} */ point) => /** @type {[number, number]} */ ([point.step, point[key]]));
       loss.show([{ name: "Loss", color: "--accent", points: of("loss") }], now.total, true);

@@ -102,6 +102,16 @@ impl Splats {
             .unwrap_or(0)
     }
 
+    fn from_columns([means, quats, log_scales, opacity_logits, sh]: [Planes; 5]) -> Self {
+        Self {
+            means,
+            quats,
+            log_scales,
+            opacity_logits,
+            sh,
+        }
+    }
+
     /// The five columns.
     pub fn columns(&self) -> [&Planes; 5] {
         [
@@ -126,26 +136,12 @@ impl Splats {
 
     /// The splats `indices`, in that order.
     pub fn gather(&self, indices: &[u32]) -> Self {
-        let [means, quats, log_scales, opacity_logits, sh] = self.columns().map(|c| c.gather(indices));
-        Self {
-            means,
-            quats,
-            log_scales,
-            opacity_logits,
-            sh,
-        }
+        Self::from_columns(self.columns().map(|c| c.gather(indices)))
     }
 
     /// A copy, made by all threads.
     pub fn copied(&self) -> Self {
-        let [means, quats, log_scales, opacity_logits, sh] = self.columns().map(Planes::copied);
-        Self {
-            means,
-            quats,
-            log_scales,
-            opacity_logits,
-            sh,
-        }
+        Self::from_columns(self.columns().map(Planes::copied))
     }
 
     /// Centre of splat `i`, world units.

@@ -7,7 +7,7 @@
 
 use crate::event::Event;
 use crate::photos::Prepared;
-use crate::schedule::{plan, upcoming_views};
+use crate::schedule::plan;
 use crate::socket::Exposure;
 use crate::trainer::{TrainError, Trainer};
 use irradia_scene::Camera;
@@ -15,20 +15,20 @@ use irradia_scene::Camera;
 /// Fraction of a run after which the decision is made.
 pub(crate) const AT: f64 = 0.1;
 /// Maximum number of training views to measure: enough for a standard deviation within a tenth.
-pub(crate) const VIEWS: usize = 64;
+const VIEWS: usize = 64;
 /// Views below which nothing is decided.
 const MIN_VIEWS: usize = 8;
 /// Cameras that predict a view's exposure.
 const NEIGHBOURS: usize = 3;
 /// Standard deviation of ln exposure, beyond its prediction, from which exposures are learned.
-pub(crate) const THRESHOLD: f64 = 0.1;
+const THRESHOLD: f64 = 0.1;
 /// Colours outside are clipped in the photograph, or too dark for a ratio.
 const USABLE: std::ops::RangeInclusive<f32> = 8.0 / 255.0..=250.0 / 255.0;
 /// Pixels below which a view is skipped.
 const MIN_PIXELS: usize = 100;
 
 /// Mean ln exposure of `photo` relative to `color` `[3, H, W]`, its frame; `None` if too few pixels of both can be compared.
-pub(crate) fn log_exposure(color: &[f32], photo: &Prepared) -> Option<f64> {
+fn log_exposure(color: &[f32], photo: &Prepared) -> Option<f64> {
     let pixels = photo.rgb.len() / 3;
     let counts = |i: &usize| {
         let opaque = photo.alpha.as_ref().is_none_or(|alpha| alpha[*i] == 255);
@@ -49,7 +49,7 @@ pub(crate) fn log_exposure(color: &[f32], photo: &Prepared) -> Option<f64> {
 
 /// Standard deviation of the ln exposures of `views` beyond what the nearest cameras predict; `None` for too few views. `unit` is
 /// the extent of the scene, which makes a turn by one radian as far as a move by one extent.
-pub(crate) fn unpredicted(views: &[(Camera, f64)], unit: f32) -> Option<f64> {
+fn unpredicted(views: &[(Camera, f64)], unit: f32) -> Option<f64> {
     if views.len() < MIN_VIEWS {
         return None;
     }
@@ -75,30 +75,19 @@ impl Trainer {
     /// Adds an exposure per photograph if the photographs need it, and says so.
     pub(crate) fn decide_exposure(&mut self) -> Result<Option<Event>, TrainError> {
         let plan = plan(&self.recipe, &self.clock);
-        let upcoming = upcoming_views(&self.dataset.train, self.options.seed, &self.clock);
-        let train = self.dataset.train.clone();
-        let stride = train.len().div_ceil(VIEWS).max(1);
         let mut measured = Vec::new();
-        for view in train.into_iter().step_by(stride) {
-            let order: Vec<usize> = std::iter::once(view)
-                .chain(upcoming.iter().copied().filter(|other| *other != view))
-                .collect();
-            let photo = self.photos.get(&order, plan.image_scale)?;
-            let camera = self.scaled_camera(view, plan.image_scale);
-            self.engine.render(camera.into(), &self.render_options(plan.sh_degree));
-            if let Some(log) = log_exposure(self.engine.frame().color, &photo) {
-                measured.push((view, camera, log));
-            }
-        }
-        let views: Vec<(Camera, f64)> = measured.iter().map(|(_, camera, log)| (*camera, *log)).collect();
+        self.show_training_views(VIEWS, &plan, |trainer, view, photo| {
+            let color = trainer.sockets.frame_color(&trainer.engine);
+            measured.extend(log_exposure(color, photo).map(|log| (view, log)));
+        })?;
+        let views: Vec<(Camera, f64)> = measured.iter().map(|(view, log)| (self.camera(*view), *log)).collect();
         let Some(spread) = unpredicted(&views, self.extent) else {
             return Ok(None);
         };
         if spread < THRESHOLD {
             return Ok(None);
         }
-        let logs: Vec<(usize, f64)> = measured.into_iter().map(|(view, _, log)| (view, log)).collect();
-        let exposure = Exposure::new(self.dataset.views.len(), &self.dataset.train).with_gains(&logs);
+        let exposure = Exposure::new(self.dataset.views.len(), &self.dataset.train).with_gains(&measured);
         self.sockets.exposure = Some(exposure);
         Ok(Some(Event::Decided {
             message: format!(

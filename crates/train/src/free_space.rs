@@ -25,16 +25,16 @@ impl FreeSpace {
         if fraction <= 0.0 {
             return Self::default();
         }
-        let sphere = |view: &View| {
+        let sphere = |view: &usize| {
+            let view = &dataset.views[*view];
             let mut radius = fraction * nearest_depth(dataset, view)?;
             if let Some(points) = &dataset.points {
                 radius = radius.min(distance_to_points(points, view));
             }
             Some((view.camera.pose.position.to_array(), radius * radius))
         };
-        let views = dataset.train.iter().map(|i| &dataset.views[*i]);
         Self {
-            spheres: views.filter_map(sphere).collect(),
+            spheres: dataset.train.par_iter().filter_map(sphere).collect(),
         }
     }
 

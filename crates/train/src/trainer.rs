@@ -9,7 +9,7 @@ use crate::half_fit::HalfFit;
 use crate::memory::{MemoryPlan, Needs};
 use crate::model::Model;
 use crate::objective::{Objective, Reference};
-use crate::photos::PhotoCache;
+use crate::photos::{PhotoCache, Prepared};
 use crate::recipe::{AdamKind, Choice, DensityControl, LengthUnit, Param, Recipe};
 use crate::schedule::{Clock, Round, StepMetrics, StepPlan, plan, upcoming_views};
 use crate::socket::{Residual, Sockets};
@@ -357,7 +357,7 @@ impl Trainer {
         let metrics = StepMetrics {
             error: loss.l1,
             measured: if plan.measure {
-                Some(self.measure_error(&upcoming, &plan)?)
+                Some(self.measure_error(&plan)?)
             } else {
                 None
             },
@@ -532,10 +532,27 @@ impl Trainer {
     }
 
     /// Mean L1 error over some training views, evenly spaced, as the plan renders them.
-    fn measure_error(&mut self, upcoming: &[usize], plan: &StepPlan) -> Result<f64, TrainError> {
-        let train = self.dataset.train.clone();
-        let stride = train.len().div_ceil(MEASURED_VIEWS).max(1);
+    fn measure_error(&mut self, plan: &StepPlan) -> Result<f64, TrainError> {
         let (mut sum, mut count) = (0.0, 0);
+        self.show_training_views(MEASURED_VIEWS, plan, |trainer, _, photo| {
+            let color = trainer.sockets.frame_color(&trainer.engine);
+            trainer.objective.error(color, photo, false);
+            sum += trainer.objective.mean_error();
+            count += 1;
+        })?;
+        Ok(sum / f64::from(count.max(1)))
+    }
+
+    /// Renders at most `most` training views, evenly spaced, as the plan does, and passes each with its photograph to `see`.
+    pub(crate) fn show_training_views(
+        &mut self,
+        most: usize,
+        plan: &StepPlan,
+        mut see: impl FnMut(&mut Self, usize, &Prepared),
+    ) -> Result<(), TrainError> {
+        let upcoming = upcoming_views(&self.dataset.train, self.options.seed, &self.clock);
+        let train = self.dataset.train.clone();
+        let stride = train.len().div_ceil(most).max(1);
         for view in train.into_iter().step_by(stride) {
             let order: Vec<usize> = std::iter::once(view)
                 .chain(upcoming.iter().copied().filter(|other| *other != view))
@@ -545,14 +562,11 @@ impl Trainer {
             let placement = self.sockets.place(view, &self.scaled_camera(view, plan.image_scale));
             let options = self.render_options(plan.sh_degree);
             self.sockets.render(&mut self.engine, view, placement, &options, plan);
-            let color = self.sockets.frame_color(&self.engine);
-            self.objective.error(color, &photo, false);
-            sum += self.objective.mean_error();
-            count += 1;
+            see(self, view, &photo);
             self.seconds += started.elapsed().as_secs_f64();
             self.cpu_seconds += cpu_started.elapsed().as_secs_f64();
         }
-        Ok(sum / f64::from(count.max(1)))
+        Ok(())
     }
 
     /// Advances the clock; steps saved by an early end of a stage go to the remaining stages.

@@ -17,6 +17,7 @@ const TABLE: &[(&str, May)] = &[
     ("scene", Import(&[])),
     ("compute", Import(&[])),
     ("formats", Import(&["scene"])),
+    ("sfm", Import(&["scene", "compute"])),
     ("splat", Import(&["scene", "compute"])),
     ("field", Import(&["scene", "compute"])),
     ("measure", Import(&["scene", "compute"])),
@@ -25,7 +26,7 @@ const TABLE: &[(&str, May)] = &[
     (
         "runs",
         Import(&[
-            "scene", "compute", "formats", "splat", "field", "measure", "train", "synth",
+            "scene", "compute", "formats", "sfm", "splat", "field", "measure", "train", "synth",
         ]),
     ),
     ("viewer", Import(&["scene", "splat", "field", "train", "runs"])),

@@ -1,6 +1,7 @@
 //! Speed of networks and encodings, beside the limits of the machine.
 
 use crate::memory;
+use crate::peak::Peak;
 use anyhow::Result;
 use cpu_time::ProcessTime;
 use irradia_compute::Level;
@@ -24,7 +25,11 @@ pub fn time(repeats: u32, mut work: impl FnMut()) -> f64 {
 
 pub fn run() -> Result<()> {
     let level = Level::detect();
-    let peak = (0..ROUNDS).map(|_| level.run(Peak)).fold(0.0, f64::max);
+    let rate = |_| {
+        let began = ProcessTime::now();
+        level.run(Peak) / began.elapsed().as_secs_f64() / 1e9
+    };
+    let peak = (0..ROUNDS).map(rate).fold(0.0, f64::max);
     println!("{}: {peak:.1} GFLOP/s per core in registers", level.name());
     for (inputs, outputs, width, depth) in [
         (32, 16, 32, 1),
@@ -53,35 +58,6 @@ pub fn run() -> Result<()> {
         encoding(level, grid);
     }
     Ok(())
-}
-
-/// Peak rate of multiply-adds of one core, in registers.
-struct Peak;
-
-impl Kernel for Peak {
-    type Output = f64;
-
-    #[inline(always)]
-    fn run<S: Simd>(self, simd: S) -> f64
-    where
-        S::F: Lanes<Scalar = f32>,
-    {
-        let (a, b) = (
-            simd.set(std::hint::black_box(0.999)),
-            simd.set(std::hint::black_box(0.001)),
-        );
-        let mut sums = [simd.splat(1.0); 12];
-        let rounds = 4_000_000u32;
-        let began = ProcessTime::now();
-        for _ in 0..rounds {
-            for k in 0..12 {
-                sums[k] = sums[k].mul_add(a, b);
-            }
-        }
-        let seconds = began.elapsed().as_secs_f64();
-        std::hint::black_box(sums);
-        f64::from(rounds) * 12.0 * 2.0 * S::LANES as f64 / seconds / 1e9
-    }
 }
 
 /// Rounds of a measurement; the best one counts.

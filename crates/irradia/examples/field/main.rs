@@ -10,6 +10,8 @@
 
 mod bench;
 mod memory;
+#[path = "../machine/peak.rs"]
+mod peak;
 
 use anyhow::{Context, Result, bail};
 use cpu_time::ProcessTime;

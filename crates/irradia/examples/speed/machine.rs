@@ -1,8 +1,8 @@
 //! What the machine allows: the rate of multiply-adds, the bandwidth of memory, and the memory that the process holds.
 
+use crate::peak::Peak;
 use cpu_time::ProcessTime;
 use irradia_compute::Level;
-use irradia_compute::simd::{Kernel, Lanes, Simd};
 use rayon::prelude::*;
 
 /// Measured limits of all threads together, each with a core of its own.
@@ -19,10 +19,10 @@ pub fn limits() -> Limits {
     let level = Level::detect();
     let threads = rayon::current_num_threads() as f64;
     let best = |round: &mut dyn FnMut() -> f64| (0..5).map(|_| round()).fold(f64::INFINITY, f64::min);
-    let arithmetic = best(&mut || {
+    let operation = best(&mut || {
         let began = ProcessTime::now();
-        (0..threads as u32).into_par_iter().for_each(|_| level.run(Peak));
-        began.elapsed().as_secs_f64()
+        let operations: f64 = (0..threads as u32).into_par_iter().map(|_| level.run(Peak)).sum();
+        began.elapsed().as_secs_f64() / operations
     });
     // Beyond every cache that belongs to a core; 512 MiB.
     let mut values = vec![1.0f32; 1 << 27];
@@ -36,50 +36,8 @@ pub fn limits() -> Limits {
         began.elapsed().as_secs_f64()
     });
     Limits {
-        gflops: threads * threads * f64::from(ROUNDS) * 12.0 * 2.0 * level.run(Width) as f64 / arithmetic / 1e9,
+        gflops: threads / operation / 1e9,
         gbytes: threads * 8.0 * values.len() as f64 / memory / 1e9,
-    }
-}
-
-const ROUNDS: u32 = 4_000_000;
-
-/// Independent multiply-adds in registers.
-struct Peak;
-
-impl Kernel for Peak {
-    type Output = ();
-
-    #[inline(always)]
-    fn run<S: Simd>(self, simd: S)
-    where
-        S::F: Lanes<Scalar = f32>,
-    {
-        let (a, b) = (
-            simd.set(std::hint::black_box(0.999)),
-            simd.set(std::hint::black_box(0.001)),
-        );
-        let mut sums = [simd.splat(1.0); 12];
-        for _ in 0..ROUNDS {
-            for sum in &mut sums {
-                *sum = sum.mul_add(a, b);
-            }
-        }
-        std::hint::black_box(sums);
-    }
-}
-
-/// Lanes of a vector.
-struct Width;
-
-impl Kernel for Width {
-    type Output = usize;
-
-    #[inline(always)]
-    fn run<S: Simd>(self, _: S) -> usize
-    where
-        S::F: Lanes<Scalar = f32>,
-    {
-        S::LANES
     }
 }
 

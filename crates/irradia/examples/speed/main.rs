@@ -10,6 +10,8 @@
 //! CPU time is given beside wall time: on a shared machine it is more stable.
 
 mod machine;
+#[path = "../machine/peak.rs"]
+mod peak;
 mod scale;
 
 use anyhow::{Context, Result, bail};

@@ -4,6 +4,8 @@
 //! and mapped incrementally with bundle adjustment. Geometry is `f64`; every sum and every random choice has a fixed order, so
 //! that neither the number of threads nor the order of the files changes a byte of the result.
 
+pub mod adjust;
+pub mod geometry;
 mod keypoints;
 
 pub use keypoints::{DESCRIPTOR_BYTES, Features, Keypoint, PairMatches};

@@ -7,5 +7,6 @@
 pub mod adjust;
 pub mod geometry;
 mod keypoints;
+pub mod map;
 
 pub use keypoints::{DESCRIPTOR_BYTES, Features, Keypoint, PairMatches};

@@ -119,7 +119,7 @@ impl Sift {
 
 impl Features {
     /// The same features of a photograph that is larger by `[x, y]`.
-    fn scaled(mut self, [x, y]: [f32; 2]) -> Self {
+    pub fn scaled(mut self, [x, y]: [f32; 2]) -> Self {
         for keypoint in &mut self.keypoints {
             keypoint.x *= x;
             keypoint.y *= y;

@@ -53,7 +53,7 @@ impl Freedom {
         tangential: false,
     };
 
-    /// Which columns of the parameters are adjusted; a tied focal length uses that of fx.
+    /// Which unknowns of a camera are adjusted. The first scales fx and fy together, the second moves fy alone.
     fn columns(self) -> [bool; PARAMETERS] {
         let focal = self.focal;
         [
@@ -69,6 +69,51 @@ impl Freedom {
     }
 }
 
+/// A camera, what of it is adjusted, and what is believed of it.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct AdjustedCamera {
+    /// The camera.
+    pub camera: DCamera,
+    /// What is adjusted.
+    pub freedom: Freedom,
+    /// What is believed.
+    pub belief: Belief,
+}
+
+impl AdjustedCamera {
+    /// Nothing is believed.
+    pub fn new(camera: DCamera, freedom: Freedom) -> Self {
+        Self {
+            camera,
+            freedom,
+            belief: Belief::default(),
+        }
+    }
+}
+
+/// What is believed of a camera before it is adjusted: the cost has a term `weight (parameter - value)^2 / 2` for each.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Belief {
+    /// Values in the order of the parameters; that of fy is believed of `fy / fx`.
+    pub values: [f64; PARAMETERS],
+    /// Weights, px^2 per squared unit of the parameter.
+    pub weights: [f64; PARAMETERS],
+}
+
+impl Belief {
+    /// The differences from what is believed.
+    fn errors(&self, camera: &DCamera) -> [f64; PARAMETERS] {
+        let mut errors = camera.parameters;
+        errors[1] /= errors[0];
+        std::array::from_fn(|i| errors[i] - self.values[i])
+    }
+
+    fn cost(&self, camera: &DCamera) -> f64 {
+        let terms = self.errors(camera).into_iter().zip(self.weights);
+        0.5 * terms.map(|(error, weight)| weight * error * error).sum::<f64>()
+    }
+}
+
 /// A point's projection in one photograph.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Observation {
@@ -81,8 +126,8 @@ pub struct Observation {
 /// What is adjusted. Fields are public: a caller fills them, calls [`Problem::solve`] and reads the results in the same place.
 #[derive(Clone, Debug, Default)]
 pub struct Problem {
-    /// `[C]` cameras and what is adjusted of each.
-    pub cameras: Vec<(DCamera, Freedom)>,
+    /// `[C]` cameras.
+    pub cameras: Vec<AdjustedCamera>,
     /// `[P]` poses.
     pub poses: Vec<DPose>,
     /// `[P]` whether a pose is held.
@@ -145,7 +190,7 @@ impl Problem {
         while report.iterations < options.iterations && damping < 1e12 && cost.is_finite() {
             report.iterations += 1;
             let accepted = linear.step(self, damping).and_then(|step| {
-                let next = step.applied(self, &state);
+                let next = step.applied(&state);
                 let next_cost = self.cost_at(&next, options.loss);
                 let gain = (cost - next_cost) / step.predicted;
                 (gain.is_finite() && gain > 1e-3).then_some((next, next_cost, gain))
@@ -170,7 +215,7 @@ impl Problem {
         }
         report.final_cost = cost;
         for (camera, adjusted) in self.cameras.iter_mut().zip(state.cameras) {
-            camera.0 = adjusted;
+            camera.camera = adjusted;
         }
         (self.poses, self.points) = (state.poses, state.points);
         report
@@ -178,7 +223,7 @@ impl Problem {
 
     fn state(&self) -> State {
         State {
-            cameras: self.cameras.iter().map(|c| c.0).collect(),
+            cameras: self.cameras.iter().map(|c| c.camera).collect(),
             poses: self.poses.clone(),
             points: self.points.clone(),
         }
@@ -204,7 +249,16 @@ impl Problem {
                 sum
             })
             .collect();
-        0.5 * sums.iter().sum::<f64>()
+        0.5 * sums.iter().sum::<f64>() + self.belief_cost(state)
+    }
+
+    /// The terms of what is believed of the cameras.
+    fn belief_cost(&self, state: &State) -> f64 {
+        self.cameras
+            .iter()
+            .zip(&state.cameras)
+            .map(|(c, now)| c.belief.cost(now))
+            .sum()
     }
 
     /// Ranges of points of about equal numbers of observations; they depend on the problem alone.

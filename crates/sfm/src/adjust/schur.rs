@@ -5,7 +5,7 @@
 //! slope; per point V = sum B^T B + damping; per point and block W = A^T B or K^T B.
 
 use super::cholesky::{Symmetric, conjugate_gradients};
-use super::{BEHIND, DIRECT_LIMIT, Focal, Loss, Problem, State};
+use super::{BEHIND, DIRECT_LIMIT, Loss, Problem, State};
 use crate::geometry::camera::PARAMETERS;
 use glam::{DMat3, DVec3};
 use irradia_compute::simd::{Kernel, Lanes, Level, Simd};
@@ -56,6 +56,8 @@ pub(super) struct Linearization {
     w: Vec<[[f64; POSE]; 3]>,
     /// Per entry of `groups`, sums over the point's observations of `K^T B`, `[3][8]`.
     wk: Vec<[[f64; PARAMETERS]; 3]>,
+    /// Per camera block and unknown: second and first derivative of what is believed.
+    beliefs: Vec<[[f64; 2]; PARAMETERS]>,
     /// Per point: sum of `B^T B` and of `B^T r`.
     v: Vec<(DMat3, DVec3)>,
 }
@@ -86,7 +88,7 @@ impl Linearization {
                 .cameras
                 .iter()
                 .zip(seen)
-                .map(|(c, seen)| !seen || !c.1.columns().contains(&true)),
+                .map(|(c, seen)| !seen || !c.freedom.columns().contains(&true)),
         );
         let n = problem.observations.len();
         let mut of_pose = vec![Vec::new(); pose_blocks];
@@ -122,6 +124,7 @@ impl Linearization {
             rows: vec![EMPTY; n],
             w: vec![[[0.0; POSE]; 3]; n],
             wk: vec![[[0.0; PARAMETERS]; 3]; groups.len()],
+            beliefs: Vec::new(),
             v: vec![(DMat3::ZERO, DVec3::ZERO); problem.points.len()],
             groups,
             of_camera,
@@ -135,13 +138,9 @@ impl Linearization {
             .cameras
             .iter()
             .zip(&state.cameras)
-            .map(|((_, freedom), camera)| {
-                let tied = if freedom.focal == Focal::Tied {
-                    camera.parameters[1] / camera.parameters[0]
-                } else {
-                    0.0
-                };
-                (freedom.columns().map(f64::from), tied)
+            .map(|(adjusted, camera)| {
+                let ratio = camera.parameters[1] / camera.parameters[0];
+                (adjusted.freedom.columns().map(f64::from), ratio)
             })
             .collect();
         let pieces = problem.pieces();
@@ -186,7 +185,7 @@ impl Linearization {
                         let root = slope.sqrt();
                         let row = &mut rows[at];
                         row.r = (r * root).to_array();
-                        let (mask, tied) = columns[problem.camera_of[observation.pose as usize] as usize];
+                        let (mask, ratio) = columns[problem.camera_of[observation.pose as usize] as usize];
                         for e in 0..2 {
                             let by = projection.by_point[e] * root;
                             // d camera point / d turn is the cross product turn x p; / d point is the rotation.
@@ -197,7 +196,7 @@ impl Linearization {
                             for c in 0..PARAMETERS {
                                 row.k[e][c] = mask[c] * root * projection.by_camera[e][c];
                             }
-                            row.k[e][0] += mask[0] * tied * root * projection.by_camera[e][1];
+                            row.k[e][0] += mask[0] * ratio * root * projection.by_camera[e][1];
                         }
                         for x in 0..3 {
                             for c in 0..POSE {
@@ -227,7 +226,21 @@ impl Linearization {
                 cost
             })
             .collect();
-        0.5 * costs.iter().sum::<f64>()
+        self.beliefs = (problem.cameras.iter().zip(&state.cameras).zip(&self.camera_block))
+            .filter(|(_, block)| **block != NONE)
+            .map(|((adjusted, now), _)| {
+                let columns = adjusted.freedom.columns();
+                let (errors, weights) = (adjusted.belief.errors(now), adjusted.belief.weights);
+                std::array::from_fn(|i| {
+                    if columns[i] {
+                        [weights[i], weights[i] * errors[i]]
+                    } else {
+                        [0.0; 2]
+                    }
+                })
+            })
+            .collect();
+        0.5 * costs.iter().sum::<f64>() + problem.belief_cost(state)
     }
 
     /// The damped Gauss-Newton step; `None` where the system is not positive definite.
@@ -323,7 +336,11 @@ impl Linearization {
                     }
                 }
             }
-            for i in 0..PARAMETERS {
+            for (i, [second, first]) in self.beliefs[c].into_iter().enumerate() {
+                camera_right[c * PARAMETERS + i] += first;
+                camera_diagonal[c * PARAMETERS + i][0] += second;
+                camera_diagonal[c * PARAMETERS + i][1] += first;
+                rows[i * n + cameras_at + c * PARAMETERS + i] += second;
                 let own = camera_diagonal[c * PARAMETERS + i][0];
                 // A held parameter has no equation: its own unknown is then zero.
                 let damped = if own == 0.0 {
@@ -599,22 +616,20 @@ pub(super) struct Step {
 }
 
 impl Step {
-    pub(super) fn applied(&self, problem: &Problem, state: &State) -> State {
+    pub(super) fn applied(&self, state: &State) -> State {
         let mut next = state.clone();
         for (pose, step) in next.poses.iter_mut().zip(&self.poses) {
             if let Some((turn, shift)) = step {
                 *pose = pose.moved(*turn, *shift);
             }
         }
-        for ((camera, (_, freedom)), step) in next.cameras.iter_mut().zip(&problem.cameras).zip(&self.cameras) {
+        for (camera, step) in next.cameras.iter_mut().zip(&self.cameras) {
             if let Some(step) = step {
                 let ratio = camera.parameters[1] / camera.parameters[0];
                 for (value, step) in camera.parameters.iter_mut().zip(step) {
                     *value += step;
                 }
-                if freedom.focal == Focal::Tied {
-                    camera.parameters[1] = camera.parameters[0] * ratio;
-                }
+                camera.parameters[1] += ratio * step[0];
             }
         }
         for (point, step) in next.points.iter_mut().zip(&self.points) {

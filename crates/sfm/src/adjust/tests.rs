@@ -13,7 +13,7 @@ fn world(poses: usize, points: usize, cameras: usize, noise: f64, seed: u64) -> 
             height: 480,
             parameters: [500.0, 505.0, 320.0, 240.0, 0.05 + normal(0.01), -0.03, 0.001, -0.001],
         };
-        exact.cameras.push((camera, Freedom::HELD));
+        exact.cameras.push(AdjustedCamera::new(camera, Freedom::HELD));
     }
     for i in 0..poses {
         let angle = 0.2 * i as f64;
@@ -31,7 +31,7 @@ fn world(poses: usize, points: usize, cameras: usize, noise: f64, seed: u64) -> 
         let point = DVec3::new(normal(1.0), normal(0.7), normal(1.0));
         for (i, pose) in exact.poses.iter().enumerate() {
             let p = pose.camera_from_world(point);
-            let at = exact.cameras[i % cameras].0.pixel(p);
+            let at = exact.cameras[i % cameras].camera.pixel(p);
             if p.z > 0.5 && normal(1.0) < 0.8 {
                 let at = at + DVec2::new(normal(noise), normal(noise));
                 exact.observations.push(Observation { pose: i as u32, at });
@@ -70,20 +70,20 @@ const PRECISE: AdjustOptions = AdjustOptions {
 #[test]
 fn without_noise_the_cost_vanishes_and_intrinsics_return() {
     let (exact, mut problem) = world(8, 60, 1, 0.0, 1);
-    problem.cameras[0].0.parameters = [520.0, 520.0, 320.0, 240.0, 0.0, 0.0, 0.0, 0.0];
-    problem.cameras[0].1 = EVERYTHING;
+    problem.cameras[0].camera.parameters = [520.0, 520.0, 320.0, 240.0, 0.0, 0.0, 0.0, 0.0];
+    problem.cameras[0].freedom = EVERYTHING;
     let report = problem.solve(&PRECISE);
     assert!(report.final_cost < 1e-12, "{report:?}");
     for (got, want) in problem.cameras[0]
-        .0
+        .camera
         .parameters
         .iter()
-        .zip(exact.cameras[0].0.parameters)
+        .zip(exact.cameras[0].camera.parameters)
     {
         assert!(
             (got - want).abs() < 1e-4 * want.abs().max(0.01),
             "{:?}",
-            problem.cameras[0].0
+            problem.cameras[0].camera
         );
     }
 }
@@ -94,7 +94,7 @@ fn held_values_do_not_move() {
     problem.held_poses[0] = true;
     problem.held_poses[3] = true;
     problem.held_points[5] = true;
-    problem.cameras[0].1 = Freedom {
+    problem.cameras[0].freedom = Freedom {
         focal: Focal::Tied,
         radial: 1,
         ..Freedom::HELD
@@ -110,7 +110,10 @@ fn held_values_do_not_move() {
     assert_eq!(problem.poses[3], before.poses[3]);
     assert_eq!(problem.points[5], before.points[5]);
     assert_eq!(problem.cameras[1], before.cameras[1]);
-    let (now, then) = (problem.cameras[0].0.parameters, before.cameras[0].0.parameters);
+    let (now, then) = (
+        problem.cameras[0].camera.parameters,
+        before.cameras[0].camera.parameters,
+    );
     assert!((now[0] / now[1] - then[0] / then[1]).abs() < 1e-12);
     assert!(now[0] != then[0] && now[4] != then[4]);
     assert_eq!((now[2], now[3], now[5], now[6]), (then[2], then[3], then[5], then[6]));
@@ -122,7 +125,7 @@ fn the_gradient_vanishes_at_the_solution() {
     for (loss, cameras) in [(Loss::Squared, 1), (Loss::SoftL1(1.0), 2), (Loss::Cauchy(2.0), 8)] {
         let (_, mut problem) = world(8, 60, cameras, 0.7, 3);
         for camera in &mut problem.cameras {
-            camera.1 = Freedom {
+            camera.freedom = Freedom {
                 focal: Focal::Tied,
                 radial: 1,
                 ..Freedom::HELD
@@ -159,11 +162,11 @@ fn the_gradient_vanishes_at_the_solution() {
             slope("point", 1.0, &|p, h| p.points[i].y += h);
         }
         slope("focal", 100.0, &|p, h| {
-            let ratio = p.cameras[0].0.parameters[1] / p.cameras[0].0.parameters[0];
-            p.cameras[0].0.parameters[0] += h;
-            p.cameras[0].0.parameters[1] += h * ratio;
+            let ratio = p.cameras[0].camera.parameters[1] / p.cameras[0].camera.parameters[0];
+            p.cameras[0].camera.parameters[0] += h;
+            p.cameras[0].camera.parameters[1] += h * ratio;
         });
-        slope("k1", 1.0, &|p, h| p.cameras[0].0.parameters[4] += h);
+        slope("k1", 1.0, &|p, h| p.cameras[0].camera.parameters[4] += h);
     }
 }
 
@@ -171,7 +174,7 @@ fn the_gradient_vanishes_at_the_solution() {
 fn any_number_of_threads_gives_the_same_bytes() {
     let run = |threads: usize| {
         let (_, mut problem) = world(10, 400, 2, 0.5, 4);
-        problem.cameras[1].1 = EVERYTHING;
+        problem.cameras[1].freedom = EVERYTHING;
         let pool = rayon::ThreadPoolBuilder::new()
             .num_threads(threads)
             .build()
@@ -194,4 +197,31 @@ fn points_behind_a_camera_do_not_break_it() {
     let report = problem.solve(&PRECISE);
     assert!(report.initial_cost.is_infinite() && report.iterations == 0);
     assert!(Problem::default().solve(&PRECISE).final_cost == 0.0);
+}
+
+/// One pose, one point, nothing to see but what is believed.
+#[test]
+fn what_is_believed_of_a_camera_decides_where_nothing_else_does() {
+    let (_, mut problem) = world(1, 30, 1, 0.0, 6);
+    problem.held_poses[0] = true;
+    problem.cameras[0].freedom = EVERYTHING;
+    // Each point can follow any camera: only beliefs have a minimum.
+    problem.cameras[0].belief = Belief {
+        values: [510.0, 1.01, 322.0, 241.0, 0.02, -0.02, 0.0, 0.0],
+        weights: [1e2, 1e6, 1e2, 1e2, 1e6, 1e6, 1e6, 1e6],
+    };
+    let report = problem.solve(&PRECISE);
+    assert!(report.final_cost < 1e-9, "{report:?}");
+    for (got, want) in problem.cameras[0]
+        .camera
+        .parameters
+        .iter()
+        .zip([510.0, 515.1, 322.0, 241.0, 0.02, -0.02, 0.0, 0.0])
+    {
+        assert!(
+            (got - want).abs() < 1e-3 * f64::abs(want).max(0.01),
+            "{:?}",
+            problem.cameras[0].camera
+        );
+    }
 }

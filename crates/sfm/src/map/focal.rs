@@ -23,12 +23,16 @@ pub enum Source {
 
 /// The guess, in long sides (COLMAP's default).
 const GUESS: f64 = 1.2;
-/// Candidates, in long sides: a field of view of 90 to 19 degrees, in steps of 6 %.
+/// Candidates, in long sides: a field of view of 90 to 8 degrees, in steps of 7 %.
 const FIRST: f64 = 0.5;
-const STEP: f64 = 1.06;
-const CANDIDATES: usize = 31;
+const STEP: f64 = 1.07;
+const CANDIDATES: usize = 40;
+/// The cost at which metadata are still believed, by the lowest.
+const PRIOR: f64 = 1.25;
 /// Pairs that vote, those with most inliers, and points of each.
 const VOTERS: usize = 40;
+/// Pairs among which voters are found when all photographs have metadata.
+pub(super) const ENOUGH: usize = 120;
 const POINTS: usize = 300;
 
 /// The camera of each group.
@@ -49,19 +53,24 @@ pub(super) fn cameras(
             let long_side = f64::from(first.width.max(first.height));
             let mut priors: Vec<f64> = members.iter().filter_map(|p| p.focal_prior_px).collect();
             priors.sort_by(f64::total_cmp);
-            let (focal, source) = match priors.get(priors.len() / 2) {
-                Some(prior) => (*prior, Source::Prior),
-                None => match vote(group, photos, features, pairs, uncalibrated, options) {
-                    Some(focal) => (focal * long_side, Source::Pairs),
-                    None => (GUESS * long_side, Source::Guess),
-                },
+            let prior = priors.get(priors.len() / 2).map(|prior| prior / long_side);
+            let (focal, source) = match (
+                prior,
+                vote(group, photos, features, pairs, uncalibrated, prior, options),
+            ) {
+                (Some(prior), None) => (prior, Source::Prior),
+                // Metadata of a picture that was cropped or scaled later are wrong.
+                (_, Some(focal)) => (focal, Source::Pairs),
+                (None, None) => (GUESS, Source::Guess),
             };
+            let focal = focal * long_side;
             (DCamera::centered(first.width, first.height, focal), source)
         })
         .collect()
 }
 
-/// The focal length, in long sides, at which essential matrices fit the pairs of a group best; `None` if all fit alike.
+/// The focal length, in long sides, at which essential matrices fit the pairs of a group best; `None` if all fit alike, or if
+/// `prior` fits nearly as well.
 ///
 /// Each pair's fundamental matrix gives an essential matrix for each candidate, which is refined on the pair's inliers; the
 /// candidate with the lowest sum of MSAC costs wins. Pairs that any focal length fits (planes, turns) add the same to all.
@@ -71,6 +80,7 @@ fn vote(
     features: &[Features],
     pairs: &[PairMatches],
     uncalibrated: &[&Uncalibrated],
+    prior: Option<f64>,
     options: &MapOptions,
 ) -> Option<f64> {
     let mut voters: Vec<&Uncalibrated> = uncalibrated
@@ -81,7 +91,11 @@ fn vote(
     voters.sort_by_key(|u| (std::cmp::Reverse(u.count), u.pair));
     // Neighbours have most inliers but the least parallax: every third of the better half.
     let step = (voters.len() / 2 / VOTERS).max(1);
-    let costs: Vec<[f64; CANDIDATES]> = voters
+    let candidates: [f64; CANDIDATES + 1] = std::array::from_fn(|i| match (i, prior) {
+        (CANDIDATES, Some(prior)) => prior,
+        _ => FIRST * STEP.powi(i as i32),
+    });
+    let costs: Vec<[f64; CANDIDATES + 1]> = voters
         .into_iter()
         .step_by(step)
         .take(VOTERS)
@@ -99,15 +113,29 @@ fn vote(
             );
             // A quarter of the threshold: what is left are errors of the model, not wrong matches.
             let threshold = 0.25 * options.max_epipolar_error / side;
-            std::array::from_fn(|i| cost(voter, &points, FIRST * STEP.powi(i as i32), threshold))
+            candidates.map(|focal| cost(voter, &points, focal, threshold))
         })
         .collect();
     if costs.is_empty() {
         return None;
     }
-    let total: [f64; CANDIDATES] = std::array::from_fn(|i| costs.iter().map(|c| c[i]).sum::<f64>());
+    let total: [f64; CANDIDATES + 1] = std::array::from_fn(|i| costs.iter().map(|c| c[i]).sum::<f64>());
     let best = (0..CANDIDATES).reduce(|best, i| if total[i] < total[best] { i } else { best })?;
-    let worst = total.iter().fold(0.0f64, |m, x| m.max(*x));
+    if prior.is_some() && total[CANDIDATES] < PRIOR * total[best] {
+        return None;
+    }
+    if std::env::var_os("DBG").is_some() {
+        eprintln!(
+            "DBG vote {} pairs: {:?}",
+            costs.len(),
+            total
+                .iter()
+                .enumerate()
+                .map(|(i, t)| format!("{:.2}:{:.0}", FIRST * STEP.powi(i as i32), t))
+                .collect::<Vec<_>>()
+        );
+    }
+    let worst = total[..CANDIDATES].iter().fold(0.0f64, |m, x| m.max(*x));
     if best == 0 || best == CANDIDATES - 1 || total[best] > 0.98 * worst {
         return None;
     }

@@ -16,6 +16,9 @@ const SEEDS: usize = 12;
 const TRIES: usize = 3;
 /// Points of a pair of photographs below which it is no seed.
 const SEED_POINTS: usize = 12;
+/// Inliers among the points a photograph shows: those with fewer wait until the others are registered and all is adjusted.
+const STRICT: f64 = 0.5;
+const LENIENT: f64 = 0.25;
 /// Rounds of adjustment, filtering and triangulation at the end.
 const LAST_ROUNDS: usize = 3;
 
@@ -102,8 +105,8 @@ impl Working<'_> {
         let mut settled = false;
         loop {
             let next = self.candidates(taken, failures).into_iter().find(|photo| {
-                let registered = self.register(*photo);
-                failures[*photo] += usize::from(!registered);
+                let registered = self.register(*photo, if settled { LENIENT } else { STRICT });
+                failures[*photo] += usize::from(!registered && settled);
                 registered
             });
             let Some(photo) = next else {
@@ -213,8 +216,8 @@ impl Working<'_> {
         (count, score)
     }
 
-    /// Finds the pose of a photograph from the points it shows; `false` if too few agree.
-    fn register(&mut self, photo: usize) -> bool {
+    /// Finds the pose of a photograph from the points it shows; `false` if fewer than `ratio` of them agree.
+    fn register(&mut self, photo: usize, ratio: f64) -> bool {
         let seen: Vec<u32> = self.tracks.of_photo[photo]
             .iter()
             .copied()
@@ -239,7 +242,7 @@ impl Working<'_> {
         let Some(found) = problem.solve(Vec::new(), limits) else {
             return false;
         };
-        if found.inliers < self.options.min_registration_inliers || 4 * found.inliers < seen.len() {
+        if found.inliers < self.options.min_registration_inliers || (found.inliers as f64) < ratio * seen.len() as f64 {
             return false;
         }
         self.poses[photo] = Some(found.model);

@@ -18,7 +18,8 @@ pub(super) struct Working<'a> {
     pub options: &'a MapOptions,
     /// `[groups]` cameras.
     pub cameras: Vec<DCamera>,
-    /// `[groups]` where their first focal lengths came from.
+    /// `[groups]` their first focal lengths, px, and where these came from.
+    pub first_focals: Vec<f64>,
     pub sources: Vec<Source>,
     /// `[groups]` focal lengths that are held because no value is better than another.
     pub focal_held: Vec<bool>,
@@ -40,6 +41,7 @@ impl<'a> Working<'a> {
             tracks,
             options,
             cameras: cameras.iter().map(|c| c.0).collect(),
+            first_focals: cameras.iter().map(|c| c.0.focal()).collect(),
             sources: cameras.iter().map(|c| c.1).collect(),
             focal_held: vec![false; cameras.len()],
             plane: Vec::new(),

@@ -2,13 +2,17 @@
 
 use super::focal::Source;
 use super::model::Working;
-use crate::adjust::{AdjustOptions, AdjustReport, Focal, Freedom, Loss, Observation, Problem};
+use crate::adjust::{AdjustOptions, AdjustReport, AdjustedCamera, Belief, Focal, Freedom, Loss, Observation, Problem};
 use crate::geometry::camera::DCamera;
+use glam::DVec2;
 
 /// Scale of the robust loss, px.
 const LOSS: Loss = Loss::SoftL1(1.0);
 /// Observations of a photograph, from long tracks, that an adjustment needs while the model grows.
 const ENOUGH: usize = 300;
+
+/// Squared error, px^2, that one deviation of an intrinsic parameter is worth: that of a hundred observations off by a pixel.
+const BELIEF: f64 = 100.0;
 
 /// How much of the model an adjustment may change.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -43,7 +47,11 @@ impl Working<'_> {
         }
         problem.held_poses = vec![false; photos.len()];
         for group in 0..self.cameras.len() {
-            problem.cameras.push((self.cameras[group], self.freedom(group, extent)));
+            problem.cameras.push(AdjustedCamera {
+                camera: self.cameras[group],
+                freedom: self.freedom(group, extent),
+                belief: belief(&self.cameras[group], self.first_focals[group]),
+            });
         }
         self.add_points(&mut problem, &chosen, |_| false, |photo| Some(pose_of[photo as usize]));
         let options = match extent {
@@ -68,7 +76,7 @@ impl Working<'_> {
             self.poses[photo] = Some(*pose);
         }
         for group in 0..self.cameras.len() {
-            self.take_camera(group, problem.cameras[group].0);
+            self.take_camera(group, problem.cameras[group].camera);
         }
         for (track, point) in chosen.iter().zip(&problem.points) {
             self.points[*track] = Some(*point);
@@ -118,7 +126,11 @@ impl Working<'_> {
                 add(&mut problem, other, true);
             }
         }
-        problem.cameras = self.cameras.iter().map(|c| (*c, Freedom::HELD)).collect();
+        problem.cameras = self
+            .cameras
+            .iter()
+            .map(|c| AdjustedCamera::new(*c, Freedom::HELD))
+            .collect();
         self.add_points(
             &mut problem,
             &tracks,
@@ -243,5 +255,26 @@ impl Working<'_> {
         } else {
             self.focal_held[group] = true;
         }
+    }
+}
+
+/// What is known of cameras in general, so that what a set of photographs does not determine stays where it usually is:
+/// square pixels, a principal point near the centre, a weak lens, a focal length near the first one.
+fn belief(camera: &DCamera, first_focal: f64) -> Belief {
+    let long_side = f64::from(camera.width.max(camera.height));
+    let deviations = [
+        0.5 * first_focal,
+        0.002,
+        0.01 * long_side,
+        0.01 * long_side,
+        0.1,
+        0.1,
+        0.002,
+        0.002,
+    ];
+    let center = 0.5 * DVec2::new(f64::from(camera.width), f64::from(camera.height));
+    Belief {
+        values: [first_focal, 1.0, center.x, center.y, 0.0, 0.0, 0.0, 0.0],
+        weights: deviations.map(|d| BELIEF / (d * d)),
     }
 }

@@ -226,7 +226,7 @@ mod tests {
         let pairs = [
             pair([0, 1], &[[0, 0], [1, 1]]),
             // Keypoint 2 of the last photograph is its keypoint 0 in another orientation.
-            pair([1, 2], &[[0, 2]]),
+            pair([1, 2], &[[0, 2], [1, 1]]),
             // Would join keypoints 0 and 1 of the first photograph.
             pair([0, 2], &[[1, 0]]),
         ];
@@ -239,9 +239,9 @@ mod tests {
                 .collect::<Vec<_>>()
         };
         assert_eq!(members(0), [(0, 0), (1, 0), (2, 0)]);
-        assert_eq!(members(1), [(0, 1), (1, 1)]);
+        assert_eq!(members(1), [(0, 1), (1, 1), (2, 1)]);
         assert_eq!(tracks.of_photo[1], [1, 4]);
         assert_eq!(tracks.pixels[2], DVec2::new(6.0, 0.0));
-        assert_eq!(tracks.track_of, [0, 0, 0, 1, 1]);
+        assert_eq!(tracks.track_of, [0, 0, 0, 1, 1, 1]);
     }
 }

@@ -38,12 +38,17 @@ pub fn verify(
     options: &MapOptions,
     progress: &mut dyn FnMut(Progress),
 ) -> (Cameras, Vec<VerifiedPair>) {
+    // With metadata for all, a few pairs suffice to check them.
     let known = photos.iter().all(|p| p.focal_prior_px.is_some());
+    let mut voters: Vec<usize> = (0..pairs.len()).collect();
+    voters.sort_by_key(|i| (std::cmp::Reverse(pairs[*i].matches.len()), *i));
+    let mut votes = vec![!known; pairs.len()];
+    voters.iter().take(focal::ENOUGH).for_each(|i| votes[*i] = true);
     let uncalibrated: Vec<Option<Uncalibrated>> = pairs
         .par_iter()
         .enumerate()
         .map(|(i, pair)| {
-            if known || pair.matches.len() < options.min_inliers {
+            if !votes[i] || pair.matches.len() < options.min_inliers {
                 return None;
             }
             fundamental(i, photos, features, pair, options)

@@ -232,11 +232,10 @@ impl Linearization {
                 let columns = adjusted.freedom.columns();
                 let (errors, weights) = (adjusted.belief.errors(now), adjusted.belief.weights);
                 std::array::from_fn(|i| {
-                    if columns[i] {
-                        [weights[i], weights[i] * errors[i]]
-                    } else {
-                        [0.0; 2]
-                    }
+                    // The ratio fy / fx moves by 1 / fx as fy moves.
+                    let slope = if i == 1 { 1.0 / now.parameters[0] } else { 1.0 };
+                    let weight = if columns[i] { weights[i] * slope } else { 0.0 };
+                    [weight * slope, weight * errors[i]]
                 })
             })
             .collect();

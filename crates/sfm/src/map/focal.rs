@@ -124,17 +124,6 @@ fn vote(
     if prior.is_some() && total[CANDIDATES] < PRIOR * total[best] {
         return None;
     }
-    if std::env::var_os("DBG").is_some() {
-        eprintln!(
-            "DBG vote {} pairs: {:?}",
-            costs.len(),
-            total
-                .iter()
-                .enumerate()
-                .map(|(i, t)| format!("{:.2}:{:.0}", FIRST * STEP.powi(i as i32), t))
-                .collect::<Vec<_>>()
-        );
-    }
     let worst = total[..CANDIDATES].iter().fold(0.0f64, |m, x| m.max(*x));
     if best == 0 || best == CANDIDATES - 1 || total[best] > 0.98 * worst {
         return None;

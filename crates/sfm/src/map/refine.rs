@@ -6,13 +6,15 @@ use crate::adjust::{AdjustOptions, AdjustReport, AdjustedCamera, Belief, Focal, 
 use crate::geometry::camera::DCamera;
 use glam::DVec2;
 
-/// Scale of the robust loss, px.
-const LOSS: Loss = Loss::SoftL1(1.0);
+/// The loss while the model grows and poses may be far off, and the one at the end, which ignores wrong matches more.
+const GROWING_LOSS: Loss = Loss::SoftL1(1.0);
+const LOSS: Loss = Loss::Cauchy(1.0);
 /// Observations of a photograph, from long tracks, that an adjustment needs while the model grows.
 const ENOUGH: usize = 300;
 
-/// Squared error, px^2, that one deviation of an intrinsic parameter is worth: that of a hundred observations off by a pixel.
-const BELIEF: f64 = 100.0;
+/// Squared error, px^2, that one deviation of an intrinsic parameter is worth: that of ten observations off by a
+/// pixel.
+const BELIEF: f64 = 10.0;
 
 /// How much of the model an adjustment may change.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -54,22 +56,15 @@ impl Working<'_> {
             });
         }
         self.add_points(&mut problem, &chosen, |_| false, |photo| Some(pose_of[photo as usize]));
-        let options = match extent {
-            Extent::Growing => AdjustOptions {
-                loss: LOSS,
-                iterations: 8,
-                tolerance: 1e-3,
-            },
-            Extent::Full => AdjustOptions {
-                loss: LOSS,
-                iterations: 15,
-                tolerance: 1e-4,
-            },
-            Extent::Last => AdjustOptions {
-                loss: LOSS,
-                iterations: 30,
-                tolerance: 1e-5,
-            },
+        let (loss, iterations, tolerance) = match extent {
+            Extent::Growing => (GROWING_LOSS, 8, 1e-3),
+            Extent::Full => (LOSS, 15, 1e-4),
+            Extent::Last => (LOSS, 30, 1e-5),
+        };
+        let options = AdjustOptions {
+            loss,
+            iterations,
+            tolerance,
         };
         let report = problem.solve(&options);
         for (pose, photo) in problem.poses.iter().zip(photos) {
@@ -138,7 +133,7 @@ impl Working<'_> {
             |photo| Some(pose_of[photo as usize]),
         );
         problem.solve(&AdjustOptions {
-            loss: LOSS,
+            loss: GROWING_LOSS,
             iterations: 6,
             tolerance: 1e-3,
         });

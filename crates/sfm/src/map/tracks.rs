@@ -4,6 +4,9 @@ use super::types::{PairKind, VerifiedPair};
 use crate::Features;
 use glam::DVec2;
 
+/// Tracks of three photographs or more with which a photograph needs no tracks of two.
+const ENOUGH: usize = 200;
+
 /// A keypoint of a track.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Observation {
@@ -101,6 +104,12 @@ impl Tracks {
                 });
             }
         }
+        // Tracks of two photographs say least and are wrong most often: only photographs with few others need them.
+        let mut longer = vec![0usize; features.len()];
+        for member in members.iter().filter(|m| m.len() > 2).flatten() {
+            longer[member.photo as usize] += 1;
+        }
+        members.retain(|m| m.len() > 2 || m.iter().any(|member| longer[member.photo as usize] < ENOUGH));
         for (track, members) in members.into_iter().enumerate() {
             for member in members {
                 let keypoint = &features[member.photo as usize].keypoints[member.keypoint as usize];

@@ -5,10 +5,10 @@ use super::focal::{self, Source};
 use super::types::{MapOptions, PairKind, PhotoInfo, Progress, VerifiedPair};
 use crate::geometry::camera::DCamera;
 use crate::geometry::correspondences::{Correspondences, sampson_squared};
-use crate::geometry::essential::{Essential, Motion, closest_essential, motion_in_front, refine_motion};
+use crate::geometry::essential::{Essential, Motion, closest_essential, cross_matrix, motion_in_front, refine_motion};
 use crate::geometry::fundamental::Fundamental;
 use crate::geometry::homography::{Homography, rotation_between};
-use crate::geometry::ransac::{Limits, estimate};
+use crate::geometry::ransac::{Estimate, Limits, estimate};
 use crate::{Features, PairMatches};
 use glam::{DMat3, DVec2, DVec3};
 use rayon::prelude::*;
@@ -18,6 +18,9 @@ const SAMPLES: usize = 600;
 const CONFIDENCE: f64 = 0.9999;
 /// Inliers of a homography, or of a rotation, by those of the essential matrix, from which on it explains the pair.
 const EXPLAINS: f64 = 0.8;
+
+/// The median angle below which a pair is a rotation, radians: about three pixels at a long side of a thousand.
+const LEAST_ANGLE: f64 = 0.003;
 
 /// A pair's fundamental matrix between pixels that are centred and divided by each photograph's long side.
 #[derive(Clone, Debug)]
@@ -112,17 +115,29 @@ fn fundamental(
         confidence: CONFIDENCE,
         seed: seed_of(pair),
     };
-    let best = estimate(
-        &Fundamental {
-            points: &points,
-            threshold,
-        },
-        Vec::new(),
-        limits,
-    )?;
-    if best.inliers < options.min_inliers {
-        return None;
-    }
+    let problem = Fundamental {
+        points: &points,
+        threshold,
+    };
+    let enough = |best: &Estimate<DMat3>| best.inliers >= options.min_inliers;
+    let best = estimate(&problem, Vec::new(), limits).filter(enough).or_else(|| {
+        // Seven points of one photograph taken twice, or of a noiseless turn, leave the matrix open: any epipole does.
+        let plane = estimate(
+            &Homography {
+                points: &points,
+                threshold,
+            },
+            Vec::new(),
+            limits,
+        )?
+        .model;
+        estimate(
+            &problem,
+            vec![cross_matrix(DVec3::X) * plane],
+            Limits { samples: 0, ..limits },
+        )
+        .filter(enough)
+    })?;
     let inliers: Vec<bool> = points
         .points
         .iter()
@@ -200,8 +215,12 @@ fn calibrated(
     let (start, _) = motion_in_front(best.model, kept.iter());
     let motion = refine_motion(start, &kept, threshold, 3)
         .map_or(start, |refined| motion_in_front(refined.essential(), kept.iter()).0);
-    let kind = kind(&kept, threshold, pair);
     let angle = median_angle(&motion, &kept);
+    let kind = if angle < LEAST_ANGLE {
+        PairKind::Rotation
+    } else {
+        kind(&kept, threshold, pair)
+    };
     Some(VerifiedPair {
         photos: pair.photos,
         matches: select(&pair.matches, &inliers),
@@ -242,11 +261,11 @@ fn kind(points: &[[DVec2; 2]], threshold: f64, pair: &PairMatches) -> PairKind {
     if (plane.inliers as f64) < explained {
         return PairKind::General;
     }
-    // Twice: the second time without what does not turn along.
+    // Twice: the second time without what does not turn along. The lens may be unknown yet: twice the threshold.
     let mut rotation = rotation_between(points.iter().copied());
     let close = |rotation: &DMat3, [a, b]: &[DVec2; 2]| {
         let turned = *rotation * a.extend(1.0);
-        turned.z > 0.0 && (turned.truncate() / turned.z - *b).length() < threshold
+        turned.z > 0.0 && (turned.truncate() / turned.z - *b).length() < 2.0 * threshold
     };
     rotation = rotation_between(points.iter().copied().filter(|p| close(&rotation, p)));
     let turned = points.iter().filter(|p| close(&rotation, p)).count();

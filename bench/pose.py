@@ -12,7 +12,9 @@ without a pose counts as wrong.
 
 import itertools
 import json
+import multiprocessing
 import pathlib
+import resource
 import shutil
 import subprocess
 import sys
@@ -23,16 +25,38 @@ import numpy as np
 import pycolmap
 
 
+def timed(work):
+    """Wall and CPU seconds of `work`, which runs in child processes."""
+    cpu = lambda: sum(resource.getrusage(resource.RUSAGE_CHILDREN)[:2])
+    start, before = time.perf_counter(), cpu()
+    work()
+    return time.perf_counter() - start, cpu() - before
+
+
 def run_irradia(program, photos, out):
-    start = time.perf_counter()
-    subprocess.run([program, "pose", photos, "--out", out], check=True, stdout=subprocess.DEVNULL)
-    seconds = time.perf_counter() - start
+    command = [program, "pose", photos, "--out", out]
+    quiet = subprocess.DEVNULL
+    seconds = timed(lambda: subprocess.run(command, check=True, stdout=quiet, stderr=quiet))
     report = json.loads((out / "pose.json").read_text())
     stages = {stage["name"]: stage["seconds"] for stage in report["stages"]}
     return seconds, stages, pycolmap.Reconstruction(out / "sparse" / "0")
 
 
 def run_colmap(photos, out):
+    """In a process of its own, whose CPU time can be told."""
+    def work():
+        child = multiprocessing.get_context("spawn").Process(target=colmap, args=(photos, out))
+        child.start()
+        child.join()
+
+    seconds = timed(work)
+    models = [pycolmap.Reconstruction(model) for model in out.glob("[0-9]*")]
+    model = max(models, key=lambda model: model.num_reg_images(), default=pycolmap.Reconstruction())
+    return seconds, json.loads((out / "stages.json").read_text()), model
+
+
+def colmap(photos, out):
+    pycolmap.logging.minloglevel = 2
     out.mkdir()
     database = out / "database.db"
     times = [time.perf_counter()]
@@ -42,12 +66,11 @@ def run_colmap(photos, out):
     times.append(time.perf_counter())
     pycolmap.match_exhaustive(database, device=pycolmap.Device.cpu)
     times.append(time.perf_counter())
-    models = pycolmap.incremental_mapping(database, photos, out)
+    pycolmap.incremental_mapping(database, photos, out)
     times.append(time.perf_counter())
     names = ["features", "matches", "poses"]
     stages = {name: b - a for name, a, b in zip(names, times, times[1:])}
-    model = max(models.values(), key=lambda model: model.num_reg_images()) if models else pycolmap.Reconstruction()
-    return times[-1] - times[0], stages, model
+    (out / "stages.json").write_text(json.dumps(stages))
 
 
 def poses(model):
@@ -94,11 +117,11 @@ def main():
             again = run_colmap(photos, folder / "again")
             count = sum(1 for file in photos.iterdir() if file.suffix.lower() in (".jpg", ".jpeg", ".png"))
             print(f"{photos}: {count} photographs")
-            for name, (seconds, stages, model) in (("irradia", ours), ("COLMAP", colmap), ("COLMAP again", again)):
+            for name, ((wall, cpu), stages, model) in (("irradia", ours), ("COLMAP", colmap), ("COLMAP again", again)):
                 times = ", ".join(f"{stage} {value:.1f}" for stage, value in stages.items())
                 focal = np.mean([camera.mean_focal_length() for camera in model.cameras.values()] or [0.0])
                 print(
-                    f"  {name:13} {seconds:6.1f} s ({times}); {model.num_reg_images()} registered, "
+                    f"  {name:13} {wall:6.1f} s, {cpu:.1f} s of CPU ({times}); {model.num_reg_images()} registered, "
                     f"{model.num_points3D()} points, {model.compute_mean_reprojection_error():.2f} px, focal {focal:.1f}"
                 )
             truth = poses(colmap[2])

@@ -142,7 +142,10 @@ impl Display {
             }
             (PoseProgress::Done(done), Some(bar)) => bar.set_position(done as u64),
             (PoseProgress::Done(done), None) if self.last_line.elapsed() >= LINE_EVERY => {
-                note(format_args!("{} {done}/{}", self.stage, self.of));
+                match self.of {
+                    0 => note(format_args!("{} {done}", self.stage)),
+                    of => note(format_args!("{} {done}/{of}", self.stage)),
+                }
                 self.last_line = Instant::now();
             }
             (PoseProgress::Done(_), None) => {}

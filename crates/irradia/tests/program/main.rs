@@ -7,6 +7,7 @@ mod film;
 mod lpips;
 mod memory;
 mod outputs;
+mod pose;
 mod process;
 mod real_data;
 mod recipe;

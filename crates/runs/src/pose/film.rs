@@ -24,6 +24,8 @@ const SPACING: f64 = 0.05;
 const LOST: f64 = 0.1;
 /// Pixels across the frames in which motion and sharpness are measured.
 const WIDTH: u32 = 320;
+/// Frames that are measured in parallel.
+const BATCH: usize = 32;
 /// The longest line of a header of ffmpeg's grey pictures.
 const LONGEST_LINE: usize = 64;
 
@@ -149,9 +151,6 @@ fn look(film: &Path, progress: &(dyn Fn(PoseProgress) + Sync)) -> Result<Vec<Fra
     }
     Ok(frames)
 }
-
-/// Frames that are measured in parallel.
-const BATCH: usize = 32;
 
 fn no_ffmpeg(film: &Path, error: &std::io::Error) -> RunError {
     RunError::Refused(format!(

@@ -28,6 +28,8 @@ pub use film::is_film;
 
 /// Fewer photographs make no dataset.
 const MIN_PHOTOS: usize = 3;
+/// Frames after each frame of a film that it is matched with in any case.
+const FILM_SUCCESSORS: usize = 10;
 /// The report's name.
 const REPORT: &str = "pose.json";
 
@@ -63,7 +65,7 @@ pub enum PoseProgress {
     Stage {
         /// `frames`, `features`, `matches` or `poses`.
         name: &'static str,
-        /// Steps of the stage: photographs or pairs.
+        /// Steps of the stage: photographs or pairs; 0 if their number is unknown, as of a film's frames.
         of: usize,
     },
     /// This many steps of the stage are done.
@@ -201,9 +203,6 @@ pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Resu
     write_atomic(&out.join(REPORT), |file| file.write_all(&to_json(&report)))?;
     Ok(report)
 }
-
-/// Frames after each frame of a film that it is matched with in any case.
-const FILM_SUCCESSORS: usize = 10;
 
 /// Refuses to replace a model that [`pose`] did not write.
 fn check_free(out: &Path) -> Result<(), RunError> {

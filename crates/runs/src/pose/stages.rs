@@ -1,6 +1,6 @@
 //! Features and matches, with those of an earlier call.
 
-use super::store::{Looks, Store};
+use super::store::{self, Known, Looks};
 use super::{PoseInput, PoseProgress};
 use crate::RunError;
 use irradia_formats::{PhotoEntry, PhotoFolder, Pixels};
@@ -8,7 +8,7 @@ use irradia_sfm::features::{Extractor, GreyPhoto, Sift};
 use irradia_sfm::matching::{MatchOptions, PairOptions, candidate_pairs, match_pairs};
 use irradia_sfm::{Features, PairMatches};
 use rayon::prelude::*;
-use std::collections::HashMap;
+use std::collections::HashSet;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
@@ -20,10 +20,13 @@ pub(super) struct Work<'a> {
     folder: &'a PhotoFolder,
     progress: &'a (dyn Fn(PoseProgress) + Sync),
     path: PathBuf,
+    settings: [u32; 4],
     sift: Sift,
-    store: Store,
+    known: Known,
     /// Indices of the folder's photographs that could be decoded.
     used: Vec<usize>,
+    /// Of their files.
+    hashes: Vec<u64>,
     features: Vec<Features>,
     colors: Vec<Vec<[u8; 3]>>,
     /// Names of the others, and why.
@@ -44,14 +47,16 @@ impl<'a> Work<'a> {
             sift.peak_threshold.to_bits(),
             sift.edge_threshold.to_bits(),
         ];
-        let (store, warning) = Store::read(&path, settings);
+        let (known, warning) = store::read(&path, settings);
         let mut work = Self {
             folder,
             progress,
             path,
+            settings,
             sift,
-            store,
+            known,
             used: Vec::new(),
+            hashes: Vec::new(),
             features: Vec::new(),
             colors: Vec::new(),
             undecodable: Vec::new(),
@@ -101,7 +106,7 @@ impl<'a> Work<'a> {
         let found: Vec<Result<Option<Looks>, String>> = photos
             .par_iter()
             .map(|photo| {
-                let looks = match self.store.looks.contains_key(&photo.hash) {
+                let looks = match self.known.looks.contains_key(&photo.hash) {
                     true => Ok(None),
                     false => extract(&self.sift, photo).map(Some),
                 };
@@ -112,35 +117,43 @@ impl<'a> Work<'a> {
             .collect();
         let mut is_new = false;
         for (i, (photo, looks)) in photos.iter().zip(found).enumerate() {
-            match looks {
-                Ok(new) => {
-                    is_new |= new.is_some();
-                    self.store.looks.extend(new.map(|looks| (photo.hash, looks)));
+            is_new |= matches!(looks, Ok(Some(_)));
+            match looks.map(|new| new.or_else(|| self.known.looks.remove(&photo.hash))) {
+                Ok(looks) => {
+                    let Looks { features, colors } = looks.unwrap_or_default();
                     self.used.push(i);
+                    self.hashes.push(photo.hash);
+                    self.features.push(features);
+                    self.colors.push(colors);
                 }
                 Err(reason) => self.undecodable.push((photo.name.clone(), reason)),
             }
         }
-        self.store.keep_only(photos.iter().map(|photo| photo.hash));
+        // Photographs that are gone are forgotten.
+        self.known.looks = Default::default();
+        let kept: HashSet<u64> = self.hashes.iter().copied().collect();
+        self.known
+            .matches
+            .retain(|pair, _| pair.iter().all(|hash| kept.contains(hash)));
         if is_new {
-            self.store.write(&self.path)?;
-        }
-        for i in &self.used {
-            let looks = &self.store.looks[&photos[*i].hash];
-            self.features.push(looks.features.clone());
-            self.colors.push(looks.colors.clone());
+            self.save()?;
         }
         Ok(())
+    }
+
+    fn save(&self) -> Result<(), RunError> {
+        let photos = (&self.hashes[..], &self.features[..], &self.colors[..]);
+        Ok(store::write(&self.path, self.settings, photos, &self.known.matches)?)
     }
 
     /// Matches of the pairs worth it, those that are not known yet in parallel.
     pub fn match_pairs(&mut self, options: &PairOptions) -> Result<Vec<PairMatches>, RunError> {
         let matching = MatchOptions::default();
         let pairs = candidate_pairs(&self.features, options, &matching);
-        let hash = |pair: &[u32; 2]| pair.map(|i| self.folder.photos[self.used[i as usize]].hash);
+        let hash = |pair: &[u32; 2]| pair.map(|i| self.hashes[i as usize]);
         let new: Vec<[u32; 2]> = pairs
             .iter()
-            .filter(|pair| !self.store.matches.contains_key(&hash(pair)))
+            .filter(|pair| !self.known.matches.contains_key(&hash(pair)))
             .copied()
             .collect();
         (self.progress)(PoseProgress::Stage {
@@ -152,27 +165,20 @@ impl<'a> Work<'a> {
             let now = done.fetch_add(1, Ordering::Relaxed) + 1;
             (self.progress)(PoseProgress::Done(now));
         });
-        let found: HashMap<[u64; 2], Vec<[u32; 2]>> = found
+        let is_new = !found.is_empty();
+        let found: Vec<_> = found
             .into_iter()
             .map(|pair| (hash(&pair.photos), pair.matches))
             .collect();
-        let is_new = !found.is_empty();
-        let all = pairs
-            .iter()
-            .map(|photos| {
-                let key = hash(photos);
-                let matches = found.get(&key).or_else(|| self.store.matches.get(&key));
-                PairMatches {
-                    photos: *photos,
-                    matches: matches.cloned().unwrap_or_default(),
-                }
-            })
-            .collect();
-        self.store.matches.extend(found);
+        self.known.matches.extend(found);
         if is_new {
-            self.store.write(&self.path)?;
+            self.save()?;
         }
-        Ok(all)
+        let matches = |photos: [u32; 2]| PairMatches {
+            photos,
+            matches: self.known.matches[&photos.map(|i| self.hashes[i as usize])].clone(),
+        };
+        Ok(pairs.into_iter().map(matches).collect())
     }
 }
 

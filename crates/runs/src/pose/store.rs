@@ -5,7 +5,7 @@
 
 use irradia_formats::{FormatError, write_atomic};
 use irradia_sfm::{DESCRIPTOR_BYTES, Features, Keypoint};
-use std::collections::{BTreeMap, HashMap, HashSet};
+use std::collections::HashMap;
 use std::io::{self, Write};
 use std::path::Path;
 
@@ -23,64 +23,51 @@ pub(super) struct Looks {
     pub colors: Vec<[u8; 3]>,
 }
 
-/// What is known from earlier.
-#[derive(Clone, Debug, PartialEq)]
-pub(super) struct Store {
-    settings: [u32; 4],
+/// What is known from an earlier call.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub(super) struct Known {
     /// By the photograph's hash.
-    pub looks: BTreeMap<u64, Looks>,
+    pub looks: HashMap<u64, Looks>,
     /// By the hashes of both photographs.
     pub matches: HashMap<[u64; 2], Vec<[u32; 2]>>,
 }
 
-impl Store {
-    /// The content of the file at `path` if it has the same `settings`, else nothing; a warning if it is damaged.
-    pub fn read(path: &Path, settings: [u32; 4]) -> (Self, Option<String>) {
-        let mut store = Self {
-            settings,
-            looks: BTreeMap::new(),
-            matches: HashMap::new(),
-        };
-        let Ok(bytes) = std::fs::read(path) else {
-            return (store, None);
-        };
-        let known: Vec<u8> = SIGNATURE
-            .iter()
-            .copied()
-            .chain(settings.into_iter().flat_map(u32::to_le_bytes))
-            .collect();
-        let Some(rest) = bytes.strip_prefix(&known[..]) else {
-            return (store, None);
-        };
-        if parse(rest, &mut store).is_none() {
-            store.looks.clear();
-            store.matches.clear();
-            let warning = format!("{} is damaged; features are found again", path.display());
-            return (store, Some(warning));
-        }
-        (store, None)
+/// The content of the file at `path` if it was written under the same `settings`, else nothing; a warning if it is damaged.
+pub(super) fn read(path: &Path, settings: [u32; 4]) -> (Known, Option<String>) {
+    let Ok(bytes) = std::fs::read(path) else {
+        return Default::default();
+    };
+    let Some(rest) = bytes.strip_prefix(&header(settings)[..]) else {
+        return Default::default();
+    };
+    match parse(rest) {
+        Some(known) => (known, None),
+        None => (
+            Known::default(),
+            Some(format!("{} is damaged; features are found again", path.display())),
+        ),
     }
+}
 
-    /// Forgets all other photographs.
-    pub fn keep_only(&mut self, hashes: impl Iterator<Item = u64>) {
-        let kept: HashSet<u64> = hashes.collect();
-        self.looks.retain(|hash, _| kept.contains(hash));
-        self.matches
-            .retain(|pair, _| pair.iter().all(|hash| kept.contains(hash)));
-    }
+fn header(settings: [u32; 4]) -> Vec<u8> {
+    SIGNATURE
+        .iter()
+        .copied()
+        .chain(settings.into_iter().flat_map(u32::to_le_bytes))
+        .collect()
+}
 
-    pub fn write(&self, path: &Path) -> Result<(), FormatError> {
-        write_atomic(path, |out| self.write_to(out))
-    }
-
-    fn write_to(&self, out: &mut dyn Write) -> io::Result<()> {
-        out.write_all(SIGNATURE)?;
-        for setting in self.settings {
-            out.write_all(&setting.to_le_bytes())?;
-        }
-        let write_u64 = |out: &mut dyn Write, value: u64| out.write_all(&value.to_le_bytes());
-        write_u64(out, self.looks.len() as u64)?;
-        for (hash, Looks { features, colors }) in &self.looks {
+/// Writes the features and colours of the photographs with these `hashes`, and their matches.
+pub(super) fn write(
+    path: &Path,
+    settings: [u32; 4],
+    (hashes, features, colors): (&[u64], &[Features], &[Vec<[u8; 3]>]),
+    matches: &HashMap<[u64; 2], Vec<[u32; 2]>>,
+) -> Result<(), FormatError> {
+    write_atomic(path, |out| {
+        out.write_all(&header(settings))?;
+        write_u64(out, hashes.len() as u64)?;
+        for ((hash, features), colors) in hashes.iter().zip(features).zip(colors) {
             write_u64(out, *hash)?;
             write_u64(out, colors.len() as u64)?;
             for ((k, descriptor), color) in features.keypoints.iter().zip(&features.descriptors).zip(colors) {
@@ -91,7 +78,7 @@ impl Store {
                 out.write_all(color)?;
             }
         }
-        let mut matches: Vec<_> = self.matches.iter().collect();
+        let mut matches: Vec<_> = matches.iter().collect();
         matches.sort_unstable_by_key(|(pair, _)| **pair);
         write_u64(out, matches.len() as u64)?;
         for (pair, matches) in matches {
@@ -103,11 +90,16 @@ impl Store {
             }
         }
         Ok(())
-    }
+    })
 }
 
-/// Fills `store`; `None` if the bytes are damaged.
-fn parse(mut bytes: &[u8], store: &mut Store) -> Option<()> {
+fn write_u64(out: &mut dyn Write, value: u64) -> io::Result<()> {
+    out.write_all(&value.to_le_bytes())
+}
+
+/// What follows the header; `None` if it is damaged.
+fn parse(mut bytes: &[u8]) -> Option<Known> {
+    let mut known = Known::default();
     for _ in 0..take_u64(&mut bytes)? {
         let hash = take_u64(&mut bytes)?;
         let count = usize::try_from(take_u64(&mut bytes)?).ok()?;
@@ -120,12 +112,12 @@ fn parse(mut bytes: &[u8], store: &mut Store) -> Option<()> {
             looks.features.descriptors.push(*rest.first_chunk()?);
             looks.colors.push(*rest.last_chunk()?);
         }
-        store.looks.insert(hash, looks);
+        known.looks.insert(hash, looks);
     }
     for _ in 0..take_u64(&mut bytes)? {
         let pair = [take_u64(&mut bytes)?, take_u64(&mut bytes)?];
         let count = usize::try_from(take_u64(&mut bytes)?).ok()?;
-        let counts = pair.map(|hash| store.looks.get(&hash).map_or(0, |looks| looks.colors.len()));
+        let counts = pair.map(|hash| known.looks.get(&hash).map_or(0, |looks| looks.colors.len()));
         let matches: Vec<[u32; 2]> = take(&mut bytes, count.checked_mul(8)?)?
             .as_chunks::<8>()
             .0
@@ -138,9 +130,9 @@ fn parse(mut bytes: &[u8], store: &mut Store) -> Option<()> {
         {
             return None;
         }
-        store.matches.insert(pair, matches);
+        known.matches.insert(pair, matches);
     }
-    bytes.is_empty().then_some(())
+    bytes.is_empty().then_some(known)
 }
 
 fn take<'a>(bytes: &mut &'a [u8], count: usize) -> Option<&'a [u8]> {
@@ -157,63 +149,64 @@ fn take_u64(bytes: &mut &[u8]) -> Option<u64> {
 mod tests {
     use super::*;
 
-    fn store() -> Store {
-        let looks = |n: u8| Looks {
+    const SETTINGS: [u32; 4] = [1, 2, 3, 4];
+
+    fn looks(n: u8) -> Looks {
+        let keypoint = |i: u8| Keypoint {
+            x: i.into(),
+            y: 0.5,
+            scale: 2.0,
+            angle: -1.0,
+        };
+        Looks {
             features: Features {
-                keypoints: (0..n)
-                    .map(|i| Keypoint {
-                        x: i.into(),
-                        y: 0.5,
-                        scale: 2.0,
-                        angle: -1.0,
-                    })
-                    .collect(),
+                keypoints: (0..n).map(keypoint).collect(),
                 descriptors: (0..n).map(|i| [i; DESCRIPTOR_BYTES]).collect(),
             },
             colors: (0..n).map(|i| [i, 1, 2]).collect(),
-        };
-        Store {
-            settings: [1, 2, 3, 4],
-            looks: BTreeMap::from([(7, looks(3)), (u64::MAX, looks(2)), (8, looks(0))]),
+        }
+    }
+
+    fn known() -> Known {
+        Known {
+            looks: HashMap::from([(7, looks(3)), (u64::MAX, looks(2)), (8, looks(0))]),
             matches: HashMap::from([([7, u64::MAX], vec![[0, 1], [2, 0]]), ([7, 8], Vec::new())]),
         }
+    }
+
+    fn save(path: &Path, known: &Known) {
+        let hashes: Vec<u64> = known.looks.keys().copied().collect();
+        let features: Vec<Features> = known.looks.values().map(|looks| looks.features.clone()).collect();
+        let colors: Vec<Vec<[u8; 3]>> = known.looks.values().map(|looks| looks.colors.clone()).collect();
+        write(path, SETTINGS, (&hashes, &features, &colors), &known.matches).unwrap();
     }
 
     #[test]
     fn what_is_written_is_read_back_under_the_same_settings_only() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("features.bin");
-        let stored = store();
-        stored.write(&path).unwrap();
-        assert_eq!(Store::read(&path, [1, 2, 3, 4]), (stored, None));
-        assert!(Store::read(&path, [1, 2, 3, 5]).0.looks.is_empty());
-        assert!(Store::read(&folder.path().join("none"), [0; 4]).0.looks.is_empty());
+        save(&path, &known());
+        assert_eq!(read(&path, SETTINGS), (known(), None));
+        assert_eq!(read(&path, [1, 2, 3, 5]), Default::default());
+        assert_eq!(read(&folder.path().join("none"), SETTINGS), Default::default());
     }
 
     #[test]
     fn damage_is_noticed_and_forgotten() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("features.bin");
-        store().write(&path).unwrap();
+        save(&path, &known());
         let whole = std::fs::read(&path).unwrap();
         for length in 32..whole.len() {
             std::fs::write(&path, &whole[..length]).unwrap();
-            let (read, warning) = Store::read(&path, [1, 2, 3, 4]);
-            assert!(read.looks.is_empty() && read.matches.is_empty(), "{length}");
+            let (read, warning) = read(&path, SETTINGS);
+            assert_eq!(read, Known::default(), "{length}");
             assert!(warning.is_some_and(|line| line.contains("damaged")), "{length}");
         }
         // A match with a feature that does not exist.
-        let mut broken = store();
+        let mut broken = known();
         broken.matches.insert([8, 7], vec![[0, 0]]);
-        broken.write(&path).unwrap();
-        assert!(Store::read(&path, [1, 2, 3, 4]).1.is_some());
-    }
-
-    #[test]
-    fn photographs_that_are_gone_are_forgotten_with_their_matches() {
-        let mut store = store();
-        store.keep_only([7, 8].into_iter());
-        assert_eq!(store.looks.keys().collect::<Vec<_>>(), [&7, &8]);
-        assert_eq!(store.matches.keys().collect::<Vec<_>>(), [&[7, 8]]);
+        save(&path, &broken);
+        assert!(read(&path, SETTINGS).1.is_some());
     }
 }

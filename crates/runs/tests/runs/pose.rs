@@ -11,7 +11,7 @@ use std::time::Duration;
 
 const OPTIONS: SynthOptions = SynthOptions {
     scene: irradia_runs::synth::SceneName::Demo,
-    views: 12,
+    views: 40,
     width: 320,
     height: 240,
     seed: 3,

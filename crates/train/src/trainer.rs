@@ -587,7 +587,7 @@ impl Trainer {
             background: self.recipe.render.background,
             sh_degree,
             antialias: self.recipe.render.antialias,
-            depth: false,
+            ..RenderOptions::default()
         }
     }
 

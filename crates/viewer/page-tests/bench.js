@@ -7,7 +7,7 @@ import { browse, open, run, scratch, serve, set } from "./tests/harness.js";
 import { random } from "./tests/scenes.js";
 
 const SPLATS = 500_000;
-const STEPS = 500;
+const STEPS = 2500;
 const wanted = process.argv.slice(2);
 const wants = (name) => wanted.length === 0 || wanted.includes(name);
 const say = (name, value) => console.log(`${name.padEnd(58)} ${value}`);

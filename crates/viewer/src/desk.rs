@@ -258,9 +258,9 @@ impl Desk {
         self.with_seat(seat, |seat| drop(seat.outbox.try_send(Out::Text(text))));
     }
 
-    /// Leaves time to a training after `seconds` of drawing a moving camera.
+    /// Leaves time to a training after `seconds` of drawing a moving camera, of which the browser's share is about as much.
     pub fn rest(&self, seconds: f32) {
-        self.lock().rest_until = Some(Instant::now() + Duration::from_secs_f32(2.0 * seconds));
+        self.lock().rest_until = Some(Instant::now() + Duration::from_secs_f32(3.0 * seconds));
     }
 
     /// When the next copy of a training's scene is due, after a picture of the present one that took `seconds` and a copy that took
@@ -315,7 +315,7 @@ impl Seat {
         let resting = |last| picture(self.pace.resting(&shot, last));
         let rests_at = self.shot_at + REST;
         match same {
-            None => picture(self.pace.moving(&shot)),
+            None => picture(self.pace.moving(&shot, now.training)),
             Some(drawn) if drawn.version != now.version => match renew_after.filter(|after| *after > clock) {
                 // The camera has just stopped: it becomes sharp first.
                 _ if !drawn.detail.sharp && rests_at <= clock => resting(None),

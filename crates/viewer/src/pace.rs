@@ -4,6 +4,8 @@ use crate::message::{MAX_PIXELS, Shot};
 
 /// Seconds of drawing and encoding a picture of a moving camera: 25 pictures a second.
 const MOVING: f32 = 0.04;
+/// The same while a training shares the processor: smaller pictures, so that as many remain beside its steps.
+const MOVING_IN_TRAINING: f32 = 0.015;
 /// Seconds within which a camera at rest gets a better picture.
 const RESTING: f32 = 0.2;
 /// Least share of the window's pixels.
@@ -21,6 +23,8 @@ pub(crate) struct Detail {
     pub splats: f32,
     /// Whether the camera moves.
     pub moving: bool,
+    /// Seconds that drawing it should take.
+    pub seconds: f32,
     /// Whether nothing better follows.
     pub sharp: bool,
 }
@@ -59,8 +63,9 @@ fn most(shot: &Shot) -> f32 {
 
 impl Pace {
     /// How the next picture of a moving camera is drawn.
-    pub fn moving(&self, shot: &Shot) -> Detail {
+    pub fn moving(&self, shot: &Shot, training: bool) -> Detail {
         Detail {
+            seconds: if training { MOVING_IN_TRAINING } else { MOVING },
             pixels: self.share.min(most(shot)),
             // Coarser pixels hide that fewer splats are drawn.
             splats: if self.all {
@@ -81,6 +86,7 @@ impl Pace {
         // Four times as many pixels cost at most four times as much.
         let next = affordable.max(last.map_or(0.0, |last| 4.0 * last)).max(self.share);
         Detail {
+            seconds: RESTING,
             pixels: next.min(most),
             splats: 1.0,
             moving: false,
@@ -93,12 +99,12 @@ impl Pace {
         self.per_pixel = seconds / pixels.max(1.0);
         if detail.moving {
             // Part of the cost is fixed, so that it grows slower than the share: several pictures find it.
-            let factor = (MOVING / seconds.max(1e-4)).clamp(0.4, 1.4);
+            let factor = (detail.seconds / seconds.max(1e-4)).clamp(0.4, 1.4);
             self.share = (self.share * factor).clamp(LEAST, 1.0);
             self.all = if self.all {
-                seconds <= MOVING
+                seconds <= detail.seconds
             } else {
-                self.share == 1.0 && seconds < SPARE * MOVING
+                self.share == 1.0 && seconds < SPARE * detail.seconds
             };
         }
     }
@@ -130,11 +136,11 @@ mod tests {
         let (mut pace, shot) = (Pace::default(), shot(1000, 1000));
         let cost = |detail: &Detail| 0.05 * detail.splats + 1e-7 * 1e6 * detail.pixels;
         for _ in 0..20 {
-            let detail = pace.moving(&shot);
+            let detail = pace.moving(&shot, false);
             assert!(!detail.sharp && detail.splats <= Detail::MOST_SPLATS);
             pace.learn(&detail, 1e6 * detail.pixels, cost(&detail));
         }
-        let found = cost(&pace.moving(&shot));
+        let found = cost(&pace.moving(&shot, false));
         assert!((found - MOVING).abs() < 0.004, "{found}");
     }
 
@@ -145,7 +151,7 @@ mod tests {
             let seconds = |detail: &Detail| cost * (0.1 + 0.9 * detail.splats * detail.pixels);
             let mut drawn = Vec::new();
             for _ in 0..40 {
-                let detail = pace.moving(&shot);
+                let detail = pace.moving(&shot, false);
                 drawn.push(detail.splats == 1.0);
                 pace.learn(&detail, 1e6 * detail.pixels, seconds(&detail));
             }
@@ -161,7 +167,7 @@ mod tests {
         let detail = pace.resting(&shot, None);
         assert_eq!((detail.pixels, detail.splats, detail.sharp), (1.0, 1.0, true));
         // A field of 10 microseconds a pixel.
-        pace.learn(&pace.moving(&shot), 1e5, 1.0);
+        pace.learn(&pace.moving(&shot, false), 1e5, 1.0);
         let mut detail = pace.resting(&shot, None);
         assert!(detail.pixels < 0.2 && !detail.sharp);
         for _ in 0..4 {

@@ -18,9 +18,9 @@ const REST: Duration = Duration::from_millis(100);
 /// Wishes other than pictures that wait.
 const JOBS: usize = 4;
 /// Between two copies of a training's scene passes this many times what a copy and its picture take.
-const AT_REST: u32 = 15;
+const AT_REST: u32 = 40;
 /// Least time between two copies of a training's scene.
-const COPIES: Duration = Duration::from_millis(700);
+const COPIES: Duration = Duration::from_millis(1000);
 
 /// A message to a page.
 pub(crate) enum Out {
@@ -260,7 +260,7 @@ impl Desk {
 
     /// Leaves time to a training after `seconds` of drawing a moving camera, of which the browser's share is about as much.
     pub fn rest(&self, seconds: f32) {
-        self.lock().rest_until = Some(Instant::now() + Duration::from_secs_f32(3.0 * seconds));
+        self.lock().rest_until = Some(Instant::now() + Duration::from_secs_f32(4.5 * seconds));
     }
 
     /// When the next copy of a training's scene is due, after a picture of the present one that took `seconds` and a copy that took

@@ -14,6 +14,7 @@ mod error;
 mod image_file;
 pub mod parse;
 mod photo;
+mod photos;
 mod ply;
 mod points_ply;
 mod splats;
@@ -21,10 +22,14 @@ mod tensors;
 mod undistort;
 
 pub use atomic::write_atomic;
+pub use dataset::colmap::{
+    ColmapCamera, ColmapImage, ColmapModel, ColmapPoint, PosedImage, TrackedPoint, write_colmap,
+};
 pub use dataset::{DEFAULT_MAX_SIDE, DatasetFormat, DatasetOptions, Holdout, read_dataset};
 pub use describe::{Description, Kind, describe, detect};
 pub use error::{FormatError, Malformed};
 pub use image_file::{Pixels, read_image, write_png, write_png_16};
+pub use photos::{CameraTags, PhotoEntry, PhotoFolder, has_photos, read_photo_folder};
 pub use points_ply::{read_points_ply, write_points_ply};
 pub use splats::{SplatFormat, read_splats, write_splats};
 pub use tensors::{Tensor, read_tensors};

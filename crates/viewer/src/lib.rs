@@ -16,6 +16,7 @@
 //! | `desk.rs`, `pace.rs`, `draw.rs` | who wants which picture, when it is drawn, at which size |
 //! | `paint.rs`, `palette.rs` | a camera's picture: colours, depth, normals, counts, ellipses, errors |
 //! | `compact.rs`, `importance.rs` | splats as they travel to a browser that draws them itself, most important first |
+//! | `share.rs` | a scene as one page, or a folder for a web server |
 //! | `listen.rs`, `guard.rs`, `serve.rs`, `page.rs` | addresses, who may talk to us, and what is answered |
 //! | `client.rs`, `message.rs` | the socket of one page |
 //!
@@ -38,6 +39,7 @@ mod page;
 mod paint;
 mod palette;
 mod serve;
+mod share;
 mod subject;
 mod viewer;
 mod views;
@@ -45,5 +47,6 @@ mod views;
 pub use error::ViewerError;
 pub use listen::{DEFAULT_PORT, Listen};
 pub use live::Watcher;
+pub use share::{ShareOptions, Shared, share};
 pub use subject::Subject;
 pub use viewer::Viewer;

@@ -22,6 +22,7 @@ const FILES: &[(&str, &str, &str)] = files![
     SCRIPT "js/help.js",
     SCRIPT "js/hud.js",
     SCRIPT "js/icons.js",
+    SCRIPT "js/local/assets.js",
     SCRIPT "js/local/order.js",
     SCRIPT "js/local/renderer.js",
     SCRIPT "js/local/stream.js",

@@ -55,7 +55,7 @@ export class Stage extends HTMLElement {
     this.handle.setAttribute("aria-label", "Border between photograph and picture");
     this.empty = el("div", { className: "empty" });
     this.prepend(this.served, this.localCanvas, this.photo, this.overlay, this.handle, this.empty);
-    const local = new LocalRenderer(this.localCanvas, () => (this.dirty = true));
+    const local = new LocalRenderer(this.localCanvas, () => (this.dirty = true), (problem) => state.set({ problem }));
     this.local = local;
     this.navigation = new Navigation(this.overlay, (x, y) => this.pickAt(x, y));
     new ResizeObserver(() => this.resize()).observe(this);

@@ -1,7 +1,7 @@
 // Draws splats with WebGL2: one pass projects every splat into a texture, another blends a quad for each, farthest first.
 
 import { axes } from "../math.js";
-import { state } from "../state.js";
+import { openSplats, orderWorker, shader } from "./assets.js";
 import { readSplats } from "./stream.js";
 
 /** @typedef {import("../camera.js").Camera} Camera */
@@ -18,9 +18,6 @@ const SHAPES = ["color", "ellipses", "rings", "points"];
 const REST = 100;
 /** Milliseconds of a moving picture. */
 const BUDGET = 33;
-
-/** @param {string} name */
-const shader = async (name) => (await fetch(`page/shaders/${name}${location.search}`)).text();
 
 export class LocalRenderer {
   works = false;
@@ -49,10 +46,11 @@ export class LocalRenderer {
   sortMilliseconds = 0;
   drawn = 0;
 
-  /** @param {HTMLCanvasElement} canvas @param {() => void} dirty */
-  constructor(canvas, dirty) {
+  /** @param {HTMLCanvasElement} canvas @param {() => void} dirty @param {(problem: string) => void} report */
+  constructor(canvas, dirty, report) {
     this.canvas = canvas;
     this.dirty = dirty;
+    this.report = report;
     const options = { alpha: false, antialias: false, depth: false, preserveDrawingBuffer: true, powerPreference: "high-performance" };
     const gl = /** @type {WebGL2RenderingContext | null} */ (canvas.getContext("webgl2", options));
     if (!gl) return;
@@ -61,7 +59,7 @@ export class LocalRenderer {
     const device = String(gl.getParameter(info ? info.UNMASKED_RENDERER_WEBGL : gl.RENDERER));
     this.accelerated = !/swiftshader|llvmpipe|software|basic render/i.test(device);
     this.works = true;
-    this.worker = new Worker(`page/js/local/order.js${location.search}`, { type: "module" });
+    this.worker = orderWorker();
     this.worker.onmessage = ({ data }) => this.ordered(data);
     this.ready = this.prepare(gl);
     canvas.addEventListener("webglcontextlost", () => {
@@ -98,12 +96,12 @@ export class LocalRenderer {
     this.abort = new AbortController();
     await this.ready;
     try {
-      const response = await fetch(`splats${location.search}`, { signal: this.abort.signal });
+      const response = await openSplats(this.abort.signal);
       await readSplats(response, (header) => this.begin(gl, header), (block) => this.take(gl, block));
     } catch (error) {
       if (!(error instanceof DOMException && error.name === "AbortError")) {
         this.version = 0;
-        state.set({ problem: String(error) });
+        this.report(String(error));
       }
     }
   }

@@ -58,6 +58,11 @@ impl<'a> Bytes<'a> {
         Ok(values)
     }
 
+    /// Whether all bytes are read.
+    pub fn is_empty(&self) -> bool {
+        self.rest.is_empty()
+    }
+
     /// Bytes up to and including a zero; invalid UTF-8 is replaced.
     pub fn text(&mut self) -> Result<String, Malformed> {
         let length = self.rest.iter().position(|byte| *byte == 0).unwrap_or(self.rest.len());

@@ -2,9 +2,11 @@
 
 use crate::error::read_and_parse;
 use crate::splats::ply::has_splats;
-use crate::{DatasetFormat, DatasetOptions, FormatError, SplatFormat, read_dataset, read_points_ply, read_splats};
+use crate::{
+    DatasetFormat, DatasetOptions, FormatError, SplatFile, SplatFormat, read_dataset, read_points_ply, read_splat_file,
+};
 use glam::DVec3;
-use irradia_scene::{Dataset, GaussianCloud, PointCloud, Similarity};
+use irradia_scene::{Dataset, PointCloud, Similarity};
 use std::fmt;
 use std::path::Path;
 
@@ -24,6 +26,9 @@ pub enum Kind {
 /// # Errors
 /// When it does not exist, or is of no known kind; the error says what was expected.
 pub fn detect(path: &Path) -> Result<Kind, FormatError> {
+    if let Ok(format @ SplatFormat::SogFolder) = SplatFormat::of(path) {
+        return Ok(Kind::Splats(format));
+    }
     if let Some(format) = DatasetFormat::recognise(path) {
         return Ok(Kind::Dataset(format));
     }
@@ -32,7 +37,7 @@ pub fn detect(path: &Path) -> Result<Kind, FormatError> {
         read_dataset(path, &DatasetOptions::default())?;
     }
     match SplatFormat::of(path)? {
-        SplatFormat::Ply if !read_and_parse(path, has_splats)? => Ok(Kind::Points),
+        SplatFormat::Ply | SplatFormat::PointsPly if !read_and_parse(path, has_splats)? => Ok(Kind::Points),
         format => Ok(Kind::Splats(format)),
     }
 }
@@ -67,15 +72,16 @@ impl fmt::Display for Description {
 /// Those of [`detect`] and of reading it.
 pub fn describe(path: &Path) -> Result<Description, FormatError> {
     Ok(match detect(path)? {
-        Kind::Splats(format) => describe_splats(format, &read_splats(path)?),
+        Kind::Splats(_) => describe_splats(&read_splat_file(path)?),
         Kind::Points => describe_points(&read_points_ply(path)?),
         Kind::Dataset(_) => describe_dataset(&read_dataset(path, &DatasetOptions::default())?),
     })
 }
 
-fn describe_splats(format: SplatFormat, cloud: &GaussianCloud) -> Description {
+fn describe_splats(file: &SplatFile) -> Description {
+    let cloud = &file.cloud;
     Description {
-        title: format!("{format} with {} Gaussians", cloud.len()),
+        title: format!("{} with {} Gaussians", file.format, cloud.len()),
         facts: vec![
             ("SH degree", cloud.sh_degree.to_string()),
             ("antialiased", if cloud.antialiased { "yes" } else { "no" }.into()),
@@ -84,7 +90,7 @@ fn describe_splats(format: SplatFormat, cloud: &GaussianCloud) -> Description {
                 extent(cloud.means.iter().copied(), &cloud.world_from_dataset),
             ),
         ],
-        warnings: Vec::new(),
+        warnings: file.warnings(),
     }
 }
 

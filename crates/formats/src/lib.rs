@@ -6,12 +6,14 @@
 #![forbid(unsafe_code)]
 
 mod atomic;
+pub mod base64;
 mod bytes;
 mod complete;
 mod dataset;
 mod describe;
 mod error;
 mod image_file;
+mod pack;
 pub mod parse;
 mod photo;
 mod photos;
@@ -20,6 +22,8 @@ mod points_ply;
 mod splats;
 mod tensors;
 mod undistort;
+mod unpack;
+mod zip;
 
 pub use atomic::write_atomic;
 pub use dataset::colmap::{
@@ -29,7 +33,11 @@ pub use dataset::{DEFAULT_MAX_SIDE, DatasetFormat, DatasetOptions, Holdout, read
 pub use describe::{Description, Kind, describe, detect};
 pub use error::{FormatError, Malformed};
 pub use image_file::{Pixels, read_image, write_png, write_png_16};
+pub use pack::gzip;
 pub use photos::{CameraTags, PhotoEntry, PhotoFolder, has_photos, read_photo_folder};
 pub use points_ply::{read_points_ply, write_points_ply};
-pub use splats::{SplatFormat, read_splats, write_splats};
+pub use splats::{
+    Quality, SplatFile, SplatFormat, SpzVersion, WriteOptions, read_splat_file, read_splats, splat_file_size,
+    write_splats, write_splats_with,
+};
 pub use tensors::{Tensor, read_tensors};

@@ -8,7 +8,21 @@ pub use crate::dataset::llff::{LlffPose, parse_poses_bounds as poses_bounds};
 pub use crate::dataset::transforms::{CameraKeys, Frame, Transforms, parse_transforms as transforms};
 pub use crate::photos::parse_camera_tags as camera_tags;
 pub use crate::points_ply::parse_points_ply as points_ply;
+pub use crate::splats::antimatter::parse as splat;
+pub use crate::splats::gltf::parse as glb;
+pub use crate::splats::ksplat::parse as ksplat;
 pub use crate::splats::ply::parse_splat_ply as splat_ply;
+pub use crate::splats::sog::parse as sog;
+pub use crate::splats::spz::parse as spz;
+
+/// A `.gltf` file, without other files beside it.
+///
+/// # Errors
+/// The same as for [`glb`].
+pub fn gltf(text: &[u8]) -> Result<irradia_scene::GaussianCloud, crate::Malformed> {
+    let absent = |_: &str| Err(crate::Malformed("its buffer is another file".into()));
+    crate::splats::gltf::parse_gltf(text, &absent)
+}
 
 /// All tensors of a PyTorch state dict or a safetensors file; see [`crate::read_tensors`].
 ///

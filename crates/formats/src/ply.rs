@@ -181,6 +181,11 @@ impl<'a> Ply<'a> {
         found.ok_or_else(|| Malformed(format!("the PLY header declares no element `{element}`")))
     }
 
+    /// Whether the header declares `element`.
+    pub fn has(&self, element: &str) -> bool {
+        self.elements.iter().any(|e| e.name == element)
+    }
+
     /// Names of an element's properties, in order.
     pub fn property_names(&self, element: &str) -> Result<impl Iterator<Item = &str>, Malformed> {
         Ok(self.find(element)?.properties.iter().map(|p| p.name.as_str()))
@@ -320,6 +325,14 @@ impl Column {
         match self.scalar {
             Scalar::F32 => f32::from_bits(u32::from_ne_bytes(self.native(row))),
             _ => self.f64(row) as f32,
+        }
+    }
+
+    /// The value in `row` as bits; other types than `uint` are converted.
+    pub fn u32(self, row: &[u8]) -> u32 {
+        match self.scalar {
+            Scalar::U32 => u32::from_ne_bytes(self.native(row)),
+            _ => self.f64(row) as u32,
         }
     }
 

@@ -62,6 +62,11 @@ fn parse_declared(bytes: &[u8]) -> Result<DeclaredPoints, Malformed> {
 /// # Errors
 /// When the file cannot be written.
 pub fn write_points_ply(path: &Path, points: &PointCloud) -> Result<(), FormatError> {
+    write_atomic(path, |out| out.write_all(&encode_points(points)))
+}
+
+/// The bytes of [`write_points_ply`].
+pub(crate) fn encode_points(points: &PointCloud) -> Vec<u8> {
     let mut bytes = format!(
         "ply\nformat binary_little_endian 1.0\nelement vertex {}\nproperty float x\nproperty float y\nproperty float z\n\
          property uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n",
@@ -72,7 +77,7 @@ pub fn write_points_ply(path: &Path, points: &PointCloud) -> Result<(), FormatEr
         position.to_array().iter().for_each(|v| bytes.extend(v.to_le_bytes()));
         bytes.extend(color);
     }
-    write_atomic(path, |out| out.write_all(&bytes))
+    bytes
 }
 
 /// The factor that converts the file's colours to 0..=255. Float colours are in \[0, 1\] by convention, but some writers keep

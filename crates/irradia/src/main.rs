@@ -42,10 +42,12 @@ enum Command {
     Render(command::render::Args),
     /// Look at a scene, a run or a dataset in a browser
     View(command::view::Args),
+    /// Write a scene as one page that opens from the disk in any browser
+    Share(command::share::Args),
     /// Describe a scene, a run or a dataset
     Info(command::files::InfoArgs),
-    /// Convert a scene to another file format, by extension
-    Convert(command::files::ConvertArgs),
+    /// Convert a scene to another file format, by the end of its name, and say what it costs
+    Convert(command::convert::ConvertArgs),
     /// Write a ray-traced scene as a dataset: images, depth, normals, points, cameras
     Synth(command::demo::SynthArgs),
 }
@@ -73,8 +75,9 @@ fn main() -> ExitCode {
         Command::Lpips(args) => command::lpips::run(&args),
         Command::Render(args) => command::render::run(&args),
         Command::View(args) => command::view::run(&args),
+        Command::Share(args) => command::share::run(&args),
         Command::Info(args) => command::files::info(&args),
-        Command::Convert(args) => command::files::convert(&args),
+        Command::Convert(args) => command::convert::convert(&args),
         Command::Synth(args) => command::demo::synth(&args),
     };
     match result {

@@ -29,6 +29,7 @@
 //! | view a training run from another thread | [`Run::snapshots`] |
 //! | read and render a scene | [`Scene`] |
 //! | evaluate a scene against photographs | [`evaluate`] |
+//! | convert a scene to another format | [`convert`] |
 //! | describe a file or folder | [`describe`] |
 //!
 //! Nothing here prints: warnings are returned, or passed to observers. Random numbers come from the request's seed alone, and
@@ -39,6 +40,7 @@
 #![forbid(unsafe_code)]
 
 mod background;
+mod convert;
 mod describe;
 mod error;
 mod evaluate;
@@ -59,6 +61,7 @@ mod snapshot;
 mod synth_files;
 
 pub use background::Background;
+pub use convert::{COMPARED_VIEWS, Conversion, convert};
 pub use describe::describe;
 pub use error::RunError;
 pub use evaluate::{distinct, evaluate, file_stem, file_stems, unmeasured};

@@ -92,9 +92,12 @@ impl Scene {
     }
 }
 
-/// The file of the scene if `path` is a run's folder, otherwise `path` itself.
+/// By which a folder of SOG images is recognised.
+const SOG_META: &str = "meta.json";
+
+/// The file of the scene if `path` is a run's folder or one of SOG images, otherwise `path` itself.
 pub fn scene_of(path: &Path) -> PathBuf {
-    let files = [SCENE, FIELD].map(|name| path.join(name));
+    let files = [SCENE, FIELD, SOG_META].map(|name| path.join(name));
     files.into_iter().find(|file| file.is_file()).unwrap_or(path.to_owned())
 }
 

@@ -11,6 +11,7 @@
 mod camera;
 mod cloud;
 mod dataset;
+pub mod half;
 mod image;
 mod lens;
 mod points;

@@ -8,9 +8,10 @@
 //! A rotation is the unit quaternion w, x, y, z without its largest component, which is made positive: its index in the top two
 //! of 48 bits (one is unused), then the others in order, 15 bits each, from -1/sqrt(2) to 1/sqrt(2).
 
+use crate::importance::by_importance;
+use irradia_scene::half::{from_half, half};
 use irradia_scene::sh;
 use irradia_splat::Splats;
-use irradia_splat::render::ALPHA_MIN;
 use rayon::prelude::*;
 
 /// Splats per block: of 500,000 the first block is 1.6 %.
@@ -25,31 +26,11 @@ pub(crate) const fn band_bytes(degree: u32) -> usize {
     16 * degree as usize
 }
 
-/// `splats` in compact form, with bands up to `degree`. Splats that can never be seen are left out.
-pub(crate) fn compact(splats: &Splats, degree: u32) -> Vec<u8> {
+/// `splats` in compact form, with bands up to `degree`, the `most` important of them. Splats that can never be seen are left out.
+pub(crate) fn compact(splats: &Splats, degree: u32, most: usize) -> Vec<u8> {
     let degree = degree.min(splats.sh_degree());
-    // Light that a splat may cover: opacity times the area of its largest cross section.
-    let importance = |i: usize| {
-        let mut scales: [f32; 3] = std::array::from_fn(|c| splats.log_scales.get(c, i));
-        scales.sort_unstable_by(f32::total_cmp);
-        splats.opacity(i).ln() + scales[2] + scales[1]
-    };
-    let is_drawn = |i: &u32| {
-        let i = *i as usize;
-        let values = splats
-            .columns()
-            .into_iter()
-            .take(4)
-            .flat_map(|column| (0..column.count()).map(move |c| column.get(c, i)));
-        splats.opacity(i) >= ALPHA_MIN as f32 && values.into_iter().all(f32::is_finite)
-    };
-    let mut order: Vec<(f32, u32)> = (0..splats.len() as u32)
-        .into_par_iter()
-        .filter(is_drawn)
-        .map(|i| (importance(i as usize), i))
-        .collect();
-    order.par_sort_unstable_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
-
+    let mut order = by_importance(splats);
+    order.truncate(most);
     let band = band_bytes(degree);
     let mut bytes = vec![0; HEADER + order.len() * (CORE + band)];
     bytes[..4].copy_from_slice(b"IRS1");
@@ -61,11 +42,11 @@ pub(crate) fn compact(splats: &Splats, degree: u32) -> Vec<u8> {
         .zip(order.par_chunks(BLOCK))
         .for_each(|(to, order)| {
             let (cores, bands) = to.split_at_mut(order.len() * CORE);
-            for (to, (_, i)) in cores.chunks_exact_mut(CORE).zip(order) {
+            for (to, i) in cores.chunks_exact_mut(CORE).zip(order) {
                 write_core(splats, *i as usize, to);
             }
             if band > 0 {
-                for (to, (_, i)) in bands.chunks_exact_mut(band).zip(order) {
+                for (to, i) in bands.chunks_exact_mut(band).zip(order) {
                     write_bands(splats, *i as usize, degree, to);
                 }
             }
@@ -117,62 +98,10 @@ fn packed_rotation(q: [f32; 4]) -> u64 {
     })
 }
 
-/// The nearest IEEE 754 half-precision number; beyond its range the largest one.
-fn half(value: f32) -> u16 {
-    let bits = value.to_bits();
-    let sign = (bits >> 16 & 0x8000) as u16;
-    let value = f32::from_bits(bits & 0x7fff_ffff);
-    if value.is_nan() {
-        return sign | 0x7e00;
-    }
-    if value >= 65504.0 {
-        return sign | 0x7bff;
-    }
-    if value < 2f32.powi(-14) {
-        // Subnormal: a whole number of 2^-24.
-        return sign | (value * 2f32.powi(24)).round_ties_even() as u16;
-    }
-    // Rebias the exponent from 127 to 15, and round 13 bits to even.
-    let bits = value.to_bits() - (112 << 23);
-    sign | ((bits + 0x0fff + (bits >> 13 & 1)) >> 13) as u16
-}
-
-/// The value of a half-precision number.
-fn from_half(bits: u16) -> f32 {
-    let (sign, magnitude) = (f32::from(1 - 2 * (bits >> 15) as i16), u32::from(bits & 0x7fff));
-    let value = match magnitude {
-        ..0x0400 => magnitude as f32 * 2f32.powi(-24),
-        _ => f32::from_bits((magnitude << 13) + (112 << 23)),
-    };
-    sign * value
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
     use irradia_splat::logit;
-
-    #[test]
-    fn halves_are_the_nearest() {
-        for (value, bits) in [
-            (0.0, 0),
-            (1.0, 0x3c00),
-            (-2.0, 0xc000),
-            (65504.0, 0x7bff),
-            (1e9, 0x7bff),
-            (6.103_515_6e-5, 0x0400),
-            (5.960_464_5e-8, 1),
-            (0.1, 0x2e66),
-            (1.0 + 2f32.powi(-11), 0x3c00),
-            (1.0 + 3.0 * 2f32.powi(-11), 0x3c02),
-        ] {
-            assert_eq!(half(value), bits, "{value}");
-        }
-        for bits in (0..0x7c00).step_by(7) {
-            assert_eq!(half(from_half(bits)), bits);
-            assert_eq!(half(-from_half(bits)), bits | 0x8000);
-        }
-    }
 
     /// The inverse of [`packed_rotation`].
     fn unpacked(bits: u64) -> [f32; 4] {
@@ -218,7 +147,8 @@ mod tests {
         splats.log_scales.set(2, 2, 2.0);
         splats.opacity_logits.set(0, 0, -9.0);
         splats.means.set(1, 1, f32::NAN);
-        let bytes = compact(&splats, 3);
+        assert_eq!(compact(&splats, 3, 1)[4..8], 1u32.to_le_bytes());
+        let bytes = compact(&splats, 3, usize::MAX);
         let word = |at: usize| u32::from_le_bytes(bytes[at..at + 4].try_into().expect("four"));
         assert_eq!((&bytes[..4], word(4), word(8)), (&b"IRS1"[..], 2, 1));
         assert_eq!(bytes.len(), HEADER + 2 * (CORE + 16));

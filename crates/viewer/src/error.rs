@@ -8,6 +8,9 @@ pub enum ViewerError {
     /// A scene, a run or a dataset could not be read.
     #[error(transparent)]
     Run(#[from] RunError),
+    /// A file could not be written.
+    #[error(transparent)]
+    Format(#[from] irradia_runs::formats::FormatError),
     /// A run has not written a scene yet.
     #[error("{0} holds no scene yet: wait for its end, or resume it with irradia train --resume {0} --view", path.display())]
     Unfinished {
@@ -19,6 +22,25 @@ pub enum ViewerError {
     Listen {
         /// Host and port.
         address: String,
+        /// The system's reason.
+        source: io::Error,
+    },
+    /// A scene without splats was to be shared.
+    #[error("a radiance field has no splats, which a shared page draws; train splats, or share a film of it")]
+    NoSplats,
+    /// No scene fits into a limit of bytes.
+    #[error("no scene fits into {bytes} bytes: the page around it takes {around}; choose a larger --max")]
+    TooSmall {
+        /// The limit.
+        bytes: u64,
+        /// Bytes of the page without a scene.
+        around: u64,
+    },
+    /// A folder could not be created.
+    #[error("cannot create {}: {source}", path.display())]
+    Folder {
+        /// The folder.
+        path: PathBuf,
         /// The system's reason.
         source: io::Error,
     },

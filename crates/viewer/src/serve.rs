@@ -140,7 +140,7 @@ async fn splats(State(shared): App) -> Response {
             return Some(bytes.clone());
         }
         let scene = edition.scene();
-        let bytes = Bytes::from(compact(scene.model.splats()?, scene.options.sh_degree));
+        let bytes = Bytes::from(compact(scene.model.splats()?, scene.options.sh_degree, usize::MAX));
         *kept = Some((edition.version, bytes.clone()));
         Some(bytes)
     });

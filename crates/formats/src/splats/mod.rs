@@ -1,75 +1,425 @@
 //! Splat scenes. A new format is one file here and one arm in each `match` below.
+//!
+//! Readers return the project's conventions and writers start from them; each format's own are in its module's first lines and, side
+//! by side, in `docs/formats.md`.
 
+pub(crate) mod antimatter;
+mod axes;
+mod compressed_ply;
+pub(crate) mod gltf;
+pub(crate) mod ksplat;
+mod npz;
 pub(crate) mod ply;
+mod quantize;
+mod rows;
+pub(crate) mod sog;
+pub(crate) mod spz;
 
-use crate::FormatError;
-use crate::error::read_and_parse;
-use irradia_scene::GaussianCloud;
+use crate::error::{read_and_parse, read_file};
+use crate::points_ply::encode_points;
+use crate::{FormatError, Malformed, write_atomic};
+use irradia_scene::{GaussianCloud, PointCloud, Similarity, sh};
+use std::borrow::Cow;
 use std::fmt;
-use std::path::Path;
+use std::fs;
+use std::path::{Path, PathBuf};
 
-/// The splat file formats, identified by extension.
+/// The splat file formats, identified by the end of the file's name.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum SplatFormat {
-    /// `.ply` in the layout of the Inria 3DGS code.
+    /// `.ply` in the layout of the Inria 3DGS code; when reading, any PLY.
     Ply,
+    /// `.compressed.ply`, PlayCanvas's compressed PLY.
+    CompressedPly,
+    /// `.points.ply`, a point cloud of the centres; written only.
+    PointsPly,
+    /// `.spz`, versions 1 to 4.
+    Spz,
+    /// `.splat`, of antimatter15's viewer.
+    Splat,
+    /// `.ksplat`, of mkkellogg's viewer.
+    Ksplat,
+    /// `.sog`, PlayCanvas's images in a zip archive.
+    Sog,
+    /// The same as a folder, named by itself or by its `meta.json`.
+    SogFolder,
+    /// `.glb`, binary glTF with `KHR_gaussian_splatting`.
+    Glb,
+    /// `.spz.glb`, binary glTF whose splats are packed as SPZ.
+    GlbSpz,
+    /// `.gltf`, glTF as text.
+    Gltf,
+    /// `.npz`, the columns as NumPy arrays; written only.
+    Npz,
 }
 
 impl SplatFormat {
     /// All of them.
-    pub const ALL: [Self; 1] = [Self::Ply];
+    pub const ALL: [Self; 12] = [
+        Self::Ply,
+        Self::CompressedPly,
+        Self::PointsPly,
+        Self::Spz,
+        Self::Splat,
+        Self::Ksplat,
+        Self::Sog,
+        Self::SogFolder,
+        Self::Glb,
+        Self::GlbSpz,
+        Self::Gltf,
+        Self::Npz,
+    ];
 
-    /// The extension, without the dot.
-    pub fn extension(self) -> &'static str {
+    /// The end of a file's name: its extension with the dot, or `meta.json`.
+    pub fn suffix(self) -> &'static str {
         match self {
-            Self::Ply => "ply",
+            Self::Ply => ".ply",
+            Self::CompressedPly => ".compressed.ply",
+            Self::PointsPly => ".points.ply",
+            Self::Spz => ".spz",
+            Self::Splat => ".splat",
+            Self::Ksplat => ".ksplat",
+            Self::Sog => ".sog",
+            Self::SogFolder => sog::META,
+            Self::Glb => ".glb",
+            Self::GlbSpz => ".spz.glb",
+            Self::Gltf => ".gltf",
+            Self::Npz => ".npz",
         }
     }
 
-    /// The format for `path`'s extension, ignoring case.
+    /// The format for the end of `path`'s name, ignoring case; a folder with a `meta.json` is [`Self::SogFolder`].
     ///
     /// # Errors
     /// [`FormatError::UnknownSplatFormat`], which lists the known ones.
     pub fn of(path: &Path) -> Result<Self, FormatError> {
-        let extension = path.extension().map(|e| e.to_string_lossy().to_lowercase());
-        let found = Self::ALL
-            .into_iter()
-            .find(|format| extension.as_deref() == Some(format.extension()));
-        found.ok_or_else(|| FormatError::UnknownSplatFormat {
+        if path.join(sog::META).is_file() {
+            return Ok(Self::SogFolder);
+        }
+        let name = path
+            .file_name()
+            .map(|name| name.to_string_lossy().to_lowercase())
+            .unwrap_or_default();
+        let is_named = |format: &Self| match format {
+            Self::SogFolder => name == sog::META,
+            _ => name.ends_with(format.suffix()),
+        };
+        let named = Self::ALL.into_iter().filter(is_named);
+        let longest = named.max_by_key(|format| format.suffix().len());
+        longest.ok_or_else(|| FormatError::UnknownSplatFormat {
             path: path.to_owned(),
-            known: Self::ALL.map(|format| format!(".{}", format.extension())).join(", "),
+            known: Self::ALL.map(Self::suffix).join(", "),
         })
+    }
+
+    /// Whether what is written is equal to the bit when it is read.
+    pub fn is_lossless(self) -> bool {
+        matches!(self, Self::Ply | Self::Npz)
+    }
+
+    /// Whether the format can be read as splats.
+    pub fn is_readable(self) -> bool {
+        !matches!(self, Self::PointsPly | Self::Npz)
+    }
+
+    /// The highest degree of spherical harmonics that is written.
+    pub fn max_degree(self) -> u32 {
+        match self {
+            Self::Ply | Self::Spz | Self::Npz => 4,
+            Self::CompressedPly | Self::Sog | Self::SogFolder | Self::Glb | Self::Gltf | Self::GlbSpz => 3,
+            Self::Ksplat => 2,
+            Self::Splat | Self::PointsPly => 0,
+        }
+    }
+
+    /// Whether the format says that a scene was trained with the Mip-Splatting filters.
+    fn holds_antialiased(self) -> bool {
+        matches!(self, Self::Ply | Self::Spz | Self::GlbSpz | Self::Sog | Self::SogFolder)
     }
 }
 
 impl fmt::Display for SplatFormat {
     fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
-        match self {
-            Self::Ply => f.write_str("PLY"),
+        f.write_str(match self {
+            Self::Ply => "PLY",
+            Self::CompressedPly => "compressed PLY",
+            Self::PointsPly => "point cloud PLY",
+            Self::Spz => "SPZ",
+            Self::Splat => ".splat",
+            Self::Ksplat => ".ksplat",
+            Self::Sog | Self::SogFolder => "SOG",
+            Self::Glb | Self::GlbSpz | Self::Gltf => "glTF",
+            Self::Npz => "NumPy archive",
+        })
+    }
+}
+
+/// How much a lossy format may lose, where it leaves the choice.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Quality {
+    /// Smaller: fewer bits or palette entries for the harmonics, `.ksplat` of level 2.
+    Low,
+    /// The format's own default; `.ksplat` of level 1.
+    #[default]
+    Normal,
+    /// The most that the format allows; `.ksplat` of level 0.
+    High,
+}
+
+/// The version of an SPZ file to write.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum SpzVersion {
+    /// The version within glTF.
+    V2,
+    /// gzip; what most programs read.
+    #[default]
+    V3,
+    /// zstd.
+    V4,
+}
+
+/// Options of [`write_splats_with`].
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct WriteOptions {
+    /// How much a lossy format may lose.
+    pub quality: Quality,
+    /// The version of SPZ files.
+    pub spz_version: SpzVersion,
+}
+
+/// A splat scene as read from a file, and what was not.
+#[derive(Clone, Debug)]
+pub struct SplatFile {
+    /// The file's format, which for PLY is found in its header.
+    pub format: SplatFormat,
+    /// The splats.
+    pub cloud: GaussianCloud,
+    /// Splats that were left out because a position, rotation, size, opacity or colour is not a number.
+    pub left_out: usize,
+    /// Properties of the splats that are not known and were not read.
+    pub unread: Vec<String>,
+}
+
+impl SplatFile {
+    /// What the reader of the file should know, a line each.
+    pub fn warnings(&self) -> Vec<String> {
+        let left_out = (self.left_out > 0).then(|| left_out_line(self.left_out));
+        let unread = (!self.unread.is_empty()).then(|| format!("properties not read: {}", self.unread.join(", ")));
+        left_out.into_iter().chain(unread).collect()
+    }
+}
+
+fn left_out_line(count: usize) -> String {
+    format!("{count} splats left out: a position, rotation, size, opacity or colour is not a number")
+}
+
+/// Reads a splat scene; the end of the name selects the format. Splats that cannot be drawn are left out.
+///
+/// # Errors
+/// When the format is unknown, or the file cannot be read, is damaged or is shorter than its header declares.
+pub fn read_splats(path: &Path) -> Result<GaussianCloud, FormatError> {
+    Ok(read_splat_file(path)?.cloud)
+}
+
+/// [`read_splats`], and what was left out.
+///
+/// # Errors
+/// The same.
+pub fn read_splat_file(path: &Path) -> Result<SplatFile, FormatError> {
+    let mut format = SplatFormat::of(path)?;
+    let mut unread = Vec::new();
+    let mut cloud = match format {
+        SplatFormat::Ply | SplatFormat::CompressedPly | SplatFormat::PointsPly => read_and_parse(path, |bytes| {
+            unread = ply::unread_properties(bytes);
+            format = match ply::is_compressed(bytes) {
+                true => SplatFormat::CompressedPly,
+                false => SplatFormat::Ply,
+            };
+            ply::parse_splat_ply(bytes)
+        })?,
+        SplatFormat::Spz => read_and_parse(path, spz::parse)?,
+        SplatFormat::Splat => read_and_parse(path, antimatter::parse)?,
+        SplatFormat::Ksplat => read_and_parse(path, ksplat::parse)?,
+        SplatFormat::Sog => read_and_parse(path, sog::parse)?,
+        SplatFormat::SogFolder => sog::read_folder(&sog_meta(path))?,
+        SplatFormat::Glb | SplatFormat::GlbSpz => read_and_parse(path, gltf::parse_glb)?,
+        SplatFormat::Gltf => read_and_parse(path, |text| gltf::parse_gltf(text, &|name| read_beside(path, name)))?,
+        SplatFormat::Npz => return Err(FormatError::malformed(path, "NumPy archives are written, not read")),
+    };
+    let left_out = rows::leave_out_invalid(&mut cloud);
+    Ok(SplatFile {
+        format,
+        cloud,
+        left_out,
+        unread,
+    })
+}
+
+/// The `meta.json` that `path` is or contains.
+fn sog_meta(path: &Path) -> PathBuf {
+    match path.is_dir() {
+        true => path.join(sog::META),
+        false => path.to_owned(),
+    }
+}
+
+/// The content of a file that `path` names: in its folder or below it.
+fn read_beside(path: &Path, name: &str) -> Result<Vec<u8>, Malformed> {
+    let relative = Path::new(name);
+    let is_below = relative
+        .components()
+        .all(|part| matches!(part, std::path::Component::Normal(_)));
+    if !is_below || name.contains([':', '\\']) {
+        return Err(Malformed(format!(
+            "names the file {}, which is not in its folder",
+            crate::zip::shown(name)
+        )));
+    }
+    read_file(&path.with_file_name("").join(relative)).map_err(|error| Malformed(error.to_string()))
+}
+
+/// Bytes on the disk of the scene `path`, a file or a folder of images.
+///
+/// # Errors
+/// When it cannot be read.
+pub fn splat_file_size(path: &Path) -> Result<u64, FormatError> {
+    let unreadable = |source| FormatError::Read {
+        path: path.to_owned(),
+        source,
+    };
+    if SplatFormat::of(path)? != SplatFormat::SogFolder {
+        return Ok(fs::metadata(path).map_err(unreadable)?.len());
+    }
+    let folder = sog_meta(path).with_file_name("");
+    let mut total = 0;
+    for entry in fs::read_dir(folder).map_err(unreadable)? {
+        let entry = entry.map_err(unreadable)?;
+        let is_part = entry.path().extension().is_some_and(|e| e == "webp") || entry.file_name() == sog::META;
+        if is_part {
+            total += entry.metadata().map_err(unreadable)?.len();
         }
     }
+    Ok(total)
 }
 
-/// Reads a splat scene; the extension selects the format.
+/// Writes a splat scene, atomically; the end of the name selects the format, its own default the quality.
 ///
 /// # Errors
-/// When the extension is unknown, or the file cannot be read, lacks a property or is shorter than its header declares.
-pub fn read_splats(path: &Path) -> Result<GaussianCloud, FormatError> {
-    match SplatFormat::of(path)? {
-        SplatFormat::Ply => read_and_parse(path, ply::parse_splat_ply),
-    }
-}
-
-/// Writes a splat scene, atomically; the extension selects the format.
-///
-/// # Errors
-/// When the extension is unknown or the file cannot be written.
+/// When the format is unknown or the file cannot be written.
 ///
 /// # Panics
 /// When the cloud's columns have unequal lengths: a bug in the caller.
 pub fn write_splats(path: &Path, cloud: &GaussianCloud) -> Result<(), FormatError> {
+    write_splats_with(path, cloud, &WriteOptions::default()).map(drop)
+}
+
+/// [`write_splats`] with options; returns what the format could not hold, a line each.
+///
+/// # Errors
+/// The same.
+///
+/// # Panics
+/// The same.
+pub fn write_splats_with(
+    path: &Path,
+    cloud: &GaussianCloud,
+    options: &WriteOptions,
+) -> Result<Vec<String>, FormatError> {
     assert!(cloud.is_consistent(), "the columns of the cloud have unequal lengths");
-    match SplatFormat::of(path)? {
-        SplatFormat::Ply => crate::write_atomic(path, |out| ply::write_splat_ply(out, cloud)),
+    let format = SplatFormat::of(path)?;
+    let mut notes = Vec::new();
+    let cloud = match format.is_lossless() {
+        true => Cow::Borrowed(cloud),
+        false => prepared(cloud, &mut notes),
+    };
+    if cloud.sh_degree > format.max_degree() {
+        notes.push(format!(
+            "spherical harmonics of degree {} become degree {}, the highest that {format} holds",
+            cloud.sh_degree,
+            format.max_degree()
+        ));
+    }
+    if cloud.antialiased && !format.holds_antialiased() {
+        notes.push(format!(
+            "{format} does not say that the scene was trained with antialiasing"
+        ));
+    }
+    let quality = options.quality;
+    match format {
+        SplatFormat::SogFolder => {
+            write_folder(&sog_meta(path), &cloud, quality)?;
+        }
+        _ => write_atomic(path, |out| match format {
+            SplatFormat::Ply => ply::write_splat_ply(out, &cloud),
+            SplatFormat::CompressedPly => compressed_ply::write(out, &cloud),
+            SplatFormat::PointsPly => out.write_all(&encode_points(&points(&cloud))),
+            SplatFormat::Spz => spz::write(out, &cloud, quality, options.spz_version),
+            SplatFormat::Splat => antimatter::write(out, &cloud),
+            SplatFormat::Ksplat => ksplat::write(out, &cloud, quality),
+            SplatFormat::Sog => out.write_all(&crate::zip::archive(&sog::encode(&cloud, quality)?)?),
+            SplatFormat::SogFolder => unreachable!("written above"),
+            SplatFormat::Glb => gltf::write_glb(out, &cloud),
+            SplatFormat::GlbSpz => gltf::write_glb_spz(out, &cloud, quality),
+            SplatFormat::Gltf => gltf::write_gltf(out, &cloud),
+            SplatFormat::Npz => npz::write(out, &cloud),
+        })?,
+    }
+    Ok(notes)
+}
+
+/// The splats that can be drawn, in the coordinates of the dataset, about the origin of its world if that is far away: other formats
+/// than PLY hold neither doubles nor a second coordinate system.
+fn prepared<'a>(cloud: &'a GaussianCloud, notes: &mut Vec<String>) -> Cow<'a, GaussianCloud> {
+    let mut cloud = Cow::Borrowed(cloud);
+    let world = cloud.world_from_dataset;
+    if !world.is_identity() {
+        let own = cloud.to_mut();
+        let (unit, log_unit) = (1.0 / world.scale, world.scale.ln());
+        own.means
+            .as_flattened_mut()
+            .iter_mut()
+            .for_each(|v| *v = (f64::from(*v) * unit) as f32);
+        own.log_scales
+            .as_flattened_mut()
+            .iter_mut()
+            .for_each(|v| *v = (f64::from(*v) - log_unit) as f32);
+        own.world_from_dataset = Similarity::IDENTITY;
+        if world.center != glam::DVec3::ZERO {
+            let glam::DVec3 { x, y, z } = world.center;
+            notes.push(format!(
+                "positions are relative to ({x}, {y}, {z}), which is too far away for floats"
+            ));
+        }
+    }
+    if rows::has_invalid(&cloud) {
+        notes.push(left_out_line(rows::leave_out_invalid(cloud.to_mut())));
+    }
+    cloud
+}
+
+/// Writes the files of a scene in images, `meta.json` last.
+fn write_folder(meta: &Path, cloud: &GaussianCloud, quality: Quality) -> Result<(), FormatError> {
+    let failed = |source| FormatError::Write {
+        path: meta.to_owned(),
+        source,
+    };
+    let files = sog::encode(cloud, quality).map_err(failed)?;
+    if let Some(folder) = meta.parent().filter(|folder| !folder.as_os_str().is_empty()) {
+        fs::create_dir_all(folder).map_err(failed)?;
+    }
+    for (name, content) in files {
+        write_atomic(&meta.with_file_name(name), |out| out.write_all(&content))?;
+    }
+    Ok(())
+}
+
+/// The centres and the colours of degree 0.
+fn points(cloud: &GaussianCloud) -> PointCloud {
+    let colors = cloud.sh.chunks_exact(3 * sh::coefficients(cloud.sh_degree));
+    PointCloud {
+        positions: cloud.means.iter().map(|mean| (*mean).into()).collect(),
+        colors: colors
+            .map(|sh| [0, 1, 2].map(|c| quantize::color_byte(sh[c])))
+            .collect(),
     }
 }

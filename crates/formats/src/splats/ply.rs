@@ -7,13 +7,13 @@
 
 use crate::Malformed;
 use crate::ply::{Column, Ply, Rows};
+use crate::splats::compressed_ply;
+use crate::splats::rows::{CHUNK, decode_splats};
 use glam::DVec3;
 use irradia_scene::{GaussianCloud, Similarity, sh};
 use rayon::prelude::*;
 use std::io::{self, Write};
 
-/// Rows converted per task.
-const CHUNK: usize = 16_384;
 /// The comment that stores [`GaussianCloud::antialiased`], for which the layout has no property.
 const ANTIALIASED: &str = "antialiased 1";
 /// The comment that stores [`GaussianCloud::world_from_dataset`]: scale and centre.
@@ -27,7 +27,7 @@ const DC: [&str; 3] = ["f_dc_0", "f_dc_1", "f_dc_2"];
 const SCALE: [&str; 3] = ["scale_0", "scale_1", "scale_2"];
 const ROTATION: [&str; 4] = ["rot_0", "rot_1", "rot_2", "rot_3"];
 
-/// Parses a splat PLY: any encoding, any order of properties, SH degree 0 to 4 by the number of `f_rest`; other content of
+/// Parses a splat PLY, compressed or not: any encoding, any order of properties, SH degree 0 to 4 by the number of `f_rest`; other content of
 /// the file is skipped. Floats are preserved bit for bit.
 ///
 /// # Errors
@@ -35,51 +35,32 @@ const ROTATION: [&str; 4] = ["rot_0", "rot_1", "rot_2", "rot_3"];
 /// declares.
 pub fn parse_splat_ply(bytes: &[u8]) -> Result<GaussianCloud, Malformed> {
     let ply = Ply::parse(bytes)?;
+    if ply.has(compressed_ply::CHUNKS) {
+        return compressed_ply::parse(&ply);
+    }
     let sh_degree = check_properties(&ply)?;
     let rows = ply.rows("vertex")?;
     let columns = Columns::find(&rows, sh_degree)?;
 
     let world_from_dataset = world_in(&ply)?;
     let (local, log_scale) = (!world_from_dataset.is_identity(), world_from_dataset.scale.ln());
-    let count = rows.len();
-    let sh_values = 3 * sh::coefficients(sh_degree);
-    let mut cloud = GaussianCloud {
-        means: vec![[0.0; 3]; count],
-        quats: vec![[0.0; 4]; count],
-        log_scales: vec![[0.0; 3]; count],
-        opacity_logits: vec![0.0; count],
-        sh: vec![0.0; count * sh_values],
-        sh_degree,
-        antialiased: ply.comments.iter().any(|comment| comment.trim() == ANTIALIASED),
-        world_from_dataset,
-    };
-    let geometry = cloud.means.par_chunks_mut(CHUNK).zip(cloud.quats.par_chunks_mut(CHUNK));
-    let shape = cloud
-        .log_scales
-        .par_chunks_mut(CHUNK)
-        .zip(cloud.opacity_logits.par_chunks_mut(CHUNK));
-    let colour = cloud.sh.par_chunks_mut(CHUNK * sh_values);
-    geometry
-        .zip(shape)
-        .zip(colour)
-        .enumerate()
-        .for_each(|(chunk, (((means, quats), (scales, opacities)), sh))| {
-            for (i, sh) in sh.chunks_exact_mut(sh_values).enumerate() {
-                let row = rows.row(chunk * CHUNK + i);
-                means[i] = columns.position.map(|c| c.f32(row));
-                quats[i] = columns.rotation.map(|c| c.f32(row));
-                scales[i] = columns.scale.map(|c| c.f32(row));
-                if local {
-                    let position = DVec3::from(columns.position.map(|c| c.f64(row)));
-                    means[i] = world_from_dataset.apply(position).as_vec3().to_array();
-                    scales[i] = scales[i].map(|scale| (f64::from(scale) + log_scale) as f32);
-                }
-                opacities[i] = columns.opacity.f32(row);
-                for (value, column) in sh.iter_mut().zip(&columns.sh) {
-                    *value = column.f32(row);
-                }
-            }
-        });
+    let mut cloud = decode_splats(rows.len(), sh_degree, |i, splat| {
+        let row = rows.row(i);
+        *splat.mean = columns.position.map(|c| c.f32(row));
+        *splat.quat = columns.rotation.map(|c| c.f32(row));
+        *splat.log_scale = columns.scale.map(|c| c.f32(row));
+        if local {
+            let position = DVec3::from(columns.position.map(|c| c.f64(row)));
+            *splat.mean = world_from_dataset.apply(position).as_vec3().to_array();
+            *splat.log_scale = splat.log_scale.map(|scale| (f64::from(scale) + log_scale) as f32);
+        }
+        *splat.opacity_logit = columns.opacity.f32(row);
+        for (value, column) in splat.sh.iter_mut().zip(&columns.sh) {
+            *value = column.f32(row);
+        }
+    });
+    cloud.antialiased = ply.comments.iter().any(|comment| comment.trim() == ANTIALIASED);
+    cloud.world_from_dataset = world_from_dataset;
     Ok(cloud)
 }
 
@@ -109,6 +90,22 @@ fn world_in(ply: &Ply) -> Result<Similarity, Malformed> {
     Err(Malformed(format!(
         "the comment {WORLD} does not hold a positive scale and three coordinates; remove it to read the file as it is"
     )))
+}
+
+/// The properties of the splats that are not read; the normals that everybody writes and nobody uses are not counted.
+pub(crate) fn unread_properties(bytes: &[u8]) -> Vec<String> {
+    let Ok(ply) = Ply::parse(bytes) else { return Vec::new() };
+    let is_read = |name: &str| {
+        let known = [&POSITION[..], &DC, &SCALE, &ROTATION, &["nx", "ny", "nz", "opacity"]].concat();
+        known.contains(&name) || name.starts_with("f_rest_") || name.starts_with("packed_")
+    };
+    let names = ply.property_names("vertex").into_iter().flatten();
+    names.filter(|name| !is_read(name)).map(str::to_owned).collect()
+}
+
+/// Whether a PLY has PlayCanvas's compressed layout.
+pub(crate) fn is_compressed(bytes: &[u8]) -> bool {
+    Ply::parse(bytes).is_ok_and(|ply| ply.has(compressed_ply::CHUNKS))
 }
 
 /// Whether a PLY contains splats rather than a point cloud, by the names of its properties.
@@ -151,12 +148,6 @@ impl Columns {
 /// Names all missing properties at once, before reading the body; returns the SH degree.
 fn check_properties(ply: &Ply) -> Result<u32, Malformed> {
     let names: Vec<&str> = ply.property_names("vertex")?.collect();
-    if names.iter().any(|name| name.starts_with("packed_")) {
-        return Err(Malformed(
-            "compressed PLY (packed_position, packed_rotation, ..) is not supported yet; convert it to a plain PLY"
-                .into(),
-        ));
-    }
     let needed = POSITION
         .iter()
         .chain(&DC)
@@ -429,6 +420,5 @@ mod tests {
         assert!(error(&format!("{all} f_rest_0 f_rest_1")).contains("2 f_rest"));
         let gap: String = (1..10).map(|i| format!(" f_rest_{i}")).collect();
         assert!(error(&format!("{all}{gap}")).contains("f_rest_0"));
-        assert!(error("packed_position packed_rotation").contains("not supported yet"));
     }
 }

@@ -1,6 +1,5 @@
 //! Named tensors of other programs: safetensors files and the state dicts of PyTorch.
 
-mod archive;
 mod pickle;
 mod torch;
 

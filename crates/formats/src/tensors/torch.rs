@@ -2,9 +2,10 @@
 //! values per storage; before that, a stream of pickles followed by the storages (`torch/serialization.py`).
 
 use super::pickle::{self, Id, Object, Pickle};
-use super::{Tensor, archive, floats};
+use super::{Tensor, floats};
 use crate::Malformed;
 use crate::bytes::Bytes;
+use crate::zip;
 use std::collections::{BTreeMap, HashMap};
 
 type Wanted<'a> = &'a dyn Fn(&str) -> bool;
@@ -15,7 +16,18 @@ fn wrong(what: impl std::fmt::Display) -> Malformed {
 
 /// From the zip archive.
 pub(super) fn from_archive(bytes: &[u8], wanted: Wanted) -> Result<BTreeMap<String, Tensor>, Malformed> {
-    let files = archive::files(bytes)?;
+    // PyTorch compresses nothing, so that no file is larger than the archive.
+    let mut files = HashMap::new();
+    for (name, entry) in zip::files(bytes)? {
+        let content = entry.stored();
+        let content = content.ok_or_else(|| {
+            wrong(format!(
+                "{} is compressed, which PyTorch does not do",
+                zip::shown(&name)
+            ))
+        })?;
+        files.insert(name, content);
+    }
     let folder = files.keys().find_map(|name| name.strip_suffix("data.pkl"));
     let folder = folder.ok_or_else(|| wrong("the archive contains no data.pkl"))?;
     let order = files.get(&format!("{folder}byteorder"));

@@ -1,6 +1,7 @@
 //! One file per command, and arguments common to several commands.
 
 pub mod compare;
+pub mod convert;
 pub mod demo;
 pub mod eval;
 pub mod files;
@@ -11,6 +12,7 @@ mod progress;
 pub mod recipe;
 mod recipe_keys;
 pub mod render;
+pub mod share;
 pub mod train;
 pub mod view;
 

@@ -56,7 +56,11 @@ fn command_line_mistakes_exit_with_2_and_change_nothing() {
         ("train data --out x --budget soon", &["--budget", "90s"]),
         ("train data --out x --threads 0", &["--threads"]),
         ("train --resume run --downscale 2", &["--resume", "--downscale"]),
-        ("convert run/scene.ply x.gltf", &["x.gltf", ".ply"]),
+        (
+            "convert run/scene.ply x.xyz",
+            &["x.xyz", ".ply", ".spz", ".ksplat", "meta.json"],
+        ),
+        ("convert run/scene.ply x.spz --spz-version 2", &["--spz-version"]),
         ("render run --out x", &["--data", "--orbit"]),
         ("render run --orbit 0 --out x", &["--orbit"]),
         ("synth x --views 1", &["1 views"]),

@@ -83,6 +83,23 @@ fn the_scene_has_the_inria_layout_and_converts_to_the_same_bytes() {
 }
 
 #[test]
+fn converting_says_what_it_costs_and_every_format_renders() {
+    let folder = with_run();
+    let said = irradia(folder.path(), "convert run scene.spz --quality high")
+        .success()
+        .stdout;
+    for word in ["splats", "size", "MB PLY ->", "MB SPZ", "PSNR", "12 views"] {
+        assert!(said.contains(word), "{said}");
+    }
+    irradia(folder.path(), "convert scene.spz scene.sog --no-compare").success();
+    irradia(folder.path(), "convert scene.sog scene.glb").success();
+    irradia(folder.path(), "render scene.glb --orbit 1 --size 32x24 --out frames").success();
+    irradia(folder.path(), "eval scene.sog --data data").success();
+    let said = irradia(folder.path(), "info scene.sog").success().stdout;
+    assert!(said.contains("SOG with"), "{said}");
+}
+
+#[test]
 fn info_describes_every_kind() {
     let folder = with_run();
     let cases = [

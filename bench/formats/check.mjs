@@ -1,0 +1,177 @@
+// Whether other programs read what irradia writes, and irradia what they write: npm install; node check.mjs IRRADIA SCENE.ply
+//
+// Every format that splat-transform reads is written by irradia, converted to PLY by splat-transform, and compared with the scene
+// splat by splat; every format that it writes is read back by irradia. glb, which it only writes, is compared with its own.
+
+import { execFileSync } from "node:child_process";
+import { mkdtempSync, readFileSync, rmSync, statSync } from "node:fs";
+import { tmpdir } from "node:os";
+import { dirname, join } from "node:path";
+import { fileURLToPath } from "node:url";
+
+const [irradia, scene] = process.argv.slice(2);
+if (!scene) {
+  console.error("usage: node check.mjs IRRADIA SCENE.ply");
+  process.exit(2);
+}
+const here = dirname(fileURLToPath(import.meta.url));
+const cli = join(process.env.NODE_MODULES ?? join(here, "node_modules"), "@playcanvas/splat-transform/bin/cli.mjs");
+const folder = mkdtempSync(join(tmpdir(), "irradia-formats-"));
+const ours = (...files) => execFileSync(irradia, ["convert", ...files], { encoding: "utf8" });
+const theirs = (...files) => execFileSync(process.execPath, [cli, "-q", "-w", "-g", "cpu", ...files], { encoding: "utf8" });
+
+/** Columns of a binary little-endian PLY of floats. */
+function readPly(path) {
+  const bytes = readFileSync(path);
+  const end = bytes.indexOf("end_header\n") + 11;
+  const lines = bytes.subarray(0, end).toString().split("\n");
+  const count = Number(lines.find((line) => line.startsWith("element vertex")).split(" ")[2]);
+  const names = lines.filter((line) => line.startsWith("property float ")).map((line) => line.split(" ")[2]);
+  const view = new DataView(bytes.buffer, bytes.byteOffset + end);
+  const columns = Object.fromEntries(names.map((name) => [name, new Float32Array(count)]));
+  for (let i = 0, at = 0; i < count; i += 1) {
+    for (const name of names) {
+      columns[name][i] = view.getFloat32(at, true);
+      at += 4;
+    }
+  }
+  return { count, columns };
+}
+
+/** For each splat of a the index of the nearest of b, by position and, among neighbours, colour. */
+function matches(a, b) {
+  const cells = new Map();
+  const size = 0.02;
+  const key = (x, y, z) => `${x},${y},${z}`;
+  const cell = ({ columns: { x, y, z } }, i) => [x[i], y[i], z[i]].map((v) => Math.floor(v / size));
+  for (let i = 0; i < b.count; i += 1) {
+    const at = key(...cell(b, i));
+    if (!cells.has(at)) cells.set(at, []);
+    cells.get(at).push(i);
+  }
+  const names = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "scale_0", "scale_1", "scale_2"];
+  const weights = [300, 300, 300, 1, 1, 1, 0.3, 0.3, 0.3];
+  const found = new Int32Array(a.count).fill(-1);
+  for (let i = 0; i < a.count; i += 1) {
+    const [cx, cy, cz] = cell(a, i);
+    let best = Infinity;
+    for (let dx = -1; dx <= 1; dx += 1) {
+      for (let dy = -1; dy <= 1; dy += 1) {
+        for (let dz = -1; dz <= 1; dz += 1) {
+          for (const j of cells.get(key(cx + dx, cy + dy, cz + dz)) ?? []) {
+            const distance = names.reduce((sum, name, k) => sum + (weights[k] * (a.columns[name][i] - b.columns[name][j])) ** 2, 0);
+            if (distance < best) [best, found[i]] = [distance, j];
+          }
+        }
+      }
+    }
+  }
+  return found;
+}
+
+const sigmoid = (v) => 1 / (1 + Math.exp(-v));
+
+/** Mean and largest differences of two scenes, as text; throws where counts differ. */
+function compare(a, b) {
+  if (a.count !== b.count) throw new Error(`${b.count} splats instead of ${a.count}`);
+  const found = matches(a, b);
+  const rest = Object.keys(b.columns).filter((name) => name.startsWith("f_rest_"));
+  const same = rest.length === Object.keys(a.columns).filter((name) => name.startsWith("f_rest_")).length;
+  const groups = {
+    position: { names: ["x", "y", "z"], of: (v) => v },
+    colour: { names: ["f_dc_0", "f_dc_1", "f_dc_2"], of: (v) => v * 0.2820948 },
+    opacity: { names: ["opacity"], of: sigmoid },
+    "ln size": { names: ["scale_0", "scale_1", "scale_2"], of: (v) => v },
+    ...(same && rest.length > 0 ? { harmonics: { names: rest, of: (v) => v } } : {}),
+  };
+  const lost = found.reduce((sum, j) => sum + (j < 0 ? 1 : 0), 0);
+  const parts = Object.entries(groups).map(([group, { names, of }]) => {
+    let [sum, most] = [0, 0];
+    for (let i = 0; i < a.count; i += 1) {
+      if (found[i] < 0) continue;
+      for (const name of names) {
+        const difference = Math.abs(of(a.columns[name][i]) - of(b.columns[name][found[i]]));
+        sum += difference;
+        most = Math.max(most, difference);
+      }
+    }
+    return `${group} ${(sum / a.count / names.length).toExponential(1)} (${most.toExponential(1)})`;
+  });
+  return `${a.count} splats${lost ? `, ${lost} without a counterpart` : ""}; ${parts.join(", ")}`;
+}
+
+/** Attributes of a .glb of floats by name. */
+function readGlb(path) {
+  const bytes = readFileSync(path);
+  const length = bytes.readUInt32LE(12);
+  const document = JSON.parse(bytes.subarray(20, 20 + length).toString());
+  const binary = bytes.subarray(28 + length);
+  const { attributes } = document.meshes[0].primitives[0];
+  return Object.fromEntries(
+    Object.entries(attributes).map(([name, index]) => {
+      const accessor = document.accessors[index];
+      const view = document.bufferViews[accessor.bufferView];
+      return [name, binary.subarray(view.byteOffset ?? 0, (view.byteOffset ?? 0) + view.byteLength)];
+    }),
+  );
+}
+
+let failed = 0;
+const check = (title, run) => {
+  try {
+    console.log(`${title}: ${run()}`);
+  } catch (error) {
+    failed += 1;
+    console.log(`${title}: FAILED ${error.message.split("\n")[0]}`);
+  }
+};
+const megabytes = (path) => `${(statSync(path).size / 1e6).toFixed(2)} MB`;
+
+const plain = join(folder, "plain.ply");
+ours(scene, plain);
+const truth = readPly(plain);
+console.log("written by irradia, read by splat-transform; mean difference (largest)");
+const kinds = [
+  ["a.ply"],
+  ["a.compressed.ply"],
+  ["a.spz"],
+  ["b.spz", "--spz-version", "4"],
+  ["a.splat"],
+  ["a.ksplat"],
+  ["b.ksplat", "--quality", "high"],
+  ["c.ksplat", "--quality", "low"],
+  ["a.sog"],
+];
+for (const [name, ...options] of kinds) {
+  check(`${name.slice(1)} ${options.join(" ")}`, () => {
+    const [file, back] = [join(folder, name), join(folder, "back.ply")];
+    ours(plain, file, "--no-compare", ...options);
+    theirs(file, back);
+    return `${megabytes(file)}; ${compare(truth, readPly(back))}`;
+  });
+}
+check("glb, beside splat-transform's", () => {
+  const [a, b] = [join(folder, "ours.glb"), join(folder, "theirs.glb")];
+  ours(plain, a, "--no-compare");
+  theirs(plain, b);
+  const [mine, other] = [readGlb(a), readGlb(b)];
+  const names = Object.keys(mine);
+  const worst = names.map((name) => {
+    const floats = (buffer) => new Float32Array(buffer.buffer.slice(buffer.byteOffset, buffer.byteOffset + buffer.byteLength));
+    const [p, q] = [floats(mine[name]), floats(other[name])];
+    if (p.length !== q.length) throw new Error(`${name} has ${p.length} numbers instead of ${q.length}`);
+    return p.reduce((most, v, i) => Math.max(most, Math.abs(v - q[i])), 0);
+  });
+  return `${names.length} attributes, the largest difference ${Math.max(...worst).toExponential(1)}`;
+});
+console.log("written by splat-transform, read by irradia");
+for (const name of ["t.compressed.ply", "t.spz", "t.sog", "t.glb"]) {
+  check(name.slice(1), () => {
+    const [file, back] = [join(folder, name), join(folder, "back.ply")];
+    theirs(plain, file);
+    ours(file, back);
+    return `${megabytes(file)}; ${compare(truth, readPly(back))}`;
+  });
+}
+rmSync(folder, { recursive: true });
+process.exit(failed ? 1 : 0);

@@ -1,0 +1,260 @@
+use super::accessor::{Buffers, Values, view};
+use super::document::{Document, Primitive};
+use super::{BIN_CHUNK, EXTENSION, GLB, JSON_CHUNK, SPZ_EXTENSIONS, harmonic};
+use crate::bytes::Bytes;
+use crate::splats::axes::{Affine, Signs};
+use crate::splats::quantize::logit;
+use crate::splats::rows::{decode_splats, plausible_count};
+use crate::splats::spz;
+use crate::{Malformed, base64, zip};
+use irradia_scene::{GaussianCloud, sh};
+use rayon::prelude::*;
+use std::borrow::Cow;
+
+/// Extensions that a document may require.
+const KNOWN: [&str; 2] = [EXTENSION, "KHR_mesh_quantization"];
+
+/// Parses a `.glb` file.
+///
+/// # Errors
+/// One line when it is damaged, needs an extension that is not known, has no splats, or refers to what it does not contain.
+pub fn parse_glb(bytes: &[u8]) -> Result<GaussianCloud, Malformed> {
+    let mut rest = Bytes::new(bytes);
+    if rest.u32()? != GLB {
+        return Err(Malformed("not a .glb file: it does not begin with glTF".into()));
+    }
+    let (version, length) = (rest.u32()?, rest.u32()? as usize);
+    if version != 2 || length > bytes.len() {
+        return Err(Malformed(format!(
+            "declares version {version} and {length} bytes, and has {}; expected version 2 and a complete file",
+            bytes.len()
+        )));
+    }
+    let (mut text, mut binary) = (None, None);
+    while !rest.is_empty() {
+        let (length, kind) = (rest.u32()?, rest.u32()?);
+        let chunk = rest.take(length as usize)?;
+        match kind {
+            JSON_CHUNK => text = Some(chunk),
+            BIN_CHUNK => binary = binary.or(Some(chunk)),
+            _ => {}
+        }
+    }
+    let text = text.ok_or_else(|| Malformed("the .glb file has no JSON".into()))?;
+    parse(text, binary, bytes.len(), &|name| {
+        Err(Malformed(format!(
+            "its buffer {} is another file; convert it to one that contains its buffers",
+            zip::shown(name)
+        )))
+    })
+}
+
+/// Parses a `.gltf` file; `read` provides the files beside it that it names.
+pub(crate) fn parse_gltf(
+    text: &[u8],
+    read: &dyn Fn(&str) -> Result<Vec<u8>, Malformed>,
+) -> Result<GaussianCloud, Malformed> {
+    parse(text, None, text.len(), read)
+}
+
+fn parse(
+    text: &[u8],
+    binary: Option<&[u8]>,
+    file_bytes: usize,
+    read: &dyn Fn(&str) -> Result<Vec<u8>, Malformed>,
+) -> Result<GaussianCloud, Malformed> {
+    let document: Document = serde_json::from_slice(text)
+        .map_err(|error| Malformed(format!("its JSON is not that of glTF 2.0: {error}")))?;
+    let is_known = |name: &&String| KNOWN.contains(&name.as_str()) || SPZ_EXTENSIONS.contains(&name.as_str());
+    if let Some(unknown) = document.extensions_required.iter().find(|name| !is_known(name)) {
+        return Err(Malformed(format!(
+            "requires the extension {}, which is not supported",
+            zip::shown(unknown)
+        )));
+    }
+    let mut buffers: Vec<Cow<[u8]>> = Vec::new();
+    for (i, buffer) in document.buffers.iter().enumerate() {
+        let content: Cow<[u8]> = match (&buffer.uri, binary) {
+            (None, Some(binary)) if i == 0 => Cow::Borrowed(binary),
+            (None, _) => return Err(Malformed(format!("its buffer {i} has no content"))),
+            (Some(uri), _) => Cow::Owned(match uri.strip_prefix("data:") {
+                Some(data) => data
+                    .split_once(";base64,")
+                    .and_then(|(_, data)| base64::decode(data))
+                    .ok_or_else(|| Malformed(format!("its buffer {i} is not valid base64")))?,
+                None => read(uri)?,
+            }),
+        };
+        if (content.len() as u64) < buffer.byte_length {
+            return Err(Malformed(format!(
+                "its buffer {i} declares {} bytes and has {}; the file is truncated, copy it again",
+                buffer.byte_length,
+                content.len()
+            )));
+        }
+        buffers.push(content);
+    }
+    let total = buffers.iter().map(|buffer| buffer.len()).sum::<usize>().max(file_bytes);
+    let mut parts = Vec::new();
+    let mut splats = 0;
+    for (primitive, transform) in placed_primitives(&document)? {
+        let mut cloud = decode(&document, &buffers, primitive)?;
+        if primitive.is_linear() {
+            encode_srgb(&mut cloud);
+        }
+        transform.apply(&mut cloud).ok_or_else(|| {
+            Malformed("a node mirrors its splats or has no size, for which glTF defines no splats".into())
+        })?;
+        splats += cloud.len() as u64;
+        // A mesh may be placed many times.
+        plausible_count(splats, total)?;
+        parts.push(cloud);
+    }
+    if parts.is_empty() {
+        return Err(Malformed(format!(
+            "contains no splats: no mesh in its scene has the extension {EXTENSION}"
+        )));
+    }
+    let mut cloud = concatenate(parts);
+    Signs::HALF_TURN_Z.apply(&mut cloud);
+    Ok(cloud)
+}
+
+/// The primitives with splats in the document's scene, in the order of its nodes, and their places.
+fn placed_primitives(document: &Document) -> Result<Vec<(&Primitive, Affine)>, Malformed> {
+    let all: Vec<usize>;
+    let roots = match document.scenes.get(document.scene.unwrap_or(0)) {
+        Some(scene) => &scene.nodes,
+        // Without a scene every node that is nobody's child is a root.
+        None => {
+            let is_child = |i: &usize| document.nodes.iter().any(|node| node.children.contains(i));
+            all = (0..document.nodes.len()).filter(|i| !is_child(i)).collect();
+            &all
+        }
+    };
+    let mut stack: Vec<(usize, Affine)> = roots.iter().rev().map(|root| (*root, Affine::IDENTITY)).collect();
+    let mut visited = vec![false; document.nodes.len()];
+    let mut placed = Vec::new();
+    while let Some((index, parent)) = stack.pop() {
+        let node = document.nodes.get(index);
+        let node = node.ok_or_else(|| Malformed(format!("its node {index} does not exist")))?;
+        if std::mem::replace(&mut visited[index], true) {
+            return Err(Malformed(format!(
+                "its node {index} has two parents; nodes form a tree"
+            )));
+        }
+        let place = parent.after(node.transform());
+        if let Some(mesh) = node.mesh {
+            let mesh = document.meshes.get(mesh);
+            let mesh = mesh.ok_or_else(|| Malformed(format!("the mesh of its node {index} does not exist")))?;
+            let splats = mesh.primitives.iter().filter(|primitive| primitive.has_splats());
+            placed.extend(splats.map(|primitive| (primitive, place)));
+        }
+        stack.extend(node.children.iter().rev().map(|child| (*child, place)));
+    }
+    Ok(placed)
+}
+
+/// The splats of a primitive, in its own space.
+fn decode(document: &Document, buffers: &Buffers, primitive: &Primitive) -> Result<GaussianCloud, Malformed> {
+    if let Some(index) = primitive.spz() {
+        let index = usize::try_from(index).unwrap_or(usize::MAX);
+        let mut cloud = spz::parse(view(document, buffers, index)?)?;
+        Signs::HALF_TURN_Z.apply(&mut cloud);
+        return Ok(cloud);
+    }
+    let attribute = |name: &str, width: usize| match primitive.attributes.get(name) {
+        Some(accessor) => {
+            let values = Values::find(document, buffers, *accessor, width);
+            values.map_err(|error| Malformed(format!("{name}: {error}")))
+        }
+        None => Err(Malformed(format!("its splats lack the attribute {name}"))),
+    };
+    let own = |name: &str| format!("{EXTENSION}:{name}");
+    let positions = attribute("POSITION", 3)?;
+    let rotations = attribute(&own("ROTATION"), 4)?;
+    let scales = attribute(&own("SCALE"), 3)?;
+    let opacities = attribute(&own("OPACITY"), 1)?;
+    let has = |degree: &u32| {
+        primitive
+            .attributes
+            .contains_key(&harmonic(sh::coefficients(*degree) - 1))
+    };
+    let degree = (0..=3).rev().find(has).unwrap_or(0);
+    let harmonics = (0..sh::coefficients(degree))
+        .map(|coefficient| attribute(&harmonic(coefficient), 3))
+        .collect::<Result<Vec<_>, _>>()?;
+    let count = positions.count;
+    let others = [&rotations, &scales, &opacities];
+    if others.into_iter().chain(&harmonics).any(|values| values.count != count) {
+        return Err(Malformed(format!(
+            "one of its attributes has another number of rows than its {count} positions"
+        )));
+    }
+    plausible_count(count as u64, buffers.iter().map(|buffer| buffer.len()).sum())?;
+    // A negative scale, which the extension forbids, marks a file of a draft before it, which stored ln.
+    let is_ln = (0..count)
+        .into_par_iter()
+        .any(|i| scales.row::<3>(i).iter().any(|scale| *scale < 0.0));
+    Ok(decode_splats(count, degree, |i, splat| {
+        *splat.mean = positions.row(i);
+        let [x, y, z, w] = rotations.row(i);
+        *splat.quat = [w, x, y, z];
+        let scale: [f32; 3] = scales.row(i);
+        *splat.log_scale = if is_ln { scale } else { scale.map(f32::ln) };
+        let [opacity] = opacities.row(i);
+        *splat.opacity_logit = logit(opacity);
+        for (to, values) in splat.sh.chunks_exact_mut(3).zip(&harmonics) {
+            to.copy_from_slice(&values.row::<3>(i));
+        }
+    }))
+}
+
+/// From colours in linear light to sRGB-encoded ones: exact for the colour of degree 0, and to first order for what varies about it.
+fn encode_srgb(cloud: &mut GaussianCloud) {
+    let width = 3 * cloud.sh_coefficients();
+    cloud.sh.par_chunks_mut(width).for_each(|values| {
+        for c in 0..3 {
+            let linear = sh::color_from_dc(values[c]);
+            let (encoded, slope) = match linear {
+                // IEC 61966-2-1.
+                ..0.003_130_8 => (12.92 * linear, 12.92),
+                _ => (
+                    1.055 * linear.powf(1.0 / 2.4) - 0.055,
+                    1.055 / 2.4 * linear.powf(1.0 / 2.4 - 1.0),
+                ),
+            };
+            values[c] = sh::dc_from_color(encoded);
+            values[3..]
+                .iter_mut()
+                .skip(c)
+                .step_by(3)
+                .for_each(|value| *value *= slope);
+        }
+    });
+}
+
+/// All splats, with the highest degree among them.
+fn concatenate(mut parts: Vec<GaussianCloud>) -> GaussianCloud {
+    if parts.len() == 1 {
+        return parts.remove(0);
+    }
+    let sh_degree = parts.iter().map(|part| part.sh_degree).max().unwrap_or(0);
+    let mut all = GaussianCloud {
+        sh_degree,
+        ..GaussianCloud::default()
+    };
+    let width = 3 * all.sh_coefficients();
+    for part in parts {
+        for sh in part.sh.chunks_exact(3 * part.sh_coefficients()) {
+            all.sh.extend_from_slice(sh);
+            all.sh.resize(all.sh.len() + width - sh.len(), 0.0);
+        }
+        all.means.extend(part.means);
+        all.quats.extend(part.quats);
+        all.log_scales.extend(part.log_scales);
+        all.opacity_logits.extend(part.opacity_logits);
+        all.antialiased |= part.antialiased;
+    }
+    all
+}

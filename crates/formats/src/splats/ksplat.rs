@@ -1,0 +1,414 @@
+//! `.ksplat`, the format of mkkellogg's viewer, in its three levels of compression.
+//! <https://github.com/mkkellogg/GaussianSplats3D> (`SplatBuffer.js`).
+//!
+//! A header of 4096 bytes, one of 1024 bytes a section, then the sections: lengths of the partly filled buckets, centres of the
+//! buckets, splats. Level 0 holds floats; level 1 halves, and positions in 16 bits about the centre of the splat's bucket; level 2
+//! a byte for each coefficient above DC. Colour and opacity are bytes in every level, scales are standard deviations, rotations
+//! `w, x, y, z`. Coefficients are band by band, each first all of red. The axes are ours. Degree 2 is the highest that is written.
+
+use crate::Malformed;
+use crate::bytes::Bytes;
+use crate::splats::Quality;
+use crate::splats::quantize::{byte, color_byte, dc_of_byte, logits_of_bytes, normalized, opacity_byte};
+use crate::splats::rows::{bounds, decode_splats, encode_rows};
+use irradia_scene::half::{from_half, half};
+use irradia_scene::{GaussianCloud, sh};
+use std::collections::BTreeMap;
+use std::io::{self, Write};
+
+const HEADER: usize = 4096;
+const SECTION: usize = 1024;
+/// Splats of a full bucket, and the steps of a position from a bucket's centre to its side.
+const BUCKET: usize = 256;
+const STEPS: u32 = 32767;
+/// The side of a bucket's block is at most this long.
+const MAX_BLOCK: f32 = 5.0;
+/// Coefficients of level 2 where the header gives no bounds.
+const DEFAULT_RANGE: f32 = 1.5;
+
+/// Bytes of a number of position, scale and rotation, and of a coefficient.
+fn sizes(level: u16) -> (usize, usize) {
+    match level {
+        0 => (4, 4),
+        1 => (2, 2),
+        _ => (2, 1),
+    }
+}
+
+/// Where the three channels of coefficient `k` above DC are, in units of coefficients.
+fn places(k: usize) -> [usize; 3] {
+    let (first, length) = match k {
+        ..3 => (0, 3),
+        ..8 => (3, 5),
+        _ => (8, 7),
+    };
+    [0, 1, 2].map(|channel| 3 * first + channel * length + k - first)
+}
+
+/// A section's splats in the file.
+struct Section<'a> {
+    /// Index of its first splat in the scene.
+    first: usize,
+    degree: u32,
+    rows: &'a [u8],
+    row: usize,
+    /// World units of a position's step; what a position of zero steps means.
+    unit: f32,
+    zero: f32,
+    /// Splats in full buckets, and in a full bucket.
+    in_full: usize,
+    bucket_size: usize,
+    full: usize,
+    /// Index of the first splat of each partly filled bucket, without those in full ones.
+    starts: Vec<usize>,
+    /// Three floats a bucket.
+    centers: &'a [u8],
+}
+
+impl Section<'_> {
+    fn bucket(&self, i: usize) -> usize {
+        if i < self.in_full {
+            return i / self.bucket_size;
+        }
+        self.full + self.starts.partition_point(|start| *start <= i - self.in_full) - 1
+    }
+
+    fn center(&self, i: usize, axis: usize) -> f32 {
+        float(self.centers, 3 * self.bucket(i) + axis)
+    }
+}
+
+fn float(bytes: &[u8], index: usize) -> f32 {
+    f32::from_le_bytes(bytes[4 * index..4 * index + 4].try_into().expect("four bytes"))
+}
+
+fn short(bytes: &[u8], index: usize) -> u16 {
+    u16::from_le_bytes([bytes[2 * index], bytes[2 * index + 1]])
+}
+
+/// Parses a `.ksplat` file.
+///
+/// # Errors
+/// One line when its version or level is not known, or a section is larger than the file.
+pub fn parse(bytes: &[u8]) -> Result<GaussianCloud, Malformed> {
+    let mut header = Bytes::new(bytes);
+    let mut header = Bytes::new(header.take(HEADER)?);
+    let (major, minor) = (header.u8()?, header.u8()?);
+    if major != 0 || minor < 1 {
+        return Err(Malformed(format!(
+            "not a .ksplat file of version 0.1 but {major}.{minor}"
+        )));
+    }
+    header.take(2)?;
+    let [sections, _, _, count] = [header.u32()?, header.u32()?, header.u32()?, header.u32()?];
+    let level = header.u16()?;
+    if level > 2 {
+        return Err(Malformed(format!(
+            "its compression level is {level}; expected 0, 1 or 2"
+        )));
+    }
+    header.take(2 + 12)?;
+    let [low, high] = [header.u32()?, header.u32()?].map(f32::from_bits);
+    let low = if low == 0.0 { -DEFAULT_RANGE } else { low };
+    let high = if high == 0.0 { DEFAULT_RANGE } else { high };
+
+    let sections = parse_sections(&bytes[HEADER..], sections as usize, level)?;
+    let total: usize = sections.iter().map(|s| s.rows.len() / s.row).sum();
+    if total != count as usize {
+        return Err(Malformed(format!(
+            "declares {count} splats, and its sections hold {total}; the file is damaged"
+        )));
+    }
+    let degree = sections.iter().map(|s| s.degree).max().unwrap_or(0);
+    let (number, coefficient) = sizes(level);
+    let logits = logits_of_bytes();
+    Ok(decode_splats(total, degree, |i, splat| {
+        let section = &sections[sections.partition_point(|s| s.first <= i) - 1];
+        let i = i - section.first;
+        let row = &section.rows[i * section.row..(i + 1) * section.row];
+        let (numbers, rest) = row.split_at(10 * number);
+        let value = |k: usize| match level {
+            0 => float(numbers, k),
+            _ => from_half(short(numbers, k)),
+        };
+        for c in 0..3 {
+            splat.mean[c] = match level {
+                0 => float(numbers, c),
+                _ => f32::from(short(numbers, c)).mul_add(section.unit, section.zero) + section.center(i, c),
+            };
+            splat.log_scale[c] = value(3 + c).ln();
+            splat.sh[c] = dc_of_byte(rest[c]);
+        }
+        *splat.quat = std::array::from_fn(|c| value(6 + c));
+        *splat.opacity_logit = logits[usize::from(rest[3])];
+        let rest = &rest[4..];
+        for (k, to) in splat.sh[3..3 * sh::coefficients(section.degree)]
+            .chunks_exact_mut(3)
+            .enumerate()
+        {
+            for (to, place) in to.iter_mut().zip(places(k)) {
+                *to = match coefficient {
+                    4 => float(rest, place),
+                    2 => from_half(short(rest, place)),
+                    _ => low + f32::from(rest[place]) / 255.0 * (high - low),
+                };
+            }
+        }
+    }))
+}
+
+/// The sections, each with as many splats as its part of the file holds.
+fn parse_sections(bytes: &[u8], count: usize, level: u16) -> Result<Vec<Section<'_>>, Malformed> {
+    let mut body = Bytes::new(bytes);
+    let headers = body.take(count.saturating_mul(SECTION))?;
+    let (number, coefficient) = sizes(level);
+    let mut sections = Vec::new();
+    let mut first = 0;
+    for (index, header) in headers.chunks_exact(SECTION).enumerate() {
+        let wrong = |what: String| Malformed(format!("its section {index} {what}; the file is damaged"));
+        let mut header = Bytes::new(header);
+        let [splats, room, bucket_size, buckets] = [header.u32()?, header.u32()?, header.u32()?, header.u32()?];
+        let block = f32::from_bits(header.u32()?);
+        let bucket_bytes = header.u16()?;
+        header.take(2)?;
+        let steps = header.u32()?;
+        header.take(4)?;
+        let [full, partial] = [header.u32()?, header.u32()?].map(|v| v as usize);
+        let degree = u32::from(header.u16()?);
+        if degree > 3 {
+            return Err(wrong(format!("declares spherical harmonics of degree {degree}")));
+        }
+        if splats > room {
+            return Err(wrong(format!("declares {splats} splats in the space of {room}")));
+        }
+        let row = 10 * number + 4 + 3 * (sh::coefficients(degree) - 1) * coefficient;
+        let lengths = body.take(4usize.saturating_mul(partial))?;
+        let centers = body.take(usize::from(bucket_bytes).saturating_mul(buckets as usize))?;
+        let rows = body.take(row.saturating_mul(room as usize))?;
+        let (splats, bucket_size) = (splats as usize, bucket_size as usize);
+        let in_full = full.saturating_mul(bucket_size);
+        let mut starts = vec![0];
+        for length in lengths.chunks_exact(4) {
+            let length = u32::from_le_bytes(length.try_into().expect("four bytes")) as usize;
+            starts.push(starts[starts.len() - 1] + length);
+        }
+        let in_partial = starts.pop().unwrap_or(0);
+        // Only compressed positions are about the centres.
+        if level > 0 {
+            if in_full.saturating_add(in_partial) < splats {
+                return Err(wrong(format!("declares {splats} splats, and its buckets hold fewer")));
+            }
+            if bucket_bytes != 12 || (buckets as usize) < full.saturating_add(partial) {
+                return Err(wrong(format!(
+                    "declares {buckets} centres of {bucket_bytes} bytes for its buckets"
+                )));
+            }
+        }
+        let steps = if steps == 0 { STEPS } else { steps };
+        let unit = block / 2.0 / steps as f32;
+        sections.push(Section {
+            first,
+            degree,
+            rows: &rows[..row * splats],
+            row,
+            unit,
+            zero: -(steps as f32) * unit,
+            in_full,
+            bucket_size: bucket_size.max(1),
+            full,
+            starts,
+            centers,
+        });
+        first += splats;
+    }
+    Ok(sections)
+}
+
+/// Writes `cloud`: the best quality is level 0, the lowest level 2.
+pub(crate) fn write(out: &mut dyn Write, cloud: &GaussianCloud, quality: Quality) -> io::Result<()> {
+    let level: u16 = match quality {
+        Quality::High => 0,
+        Quality::Normal => 1,
+        Quality::Low => 2,
+    };
+    let (degree, width) = (cloud.sh_degree.min(2), 3 * cloud.sh_coefficients());
+    let rest = sh::coefficients(degree) - 1;
+    let (number, coefficient) = sizes(level);
+    let row = 10 * number + 4 + 3 * rest * coefficient;
+    let buckets = match level {
+        0 => Buckets::none(cloud.len()),
+        _ => Buckets::of(&cloud.means),
+    };
+    let above_dc = |i: usize| &cloud.sh[i * width + 3..i * width + 3 + 3 * rest];
+    let (low, high) = (0..cloud.len())
+        .flat_map(above_dc)
+        .fold((0f32, 0f32), |(low, high), v| (low.min(*v), high.max(*v)));
+    // Zero would mean the default.
+    let (low, high) = (low.min(-1e-3), high.max(1e-3));
+
+    let count = cloud.len() as u32;
+    let mut header = vec![0; HEADER + SECTION];
+    let put = |to: &mut [u8], at: usize, word: u32| to[at..at + 4].copy_from_slice(&word.to_le_bytes());
+    header[1] = 1;
+    for (at, word) in [(4, 1), (8, 1), (12, count), (16, count), (20, level.into())] {
+        put(&mut header, at, word);
+    }
+    put(&mut header, 36, low.to_bits());
+    put(&mut header, 40, high.to_bits());
+    let stored = buckets.centers.len();
+    let bucket_bytes = 4 * buckets.partial.len() + 12 * stored;
+    for (at, word) in [
+        (0, count),
+        (4, count),
+        (8, BUCKET as u32),
+        (12, stored as u32),
+        (16, buckets.block.to_bits()),
+        (20, if level > 0 { 12 } else { 0 }),
+        (24, if level > 0 { STEPS } else { 1 }),
+        (28, (bucket_bytes + row * cloud.len()) as u32),
+        (32, (stored - buckets.partial.len()) as u32),
+        (36, buckets.partial.len() as u32),
+        (40, degree),
+    ] {
+        put(&mut header, HEADER + at, word);
+    }
+    out.write_all(&header)?;
+    for length in &buckets.partial {
+        out.write_all(&length.to_le_bytes())?;
+    }
+    for value in buckets.centers.as_flattened() {
+        out.write_all(&value.to_le_bytes())?;
+    }
+    let unit = buckets.block / 2.0 / STEPS as f32;
+    out.write_all(&encode_rows(cloud.len(), row, |at, row| {
+        let (i, bucket) = buckets.order[at];
+        let (i, bucket) = (i as usize, bucket as usize);
+        let shape = cloud.log_scales[i]
+            .map(f32::exp)
+            .into_iter()
+            .chain(normalized(cloud.quats[i]));
+        let (numbers, colors) = row.split_at_mut(10 * number);
+        if level == 0 {
+            let values = cloud.means[i].into_iter().chain(shape);
+            for (to, value) in numbers.chunks_exact_mut(4).zip(values) {
+                to.copy_from_slice(&value.to_le_bytes());
+            }
+        } else {
+            let center = buckets.centers[bucket];
+            let position = (0..3).map(|c| {
+                let steps = ((cloud.means[i][c] - center[c]) / unit).round() + STEPS as f32;
+                steps.clamp(0.0, 65535.0) as u16
+            });
+            for (to, value) in numbers.chunks_exact_mut(2).zip(position.chain(shape.map(half))) {
+                to.copy_from_slice(&value.to_le_bytes());
+            }
+        }
+        for c in 0..3 {
+            colors[c] = color_byte(cloud.sh[i * width + c]);
+        }
+        colors[3] = opacity_byte(cloud.opacity_logits[i]);
+        let to = &mut colors[4..];
+        for (k, triple) in above_dc(i).chunks_exact(3).enumerate() {
+            for (value, place) in triple.iter().zip(places(k)) {
+                let to = &mut to[place * coefficient..(place + 1) * coefficient];
+                match coefficient {
+                    4 => to.copy_from_slice(&value.to_le_bytes()),
+                    2 => to.copy_from_slice(&half(*value).to_le_bytes()),
+                    _ => to[0] = byte((value - low) / (high - low) * 255.0),
+                }
+            }
+        }
+    }))
+}
+
+/// Splats by blocks of space, at most [`BUCKET`] in each: full buckets first.
+struct Buckets {
+    /// Side of a block.
+    block: f32,
+    /// Splat and bucket, in the order of the file.
+    order: Vec<(u32, u32)>,
+    centers: Vec<[f32; 3]>,
+    /// Splats of the buckets that are not full.
+    partial: Vec<u32>,
+}
+
+impl Buckets {
+    fn none(count: usize) -> Self {
+        Self {
+            block: MAX_BLOCK,
+            order: (0..count as u32).map(|i| (i, 0)).collect(),
+            centers: Vec::new(),
+            partial: Vec::new(),
+        }
+    }
+
+    fn of(means: &[[f32; 3]]) -> Self {
+        let (low, high) = bounds(means);
+        let extents: [f32; 3] = std::array::from_fn(|c| high[c] - low[c]);
+        let longest = extents.into_iter().fold(1e-6, f32::max);
+        let volume: f32 = extents.into_iter().map(|extent| extent.max(1e-3 * longest)).product();
+        // A block that holds a bucket's splats, were they spread evenly, and that floats resolve.
+        let even = (volume * BUCKET as f32 / means.len().max(1) as f32).cbrt();
+        let block = even.max(1e-4 * longest).min(MAX_BLOCK);
+        let mut blocks: BTreeMap<[i64; 3], Vec<u32>> = BTreeMap::new();
+        for (i, mean) in means.iter().enumerate() {
+            let place = std::array::from_fn(|c| ((mean[c] - low[c]) / block) as i64);
+            blocks.entry(place).or_default().push(i as u32);
+        }
+        let (mut full, mut partial) = (Vec::new(), Vec::new());
+        for (place, splats) in &blocks {
+            for bucket in splats.chunks(BUCKET) {
+                match bucket.len() == BUCKET {
+                    true => full.push((place, bucket)),
+                    false => partial.push((place, bucket)),
+                }
+            }
+        }
+        let lengths = partial.iter().map(|(_, bucket)| bucket.len() as u32).collect();
+        full.append(&mut partial);
+        let center = |place: &[i64; 3]| std::array::from_fn(|c| low[c] + (place[c] as f32 + 0.5) * block);
+        Self {
+            block,
+            centers: full.iter().map(|(place, _)| center(place)).collect(),
+            order: full
+                .iter()
+                .enumerate()
+                .flat_map(|(bucket, (_, splats))| splats.iter().map(move |i| (*i, bucket as u32)))
+                .collect(),
+            partial: lengths,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn coefficients_are_band_by_band_and_red_first() {
+        assert_eq!(places(0), [0, 3, 6]);
+        assert_eq!(places(2), [2, 5, 8]);
+        assert_eq!(places(3), [9, 14, 19]);
+        assert_eq!(places(7), [13, 18, 23]);
+        assert_eq!(places(8), [24, 31, 38]);
+    }
+
+    #[test]
+    fn every_splat_is_in_one_bucket_and_full_ones_come_first() {
+        let means: Vec<[f32; 3]> = (0..2000)
+            .map(|i| [(i % 2) as f32 * 30.0, 0.0, (i % 7) as f32 * 1e-3])
+            .collect();
+        let buckets = Buckets::of(&means);
+        let mut seen: Vec<u32> = buckets.order.iter().map(|(i, _)| *i).collect();
+        seen.sort_unstable();
+        assert!(seen.iter().copied().eq(0..2000));
+        let full = buckets.centers.len() - buckets.partial.len();
+        assert_eq!(full * BUCKET + buckets.partial.iter().sum::<u32>() as usize, 2000);
+        for (i, bucket) in &buckets.order {
+            for c in 0..3 {
+                let distance = means[*i as usize][c] - buckets.centers[*bucket as usize][c];
+                assert!(distance.abs() <= buckets.block * 0.501, "{distance}");
+            }
+        }
+    }
+}

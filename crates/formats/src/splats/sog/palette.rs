@@ -1,0 +1,307 @@
+//! Codebooks: 256 numbers for all numbers, and a palette of vectors for all vectors. Both minimise the squared error by Lloyd's
+//! method, start from the data's own order and sum in a fixed order, so that equal scenes give equal files.
+
+use crate::splats::rows::CHUNK;
+use rayon::prelude::*;
+
+/// Bins of the histogram by which numbers are clustered.
+const BINS: usize = 1 << 16;
+/// Bins by which their density is estimated: few, so that each has many.
+const DENSITY_BINS: usize = 512;
+/// Rounds of Lloyd's method; later ones change little.
+const ROUNDS_OF_NUMBERS: usize = 30;
+const ROUNDS_OF_COARSE: usize = 10;
+const ROUNDS_OF_FINE: usize = 8;
+/// Vectors by which the coarse clusters are found.
+const SAMPLE: usize = 1 << 16;
+/// Centroids compared at a time: the compiler makes vectors of them.
+const LANES: usize = 16;
+
+/// 256 numbers in increasing order.
+pub(super) struct Codebook(pub [f32; 256]);
+
+impl Codebook {
+    /// The best numbers for `values`; what is not finite is ignored.
+    pub fn of(values: &[f32]) -> Self {
+        let finite = || values.iter().copied().filter(|v| v.is_finite());
+        let (low, high) = finite().fold((f32::MAX, f32::MIN), |(low, high), v| (low.min(v), high.max(v)));
+        if low >= high {
+            return Self([if low == high { low } else { 0.0 }; 256]);
+        }
+        let scale = (BINS - 1) as f64 / (f64::from(high) - f64::from(low));
+        let mut bins = vec![(0u64, 0f64); BINS];
+        for v in finite() {
+            let bin = &mut bins[((f64::from(v) - f64::from(low)) * scale) as usize];
+            bin.0 += 1;
+            bin.1 += f64::from(v);
+        }
+        bins.retain(|(count, _)| *count > 0);
+        let mut numbers = Self::first(&bins, low.into(), high.into());
+        for _ in 0..ROUNDS_OF_NUMBERS {
+            let mut sums = [(0u64, 0f64); 256];
+            let mut nearest = 0;
+            for (count, sum) in &bins {
+                let mean = sum / *count as f64;
+                // Bins increase, and so does the nearest number.
+                while nearest < 255 && mean - numbers[nearest] > numbers[nearest + 1] - mean {
+                    nearest += 1;
+                }
+                sums[nearest].0 += count;
+                sums[nearest].1 += sum;
+            }
+            for (number, (count, sum)) in numbers.iter_mut().zip(sums) {
+                if count > 0 {
+                    *number = sum / count as f64;
+                }
+            }
+            numbers.sort_unstable_by(f64::total_cmp);
+        }
+        Self(std::array::from_fn(|i| numbers[i] as f32))
+    }
+
+    /// 256 numbers to begin with: where the cube root of the density has its quantiles, which is the best there is for many numbers
+    /// (Panter and Dite 1951).
+    fn first(bins: &[(u64, f64)], low: f64, high: f64) -> Vec<f64> {
+        let mut density = [0u64; DENSITY_BINS];
+        let width = (high - low) / DENSITY_BINS as f64;
+        for (count, sum) in bins {
+            let place = (sum / *count as f64 - low) / width;
+            density[(place as usize).min(DENSITY_BINS - 1)] += count;
+        }
+        let weights = density.map(|count| (count as f64).cbrt());
+        let total: f64 = weights.iter().sum();
+        let mut numbers = Vec::with_capacity(256);
+        let mut below = 0.0;
+        for (i, weight) in weights.into_iter().enumerate() {
+            let quantile = |count: usize| (count as f64 + 0.5) / 256.0 * total;
+            while numbers.len() < 256 && quantile(numbers.len()) <= below + weight {
+                let part = (quantile(numbers.len()) - below) / weight;
+                numbers.push(low + (i as f64 + part) * width);
+            }
+            below += weight;
+        }
+        numbers.resize(256, high);
+        numbers
+    }
+
+    /// The index of the number nearest to `value`.
+    pub fn index(&self, value: f32) -> u8 {
+        let above = self.0.partition_point(|number| *number < value).clamp(1, 255);
+        let nearer_below = value - self.0[above - 1] <= self.0[above] - value;
+        (above - usize::from(nearer_below)) as u8
+    }
+}
+
+/// Vectors, and for each vector of the scene which of them stands for it.
+pub(super) struct Palette {
+    /// `[entries, width]`
+    pub entries: Vec<f32>,
+    pub labels: Vec<u16>,
+}
+
+impl Palette {
+    /// At most `most` entries (65,536 or fewer) for `vectors` of `width` numbers.
+    ///
+    /// In two steps: the square root of `most` coarse clusters, then each by itself, with as many entries as its share of the error
+    /// asks for. This compares a vector with hundreds of centroids where one step would with tens of thousands.
+    pub fn of(vectors: &[f32], width: usize, most: usize) -> Self {
+        let count = vectors.len() / width;
+        if count <= most {
+            return Self {
+                entries: vectors.to_vec(),
+                labels: (0..count).map(|i| i as u16).collect(),
+            };
+        }
+        let vector = |i: usize| &vectors[i * width..(i + 1) * width];
+        let step = count.div_ceil(SAMPLE);
+        let sample: Vec<u32> = (0..count as u32).step_by(step).collect();
+        let coarse = lloyd(vectors, width, &sample, (most as f64).sqrt() as usize, ROUNDS_OF_COARSE);
+        let nearest: Vec<(u32, f32)> = (0..count)
+            .into_par_iter()
+            .with_min_len(CHUNK / 16)
+            .map(|i| coarse.nearest(vector(i)))
+            .collect();
+        let mut members = vec![Vec::new(); coarse.count];
+        let mut errors = vec![0f64; coarse.count];
+        for (i, (cluster, error)) in nearest.into_iter().enumerate() {
+            members[cluster as usize].push(i as u32);
+            errors[cluster as usize] += f64::from(error.max(0.0));
+        }
+        let shares = shares(&members, &errors, most);
+        let fine: Vec<(Centroids, Vec<u32>)> = members
+            .par_iter()
+            .zip(shares)
+            .with_max_len(1)
+            .map(|(members, share)| {
+                let centroids = lloyd(vectors, width, members, share, ROUNDS_OF_FINE);
+                let labels = members
+                    .iter()
+                    .map(|i| centroids.nearest(vector(*i as usize)).0)
+                    .collect();
+                (centroids, labels)
+            })
+            .collect();
+        let mut palette = Self {
+            entries: Vec::with_capacity(most * width),
+            labels: vec![0; count],
+        };
+        for ((centroids, labels), members) in fine.iter().zip(&members) {
+            let first = palette.entries.len() / width;
+            for (i, label) in members.iter().zip(labels) {
+                palette.labels[*i as usize] = (first + *label as usize) as u16;
+            }
+            (0..centroids.count).for_each(|c| palette.entries.extend(centroids.get(c)));
+        }
+        palette
+    }
+}
+
+/// Entries for each cluster, `most` in all: one, and the rest by the error and the number of its members, never more than members.
+fn shares(members: &[Vec<u32>], errors: &[f64], most: usize) -> Vec<usize> {
+    let total: f64 = errors.iter().sum::<f64>().max(f64::MIN_POSITIVE);
+    let count: usize = members.iter().map(Vec::len).sum();
+    let spare = (most - members.len().min(most)) as f64;
+    let share = |(members, error): (&Vec<u32>, &f64)| {
+        let part = 0.5 * error / total + 0.5 * members.len() as f64 / count as f64;
+        (1 + (part * spare) as usize).min(members.len())
+    };
+    members.iter().zip(errors).map(share).collect()
+}
+
+/// Centroids in blocks of [`LANES`]: number by number, those of a block side by side.
+struct Centroids {
+    count: usize,
+    width: usize,
+    blocks: Vec<[f32; LANES]>,
+    /// Half the squared length of each; infinite where a block has no centroid.
+    halves: Vec<[f32; LANES]>,
+}
+
+impl Centroids {
+    fn new(width: usize, centroids: &[Vec<f32>]) -> Self {
+        let mut blocks = vec![[0.0; LANES]; centroids.len().div_ceil(LANES) * width];
+        let mut halves = vec![[f32::INFINITY; LANES]; centroids.len().div_ceil(LANES)];
+        for (i, centroid) in centroids.iter().enumerate() {
+            for (k, value) in centroid.iter().enumerate() {
+                blocks[i / LANES * width + k][i % LANES] = *value;
+            }
+            halves[i / LANES][i % LANES] = 0.5 * centroid.iter().map(|v| v * v).sum::<f32>();
+        }
+        Self {
+            count: centroids.len(),
+            width,
+            blocks,
+            halves,
+        }
+    }
+
+    fn get(&self, i: usize) -> impl Iterator<Item = f32> {
+        let block = &self.blocks[i / LANES * self.width..][..self.width];
+        block.iter().map(move |lanes| lanes[i % LANES])
+    }
+
+    /// The nearest centroid, and the squared distance to it.
+    fn nearest(&self, vector: &[f32]) -> (u32, f32) {
+        let (mut best, mut at) = (f32::INFINITY, 0);
+        for (block, (numbers, halves)) in self.blocks.chunks_exact(self.width).zip(&self.halves).enumerate() {
+            // Half the squared distance, less half the squared length of the vector.
+            let mut distances = *halves;
+            for (value, lanes) in vector.iter().zip(numbers) {
+                for (distance, number) in distances.iter_mut().zip(lanes) {
+                    *distance -= value * number;
+                }
+            }
+            for (lane, distance) in distances.into_iter().enumerate() {
+                if distance < best {
+                    (best, at) = (distance, block * LANES + lane);
+                }
+            }
+        }
+        (at as u32, 2.0 * best + vector.iter().map(|v| v * v).sum::<f32>())
+    }
+}
+
+/// Lloyd's method on the vectors `members`, from every n-th of them.
+fn lloyd(vectors: &[f32], width: usize, members: &[u32], count: usize, rounds: usize) -> Centroids {
+    let vector = |i: u32| &vectors[i as usize * width..][..width];
+    let count = count.min(members.len());
+    let mut centroids: Vec<Vec<f32>> = (0..count)
+        .map(|k| vector(members[k * members.len() / count.max(1)]).to_vec())
+        .collect();
+    for _ in 0..rounds {
+        let packed = Centroids::new(width, &centroids);
+        let labels: Vec<u32> = members
+            .par_iter()
+            .with_min_len(1024)
+            .map(|i| packed.nearest(vector(*i)).0)
+            .collect();
+        let mut sums = vec![0f32; count * width];
+        let mut counts = vec![0u32; count];
+        for (i, label) in members.iter().zip(labels) {
+            counts[label as usize] += 1;
+            let sum = &mut sums[label as usize * width..][..width];
+            sum.iter_mut().zip(vector(*i)).for_each(|(sum, v)| *sum += v);
+        }
+        for ((centroid, sum), count) in centroids.iter_mut().zip(sums.chunks_exact(width)).zip(counts) {
+            if count > 0 {
+                let mean = sum.iter().map(|v| v / count as f32);
+                centroid.iter_mut().zip(mean).for_each(|(to, v)| *to = v);
+            }
+        }
+    }
+    Centroids::new(width, &centroids)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use irradia_scene::Rng;
+
+    #[test]
+    fn few_numbers_are_kept_and_many_are_near() {
+        let few: Vec<f32> = (0..1000).map(|i| [-7.0, 0.25, 3.5][i % 3]).collect();
+        let codebook = Codebook::of(&few);
+        assert!(few.iter().all(|v| codebook.0[usize::from(codebook.index(*v))] == *v));
+        let mut rng = Rng::new(4, 1);
+        let many: Vec<f32> = (0..50_000)
+            .map(|_| (0..6).map(|_| rng.uniform()).sum::<f32>() - 3.0)
+            .collect();
+        let codebook = Codebook::of(&many);
+        assert!(codebook.0.is_sorted());
+        let squares: f64 = many
+            .iter()
+            .map(|v| f64::from(v - codebook.0[usize::from(codebook.index(*v))]).powi(2))
+            .sum();
+        // Panter and Dite's bound for a normal density of this variance is sqrt(3) pi / 2 / 256^2 of it.
+        let bound = 0.5 * 2.72 / 65536.0;
+        assert!(
+            squares / many.len() as f64 <= 1.1 * bound,
+            "{}",
+            squares / many.len() as f64
+        );
+        assert_eq!(Codebook::of(&[f32::NAN]).0, [0.0; 256]);
+        assert_eq!(Codebook::of(&[2.0, f32::INFINITY]).0, [2.0; 256]);
+    }
+
+    #[test]
+    fn clusters_are_found_and_do_not_depend_on_threads() {
+        let mut rng = Rng::new(5, 1);
+        // 64 clusters of width 3, far apart.
+        let vectors: Vec<f32> = (0..20_000usize)
+            .flat_map(|i| [i % 4, i / 4 % 4, i / 16 % 4].map(|v| v as f32 * 10.0))
+            .map(|v| v + rng.range(-0.5, 0.5))
+            .collect();
+        let palette = Palette::of(&vectors, 3, 1024);
+        assert!(palette.entries.len() <= 1024 * 3);
+        let worst = vectors.chunks_exact(3).zip(&palette.labels).map(|(vector, label)| {
+            let entry = &palette.entries[usize::from(*label) * 3..][..3];
+            vector.iter().zip(entry).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max)
+        });
+        assert!(worst.fold(0.0, f32::max) < 1.0);
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
+        let alone = pool.install(|| Palette::of(&vectors, 3, 1024));
+        assert!(alone.entries == palette.entries && alone.labels == palette.labels);
+        let exact = Palette::of(&vectors[..30], 3, 1024);
+        assert_eq!((exact.entries.len(), exact.labels[9]), (30, 9));
+    }
+}

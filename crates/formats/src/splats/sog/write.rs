@@ -1,0 +1,162 @@
+use super::palette::{Codebook, Palette};
+use super::{LARGEST_W, META, ROW};
+use crate::splats::Quality;
+use crate::splats::quantize::{byte, opacity_byte, smallest_three};
+use crate::splats::rows::{bounds, encode_rows, morton_order};
+use image_webp::{ColorType, EncoderParams, WebPEncoder};
+use irradia_scene::{GaussianCloud, sh};
+use rayon::prelude::*;
+use serde_json::json;
+use std::io;
+
+/// Names and contents of a scene's files.
+type Files = Vec<(&'static str, Vec<u8>)>;
+
+/// An image to be encoded: name, width, height, channels (3 or 4), pixels.
+type Image = (&'static str, usize, usize, usize, Vec<u8>);
+
+/// The files of `cloud` in version 2; the quality limits the palette of the harmonics.
+///
+/// # Errors
+/// When an image cannot be encoded: more than 16,384 pixels a side.
+pub(crate) fn encode(cloud: &GaussianCloud, quality: Quality) -> io::Result<Files> {
+    let count = cloud.len();
+    let width = 3 * cloud.sh_coefficients();
+    let order = morton_order(&cloud.means);
+    // Sides are multiples of four, as other writers make them.
+    let columns = ((count as f64).sqrt() / 4.0).ceil().max(1.0) as usize * 4;
+    let lines = (count as f64 / columns as f64 / 4.0).ceil().max(1.0) as usize * 4;
+    let image = |name, channels: usize, encode: &(dyn Fn(usize, &mut [u8]) + Sync)| -> Image {
+        let mut pixels = encode_rows(count, channels, |at, pixel| encode(order[at] as usize, pixel));
+        pixels.resize(columns * lines * channels, 0);
+        (name, columns, lines, channels, pixels)
+    };
+
+    let logarithm = |v: f32| v.abs().ln_1p().copysign(v);
+    let (low, high) = bounds(&cloud.means);
+    let (low, high) = (low.map(logarithm), high.map(logarithm));
+    let steps = |i: usize, c: usize| {
+        let extent = f64::from(high[c]) - f64::from(low[c]);
+        let t = (f64::from(logarithm(cloud.means[i][c])) - f64::from(low[c])) / extent.max(f64::MIN_POSITIVE);
+        ((t * 65535.0).round() as u16).to_le_bytes()
+    };
+    let scales = Codebook::of(cloud.log_scales.as_flattened());
+    let colors: Vec<f32> = cloud
+        .sh
+        .chunks_exact(width)
+        .flat_map(|sh| [sh[0], sh[1], sh[2]])
+        .collect();
+    let colors = Codebook::of(&colors);
+    let dc = |i: usize, c: usize| cloud.sh[i * width + c];
+    let mut images = vec![
+        image("means_l.webp", 3, &|i, pixel| {
+            (0..3).for_each(|c| pixel[c] = steps(i, c)[0])
+        }),
+        image("means_u.webp", 3, &|i, pixel| {
+            (0..3).for_each(|c| pixel[c] = steps(i, c)[1])
+        }),
+        image("scales.webp", 3, &|i, pixel| {
+            (0..3).for_each(|c| pixel[c] = scales.index(cloud.log_scales[i][c]))
+        }),
+        image("quats.webp", 4, &|i, pixel| {
+            let (largest, others) = smallest_three(cloud.quats[i]);
+            let others = others.map(|v| byte((v * std::f32::consts::FRAC_1_SQRT_2 + 0.5) * 255.0));
+            pixel[..3].copy_from_slice(&others);
+            pixel[3] = LARGEST_W + largest as u8;
+        }),
+        image("sh0.webp", 4, &|i, pixel| {
+            (0..3).for_each(|c| pixel[c] = colors.index(dc(i, c)));
+            pixel[3] = opacity_byte(cloud.opacity_logits[i]);
+        }),
+    ];
+    let mut meta = json!({
+        "version": 2,
+        "asset": { "generator": "Irradia" },
+        "antialias": cloud.antialiased,
+        "count": count,
+        "means": { "mins": low, "maxs": high, "files": ["means_l.webp", "means_u.webp"] },
+        "scales": { "codebook": &scales.0[..], "files": ["scales.webp"] },
+        "quats": { "files": ["quats.webp"] },
+        "sh0": { "codebook": &colors.0[..], "files": ["sh0.webp"] },
+    });
+
+    // The format stops at degree 3.
+    let degree = cloud.sh_degree.min(3);
+    if degree > 0 && count > 0 {
+        let rest = 3 * (sh::coefficients(degree) - 1);
+        let vectors: Vec<f32> = order
+            .par_iter()
+            .flat_map_iter(|i| cloud.sh[*i as usize * width + 3..][..rest].iter().copied())
+            .collect();
+        let palette = Palette::of(&vectors, rest, palette_size(count, quality));
+        let codebook = Codebook::of(&palette.entries);
+        let entries = palette.entries.len() / rest;
+        let mut pixels: Vec<u8> = palette.entries.iter().map(|v| codebook.index(*v)).collect();
+        let rows = entries.div_ceil(ROW);
+        pixels.resize(rows * ROW * rest, 0);
+        images.push(("shN_centroids.webp", ROW * rest / 3, rows, 3, pixels));
+        let mut labels: Vec<u8> = palette
+            .labels
+            .iter()
+            .flat_map(|label| {
+                let [low, high] = label.to_le_bytes();
+                [low, high, 0]
+            })
+            .collect();
+        labels.resize(columns * lines * 3, 0);
+        images.push(("shN_labels.webp", columns, lines, 3, labels));
+        meta["shN"] = json!({
+            "count": entries,
+            "bands": degree,
+            "codebook": &codebook.0[..],
+            "files": ["shN_centroids.webp", "shN_labels.webp"],
+        });
+    }
+    let mut files: Files = images
+        .into_par_iter()
+        .map(|(name, width, height, channels, pixels)| Ok((name, webp(&pixels, width, height, channels)?)))
+        .collect::<io::Result<_>>()?;
+    // Last, so that a folder with it is complete.
+    files.push((META, serde_json::to_vec(&meta).map_err(io::Error::other)?));
+    Ok(files)
+}
+
+/// Entries of the palette: a power of two below the number of splats.
+fn palette_size(count: usize, quality: Quality) -> usize {
+    let most = match quality {
+        Quality::Low => 4096,
+        Quality::Normal => 16_384,
+        Quality::High => 65_536,
+    };
+    match count {
+        ..=1024 => count,
+        _ => (count.next_power_of_two() / 2).min(most),
+    }
+}
+
+/// An image in lossless WebP, the smaller of two encodings: differences from the neighbours suit what is smooth, plain values indices.
+fn webp(pixels: &[u8], width: usize, height: usize, channels: usize) -> io::Result<Vec<u8>> {
+    let color = if channels == 4 {
+        ColorType::Rgba8
+    } else {
+        ColorType::Rgb8
+    };
+    let encode = |predicts: bool| {
+        let mut bytes = Vec::new();
+        let mut encoder = WebPEncoder::new(&mut bytes);
+        let mut params = EncoderParams::default();
+        params.use_predictor_transform = predicts;
+        encoder.set_params(params);
+        match encoder.encode(pixels, width as u32, height as u32, color) {
+            Ok(()) => Ok(bytes),
+            Err(error) => Err(io::Error::other(format!("{width}x{height} pixels: {error}"))),
+        }
+    };
+    let (plain, predicted) = rayon::join(|| encode(false), || encode(true));
+    let (plain, predicted) = (plain?, predicted?);
+    Ok(if predicted.len() < plain.len() {
+        predicted
+    } else {
+        plain
+    })
+}

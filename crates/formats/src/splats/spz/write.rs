@@ -1,0 +1,175 @@
+use super::*;
+use crate::gzip;
+use crate::splats::axes::Signs;
+use crate::splats::quantize::{byte, normalized, opacity_byte, smallest_three};
+use crate::splats::rows::{encode_rows, morton_order};
+use crate::splats::{Quality, SpzVersion};
+use irradia_scene::{GaussianCloud, sh};
+use rayon::prelude::*;
+use ruzstd::encoding::{CompressionLevel, compress_to_vec};
+use std::io::{self, Write};
+
+/// Positions have 24 bits, of which at least this many before the point are never needed.
+const MAX_FRACTION_BITS: i32 = 20;
+
+/// Writes `cloud`; the quality chooses the bits of the coefficients above DC.
+pub(crate) fn write(
+    out: &mut dyn Write,
+    cloud: &GaussianCloud,
+    quality: Quality,
+    version: SpzVersion,
+) -> io::Result<()> {
+    out.write_all(&encode(cloud, quality, version))
+}
+
+/// The bytes of a file.
+pub(crate) fn encode(cloud: &GaussianCloud, quality: Quality, version: SpzVersion) -> Vec<u8> {
+    let header = Header {
+        version: match version {
+            SpzVersion::V2 => 2,
+            SpzVersion::V3 => 3,
+            SpzVersion::V4 => 4,
+        },
+        count: u32::try_from(cloud.len()).expect("fewer than 2^32 splats"),
+        // Readers of version 2 know no more.
+        degree: cloud.sh_degree.min(if version == SpzVersion::V2 { 3 } else { 4 }) as u8,
+        fraction_bits: fraction_bits(&cloud.means),
+        flags: if cloud.antialiased { ANTIALIASED } else { 0 },
+    };
+    let arrays = arrays(cloud, &header, quality);
+    let mut bytes = MAGIC.to_vec();
+    bytes.extend(header.version.to_le_bytes());
+    bytes.extend(header.count.to_le_bytes());
+    bytes.extend([header.degree, header.fraction_bits, header.flags]);
+    if version == SpzVersion::V4 {
+        let arrays: Vec<Vec<u8>> = arrays.into_iter().filter(|array| !array.is_empty()).collect();
+        let packed: Vec<Vec<u8>> = arrays
+            .par_iter()
+            .map(|array| compress_to_vec(&array[..], CompressionLevel::Fastest))
+            .collect();
+        bytes.push(arrays.len() as u8);
+        bytes.extend(32u32.to_le_bytes());
+        bytes.extend([0; 12]);
+        for (array, packed) in arrays.iter().zip(&packed) {
+            bytes.extend((packed.len() as u64).to_le_bytes());
+            bytes.extend((array.len() as u64).to_le_bytes());
+        }
+        packed.iter().for_each(|packed| bytes.extend_from_slice(packed));
+        return bytes;
+    }
+    bytes.push(0);
+    arrays.iter().for_each(|array| bytes.extend_from_slice(array));
+    gzip(&bytes)
+}
+
+/// As many bits after the point as the farthest coordinate leaves: a small scene is stored finely, a large one whole.
+fn fraction_bits(means: &[[f32; 3]]) -> u8 {
+    let farthest = means.as_flattened().iter().fold(0f32, |most, v| most.max(v.abs()));
+    let before = (farthest.max(f32::MIN_POSITIVE)).log2().floor() as i32 + 1;
+    (23 - before).clamp(0, MAX_FRACTION_BITS) as u8
+}
+
+/// The six arrays, along a Morton curve, which compresses better.
+fn arrays(cloud: &GaussianCloud, header: &Header, quality: Quality) -> [Vec<u8>; 6] {
+    let widths = header.widths();
+    let (count, width) = (cloud.len(), 3 * cloud.sh_coefficients());
+    let order = morton_order(&cloud.means);
+    let steps = f32::from(header.fraction_bits).exp2();
+    let (bits_of_first, bits_of_rest) = match quality {
+        Quality::Low => (4, 3),
+        // The format's own.
+        Quality::Normal => (5, 4),
+        Quality::High => (8, 8),
+    };
+    let signs = Signs::HALF_TURN_X;
+    let (bands, first_band) = (signs.bands(), 3 * (sh::coefficients(1) - 1));
+    let array = |which: usize, encode: &(dyn Fn(usize, &mut [u8]) + Sync)| {
+        encode_rows(count, widths[which], |at, row| encode(order[at] as usize, row))
+    };
+    [
+        array(0, &|i, row| {
+            for (to, value) in row.chunks_exact_mut(3).zip(signs.position(cloud.means[i])) {
+                let fixed = (value * steps).round().clamp(-8_388_608.0, 8_388_607.0) as i32;
+                to.copy_from_slice(&fixed.to_le_bytes()[..3]);
+            }
+        }),
+        array(1, &|i, row| row[0] = opacity_byte(cloud.opacity_logits[i])),
+        array(2, &|i, row| {
+            for (to, dc) in row.iter_mut().zip(&cloud.sh[i * width..]) {
+                *to = byte((dc * COLOR_SCALE + 0.5) * 255.0);
+            }
+        }),
+        array(3, &|i, row| {
+            for (to, scale) in row.iter_mut().zip(cloud.log_scales[i]) {
+                *to = byte((scale + SCALE_OFFSET) * SCALE_STEPS);
+            }
+        }),
+        array(4, &|i, row| {
+            let quat = signs.quat(cloud.quats[i]);
+            match row.len() {
+                3 => row.copy_from_slice(&first_three(quat)),
+                _ => row.copy_from_slice(&rotation_bits(quat).to_le_bytes()),
+            }
+        }),
+        array(5, &|i, row| {
+            let rest = &cloud.sh[i * width + 3..(i + 1) * width];
+            for (k, (to, value)) in row.iter_mut().zip(rest).enumerate() {
+                let bits = if k < first_band { bits_of_first } else { bits_of_rest };
+                *to = harmonic_byte(value * bands[k / 3], bits);
+            }
+        }),
+    ]
+}
+
+/// The nearest multiple of `2^(8 - bits)`, which compresses better the fewer bits it has.
+fn harmonic_byte(value: f32, bits: u32) -> u8 {
+    let bucket = 1 << (8 - bits);
+    let fine = (value * 128.0).round() as i32 + 128;
+    ((fine.clamp(-256, 512) + bucket / 2).div_euclid(bucket) * bucket).clamp(0, 255) as u8
+}
+
+/// The index of the largest of `x, y, z, w`, and sign and nine bits of each of the others.
+fn rotation_bits(quat: [f32; 4]) -> u32 {
+    let [w, x, y, z] = normalized(quat);
+    let (largest, others) = smallest_three([x, y, z, w]);
+    others.into_iter().fold(largest as u32, |bits, value| {
+        let magnitude = (value.abs() * std::f32::consts::SQRT_2 * COMPONENT_STEPS)
+            .round()
+            .min(COMPONENT_STEPS);
+        bits << 10 | u32::from(value < 0.0) << 9 | magnitude as u32
+    })
+}
+
+/// Version 2: x, y, z with a positive w.
+fn first_three(quat: [f32; 4]) -> [u8; 3] {
+    let quat = normalized(quat);
+    let factor = if quat[0] < 0.0 { -127.5 } else { 127.5 };
+    [1, 2, 3].map(|c| byte(quat[c] * factor + 127.5))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn small_scenes_are_stored_finely() {
+        assert_eq!(fraction_bits(&[[0.0; 3]]), 20);
+        assert_eq!(fraction_bits(&[[0.9, -7.9, 0.0]]), 20);
+        assert_eq!(fraction_bits(&[[0.9, -8.1, 0.0]]), 19);
+        assert_eq!(fraction_bits(&[[2047.9, 0.0, 0.0]]), 12);
+        assert_eq!(fraction_bits(&[[1e9, 0.0, 0.0]]), 0);
+    }
+
+    #[test]
+    fn coefficients_fall_on_the_centre_of_their_bucket() {
+        // Niantic's rule: zero stays zero with any number of bits.
+        for bits in 1..=8 {
+            assert_eq!(harmonic_byte(0.0, bits), 128);
+        }
+        assert_eq!(
+            (harmonic_byte(0.5, 8), harmonic_byte(0.51, 4), harmonic_byte(9.0, 5)),
+            (192, 192, 255)
+        );
+        assert_eq!(harmonic_byte(-9.0, 3), 0);
+    }
+}

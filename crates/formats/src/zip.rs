@@ -1,0 +1,175 @@
+//! Zip archives: the files of one by name, stored or deflated, and new ones whose files are stored.
+//! APPNOTE.TXT of PKWARE, sections 4.3.7, 4.3.12 and 4.3.16. Names are only names here: nothing is extracted to a path.
+
+use crate::Malformed;
+use crate::bytes::Bytes;
+use crate::unpack::inflate;
+use flate2::Crc;
+use std::borrow::Cow;
+use std::collections::HashMap;
+
+/// Signature and fixed part of the end-of-archive record, and its maximum comment length.
+const END: &[u8] = b"PK\x05\x06";
+const END_LENGTH: usize = 22;
+const MAX_COMMENT: usize = 0xffff;
+/// Deflate shrinks nothing more than 1032-fold; a file that declares more is made to fill the memory.
+const MAX_RATIO: usize = 1032;
+
+/// A file in an archive.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Entry<'a> {
+    packed: &'a [u8],
+    size: usize,
+    is_deflated: bool,
+}
+
+impl<'a> Entry<'a> {
+    /// The content if it is stored as it is.
+    pub fn stored(&self) -> Option<&'a [u8]> {
+        (!self.is_deflated).then_some(self.packed)
+    }
+
+    /// The content, of at most `most` bytes.
+    pub fn content(&self, most: usize) -> Result<Cow<'a, [u8]>, Malformed> {
+        if self.size > most.min(self.packed.len().saturating_mul(MAX_RATIO)) {
+            return Err(Malformed(format!(
+                "declares {} bytes, unpacked from {}; at most {most} are expected",
+                self.size,
+                self.packed.len()
+            )));
+        }
+        match self.is_deflated {
+            true => inflate(self.packed, self.size).map(Cow::Owned),
+            false => Ok(Cow::Borrowed(self.packed)),
+        }
+    }
+}
+
+/// The files of the archive by name.
+pub(crate) fn files(archive: &[u8]) -> Result<HashMap<String, Entry<'_>>, Malformed> {
+    let wrong = |what: &str| Malformed(format!("not a usable zip archive: {what}"));
+    let last = archive.len().checked_sub(END_LENGTH);
+    let last = last.ok_or_else(|| wrong("it is too short"))?;
+    let first = last.saturating_sub(MAX_COMMENT);
+    let end = (first..=last).rev().find(|at| archive[*at..].starts_with(END));
+    let end = end.ok_or_else(|| wrong("its end is missing; the file is truncated, copy it again"))?;
+    let mut record = Bytes::new(&archive[end + 10..]);
+    let [count, _, start] = [u32::from(record.u16()?), record.u32()?, record.u32()?];
+    let directory = archive.get(start as usize..end);
+    let mut directory = Bytes::new(directory.ok_or_else(|| wrong("its directory is beyond its end"))?);
+    let mut files = HashMap::new();
+    for _ in 0..count {
+        // Signature, versions, flags; then method, time, checksum, sizes, lengths of the name and of what follows it.
+        if directory.take(4)? != b"PK\x01\x02" {
+            return Err(wrong("its directory is damaged"));
+        }
+        directory.take(4)?;
+        let flags = directory.u16()?;
+        let method = directory.u16()?;
+        directory.take(8)?;
+        let [packed, size] = [directory.u32()?, directory.u32()?];
+        let [name, extra, comment] = [directory.u16()?, directory.u16()?, directory.u16()?];
+        directory.take(8)?;
+        let at = directory.u32()? as usize;
+        let name = String::from_utf8_lossy(directory.take(name.into())?).into_owned();
+        directory.take(usize::from(extra) + usize::from(comment))?;
+        let is_deflated = method == 8;
+        if flags & 1 != 0 || !is_deflated && (method != 0 || packed != size) {
+            return Err(wrong(&format!(
+                "{} is encrypted or compressed by a method that is not known",
+                shown(&name)
+            )));
+        }
+        let mut local = Bytes::new(archive.get(at..).ok_or_else(|| wrong("a file is beyond its end"))?);
+        if local.take(4)? != b"PK\x03\x04" {
+            return Err(wrong(&format!("{} is not where the directory says", shown(&name))));
+        }
+        local.take(22)?;
+        let [name_length, extra] = [local.u16()?, local.u16()?];
+        local.take(usize::from(name_length) + usize::from(extra))?;
+        let entry = Entry {
+            packed: local.take(packed as usize)?,
+            size: size as usize,
+            is_deflated,
+        };
+        files.insert(name, entry);
+    }
+    Ok(files)
+}
+
+/// A name from a file, fit to be printed.
+pub(crate) fn shown(name: &str) -> String {
+    name.chars().filter(|c| !c.is_control()).take(60).collect()
+}
+
+/// An archive of `files`, stored. The time is zip's earliest, so that the same content gives the same bytes.
+///
+/// # Errors
+/// When files or archive exceed the 4 GiB of the format's classic layout.
+pub(crate) fn archive(files: &[(&str, Vec<u8>)]) -> std::io::Result<Vec<u8>> {
+    let total: usize = files
+        .iter()
+        .map(|(name, content)| 2 * name.len() + content.len() + 76)
+        .sum();
+    if total + END_LENGTH > u32::MAX as usize {
+        return Err(std::io::Error::other(
+            "a zip archive holds at most 4 GiB; choose another format",
+        ));
+    }
+    let mut bytes = Vec::with_capacity(total + END_LENGTH);
+    let mut directory = Vec::new();
+    // 1980-01-01, midnight.
+    const TIME: [u8; 4] = [0, 0, 0x21, 0];
+    for (name, content) in files {
+        let at = bytes.len() as u32;
+        let mut crc = Crc::new();
+        crc.update(content);
+        // Version 2.0, no flags, stored.
+        let mut common = vec![20, 0, 0, 0, 0, 0];
+        common.extend(TIME);
+        common.extend(crc.sum().to_le_bytes());
+        common.extend([content.len() as u32; 2].map(u32::to_le_bytes).as_flattened());
+        common.extend((name.len() as u16).to_le_bytes());
+        common.extend([0, 0]);
+        bytes.extend_from_slice(b"PK\x03\x04");
+        bytes.extend_from_slice(&common);
+        bytes.extend_from_slice(name.as_bytes());
+        bytes.extend_from_slice(content);
+        directory.extend_from_slice(b"PK\x01\x02\x14\x00");
+        directory.extend_from_slice(&common);
+        // Comment, disk, attributes.
+        directory.extend([0; 10]);
+        directory.extend(at.to_le_bytes());
+        directory.extend_from_slice(name.as_bytes());
+    }
+    let (at, count) = (bytes.len() as u32, files.len() as u16);
+    bytes.extend_from_slice(&directory);
+    bytes.extend_from_slice(END);
+    bytes.extend([0; 4]);
+    bytes.extend([count; 2].map(u16::to_le_bytes).as_flattened());
+    bytes.extend((directory.len() as u32).to_le_bytes());
+    bytes.extend(at.to_le_bytes());
+    bytes.extend([0; 2]);
+    Ok(bytes)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn stored_files_come_back() {
+        let bytes = archive(&[("a.txt", b"hello".to_vec()), ("dir/b", vec![7; 1000])]).unwrap();
+        let files = files(&bytes).unwrap();
+        assert_eq!(files.len(), 2);
+        assert_eq!(files["a.txt"].content(10).unwrap().as_ref(), b"hello");
+        assert_eq!(files["dir/b"].stored().unwrap(), [7; 1000]);
+        assert!(
+            files["dir/b"]
+                .content(999)
+                .unwrap_err()
+                .to_string()
+                .contains("at most 999")
+        );
+    }
+}

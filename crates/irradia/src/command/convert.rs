@@ -1,0 +1,80 @@
+//! `irradia convert`
+
+use crate::terminal::say;
+use anyhow::Result;
+use irradia_runs::formats::{Quality, SpzVersion, WriteOptions};
+use irradia_runs::{Conversion, convert as convert_scene};
+use std::path::PathBuf;
+
+#[derive(clap::Args)]
+pub struct ConvertArgs {
+    /// The scene to read: a splat file of any format, a folder of SOG images, or a run
+    pub input: PathBuf,
+    /// The file to write; its name selects the format: .ply, .compressed.ply, .points.ply, .spz, .splat, .ksplat, .sog, meta.json,
+    /// .glb, .spz.glb, .gltf or .npz
+    pub output: PathBuf,
+    /// How much a lossy format may lose, where it leaves the choice (.spz, .sog, .ksplat)
+    #[arg(long, value_enum, default_value_t = QualityArg::Normal)]
+    pub quality: QualityArg,
+    /// Version of .spz files
+    #[arg(long, value_name = "3|4", default_value_t = 3, value_parser = clap::value_parser!(u8).range(3..=4))]
+    pub spz_version: u8,
+    /// Do not render the scene before and after to measure the loss
+    #[arg(long)]
+    pub no_compare: bool,
+}
+
+/// [`Quality`] on the command line.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+pub enum QualityArg {
+    /// Smaller
+    Low,
+    /// The format's own default
+    Normal,
+    /// The most that the format allows
+    High,
+}
+
+pub fn convert(args: &ConvertArgs) -> Result<()> {
+    let options = WriteOptions {
+        quality: match args.quality {
+            QualityArg::Low => Quality::Low,
+            QualityArg::Normal => Quality::Normal,
+            QualityArg::High => Quality::High,
+        },
+        spz_version: match args.spz_version {
+            4 => SpzVersion::V4,
+            _ => SpzVersion::V3,
+        },
+    };
+    let conversion = convert_scene(&args.input, &args.output, &options, !args.no_compare)?;
+    say(format_args!(
+        "{}: {} splats{}",
+        args.output.display(),
+        conversion.splats,
+        lines(&conversion)
+    ))
+}
+
+/// What the conversion cost, a line each.
+fn lines(conversion: &Conversion) -> String {
+    let [before, after] = conversion.bytes.map(|bytes| bytes as f64 / 1e6);
+    let [from, to] = conversion.formats;
+    let percent = 100.0 * after / before.max(1e-9);
+    let mut text = format!("\n  size           {before:.3} MB {from} -> {after:.3} MB {to} ({percent:.1} %)");
+    if let Some(psnr) = &conversion.psnr {
+        let mean = psnr.iter().sum::<f64>() / psnr.len() as f64;
+        let worst = psnr.iter().copied().fold(f64::INFINITY, f64::min);
+        text += &match worst.is_finite() {
+            true => format!(
+                "\n  PSNR           {mean:.2} dB, worst {worst:.2} dB, of {} views around it",
+                psnr.len()
+            ),
+            false => format!("\n  PSNR           all {} views around it are equal", psnr.len()),
+        };
+    }
+    for note in &conversion.notes {
+        text += &format!("\n  note: {note}");
+    }
+    text
+}

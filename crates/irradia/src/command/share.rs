@@ -1,0 +1,107 @@
+//! `irradia share`
+
+use crate::Usage;
+use crate::terminal::say;
+use anyhow::Result;
+use irradia_runs::Scene;
+use irradia_viewer::{ShareOptions, share};
+use std::path::PathBuf;
+
+#[derive(clap::Args)]
+pub struct Args {
+    /// The scene: a run, or a splat file of any format
+    pub scene: PathBuf,
+    /// The page to write, such as scene.html; with --folder the folder
+    #[arg(long, short)]
+    pub out: PathBuf,
+    /// Title of the page; when absent the name of the scene
+    #[arg(long)]
+    pub title: Option<String>,
+    /// A line below the title, such as who took the photographs
+    #[arg(long, default_value = "")]
+    pub credits: String,
+    /// Largest size of the page, such as 10MB or 800kB: harmonics are left out first, then the splats that are seen least
+    #[arg(long, value_name = "SIZE", value_parser = parse_size)]
+    pub max: Option<u64>,
+    /// Write a folder for a web server: page, scene and start picture
+    #[arg(long)]
+    pub folder: bool,
+}
+
+/// Bytes of `10MB`, `800kB`, `1.5GB` or `4096`.
+fn parse_size(text: &str) -> Result<u64, String> {
+    let end = text
+        .find(|c: char| !(c.is_ascii_digit() || c == '.'))
+        .unwrap_or(text.len());
+    let (number, unit) = text.split_at(end);
+    let factor = match unit.to_lowercase().as_str() {
+        "" | "b" => 1.0,
+        "k" | "kb" => 1e3,
+        "m" | "mb" => 1e6,
+        "g" | "gb" => 1e9,
+        _ => return Err("expected a size such as 10MB or 800kB".into()),
+    };
+    let number: f64 = number.parse().map_err(|_| "expected a size such as 10MB or 800kB")?;
+    Ok((number * factor) as u64)
+}
+
+pub fn run(args: &Args) -> Result<()> {
+    if args.folder && args.out.is_file() {
+        return Err(Usage(format!(
+            "--out {} is a file; name a folder for --folder",
+            args.out.display()
+        ))
+        .into());
+    }
+    let scene = Scene::read(&args.scene)?;
+    let name = || {
+        args.scene
+            .file_stem()
+            .map(|name| name.to_string_lossy().into_owned())
+            .unwrap_or_default()
+    };
+    let options = ShareOptions {
+        title: args.title.clone().unwrap_or_else(name),
+        credits: args.credits.clone(),
+        max_bytes: args.max,
+        folder: args.folder,
+    };
+    let shared = share(&scene, &args.out, &options)?;
+    let [splats, of] = shared.splats;
+    let [degree, of_degree] = shared.degree;
+    let mut lost = Vec::new();
+    if degree < of_degree {
+        lost.push(format!("harmonics of degree {of_degree} became degree {degree}"));
+    }
+    if splats < of {
+        lost.push(format!("{} of {of} splats were left out", of - splats));
+    }
+    let lost = if lost.is_empty() {
+        String::new()
+    } else {
+        format!("\n  lost           {}", lost.join(", "))
+    };
+    say(format_args!(
+        "{}: {splats} splats of degree {degree}, {:.2} MB{lost}",
+        args.out.display(),
+        shared.bytes as f64 / 1e6
+    ))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn sizes_have_units_of_a_thousand() {
+        for (text, bytes) in [
+            ("10MB", 10_000_000),
+            ("800kB", 800_000),
+            ("1.5g", 1_500_000_000),
+            ("4096", 4096),
+        ] {
+            assert_eq!(parse_size(text), Ok(bytes));
+        }
+        assert!(parse_size("ten").is_err() && parse_size("10 apples").is_err() && parse_size("").is_err());
+    }
+}

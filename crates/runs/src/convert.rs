@@ -1,0 +1,95 @@
+//! A scene from one splat format to another, and what it cost: bytes, splats and, for lossy formats, PSNR.
+
+use crate::folder::cameras_beside;
+use crate::{RunError, Scene, scene_of};
+use irradia_formats::{SplatFormat, WriteOptions, read_splat_file, read_splats, splat_file_size, write_splats_with};
+use irradia_measure::psnr;
+use irradia_scene::{GaussianCloud, Similarity};
+use irradia_splat::{RenderOptions, Renderer, Splats};
+use irradia_train::model::Model;
+use std::borrow::Cow;
+use std::path::Path;
+
+/// Cameras around the scene from which it is compared.
+pub const COMPARED_VIEWS: u32 = 12;
+/// Pixels of a compared picture.
+const COMPARED_SIZE: (u32, u32) = (640, 480);
+
+/// What a conversion did.
+#[derive(Clone, Debug)]
+pub struct Conversion {
+    /// Formats of input and output.
+    pub formats: [SplatFormat; 2],
+    /// Bytes of input and output.
+    pub bytes: [u64; 2],
+    /// Splats that were written.
+    pub splats: usize,
+    /// What was left out, and what the format cannot hold, a line each.
+    pub notes: Vec<String>,
+    /// PSNR of the pictures of the output against those of the input, one a view, dB; infinite where they are equal. `None` for
+    /// lossless formats, for those that are not splats any more, and if it was not asked for.
+    pub psnr: Option<Vec<f64>>,
+}
+
+/// Converts the scene `input`, a file, a folder of images or a run, to `output`, whose name selects the format. If `compares`, both
+/// are rendered from [`COMPARED_VIEWS`] views around the scene.
+///
+/// # Errors
+/// When a format is unknown, the input cannot be read, or the output cannot be written, in which case nothing is left of it.
+pub fn convert(input: &Path, output: &Path, options: &WriteOptions, compares: bool) -> Result<Conversion, RunError> {
+    // Reading may take a while: an unknown output format is reported first.
+    let to = SplatFormat::of(output)?;
+    let input = scene_of(input);
+    let file = read_splat_file(&input)?;
+    let mut notes = file.warnings();
+    notes.extend(write_splats_with(output, &file.cloud, options)?);
+    let is_compared = compares && to.is_readable() && !to.is_lossless();
+    Ok(Conversion {
+        formats: [file.format, to],
+        bytes: [splat_file_size(&input)?, splat_file_size(output)?],
+        splats: file.cloud.len(),
+        notes,
+        psnr: is_compared.then(|| compare(&input, &file.cloud, output)).transpose()?,
+    })
+}
+
+/// PSNR of each view around the scene.
+fn compare(input: &Path, before: &GaussianCloud, output: &Path) -> Result<Vec<f64>, RunError> {
+    let world = before.world_from_dataset;
+    let mut after = read_splats(output)?;
+    if after.world_from_dataset != world {
+        // The file has the dataset's unit, about the origin of the world.
+        let (scale, log_scale) = (world.scale as f32, world.scale.ln() as f32);
+        after.means.as_flattened_mut().iter_mut().for_each(|v| *v *= scale);
+        after
+            .log_scales
+            .as_flattened_mut()
+            .iter_mut()
+            .for_each(|v| *v += log_scale);
+    }
+    // The flag itself is no part of the comparison: where a format loses it, a note says so.
+    let options = RenderOptions {
+        antialias: before.antialiased,
+        ..RenderOptions::default()
+    };
+    let scene = |cloud: &GaussianCloud, world_from_dataset: Similarity| Scene {
+        model: Model::Splats {
+            splats: Cow::Owned(Splats::from_cloud(cloud)),
+            residual: None,
+        },
+        options,
+        cameras: cameras_beside(input, &world_from_dataset).map(Into::into),
+        world_from_dataset,
+    };
+    let (before, after) = (scene(before, world), scene(&after, world));
+    let mut renderer = Renderer::new();
+    let mut picture = |scene: &Scene, camera| {
+        let frame = scene.model.render(&mut renderer, camera, &scene.options);
+        frame.color.rounded_to_8_bits()
+    };
+    let cameras = before.orbit(COMPARED_VIEWS, Some(COMPARED_SIZE));
+    Ok(cameras
+        .iter()
+        .map(|camera| psnr(&picture(&after, camera), &picture(&before, camera)))
+        .collect())
+}

@@ -1,0 +1,32 @@
+// Where the renderer's shaders, worker and splats come from in a shared page: the page itself, or the file beside it.
+
+/** @param {string} id */
+const text = (id) => /** @type {HTMLElement} */ (document.getElementById(id)).textContent ?? "";
+
+/** Start camera, background and how the scene is drawn, as the program wrote them. */
+export const view = JSON.parse(text("view"));
+
+/** @param {string} name */
+export const shader = async (name) => text(name);
+
+export const orderWorker = () => new Worker(URL.createObjectURL(new Blob([text("order.js")], { type: "text/javascript" })), { type: "module" });
+
+/** The scene in compact form. @param {AbortSignal} signal */
+export async function openSplats(signal) {
+  const packed = view.file ? (await fetch(view.file, { signal })).body : new Blob(decoded(text("splats"))).stream();
+  if (!packed) throw new Error("the scene is not beside the page");
+  return new Response(packed.pipeThrough(new DecompressionStream("gzip")));
+}
+
+/** The bytes of base64, part by part. @param {string} base64 */
+function decoded(base64) {
+  const part = 4 << 20;
+  const parts = [];
+  for (let at = 0; at < base64.length; at += part) {
+    const binary = atob(base64.slice(at, at + part));
+    const bytes = new Uint8Array(binary.length);
+    for (let i = 0; i < binary.length; i += 1) bytes[i] = binary.charCodeAt(i);
+    parts.push(bytes);
+  }
+  return parts;
+}

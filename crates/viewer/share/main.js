@@ -1,0 +1,120 @@
+// A shared scene: draws it, and moves the camera about it with mouse, touch and keyboard.
+
+import { view } from "irradia/assets.js";
+import { add, axes, clamp, dot, length, multiply, rotate, scale, subtract, turn, unit } from "irradia/math.js";
+import { LocalRenderer } from "irradia/renderer.js";
+
+/** Radians per pixel of dragging, and the largest angle between the view and the horizon. */
+const TURN = 0.006;
+const STEEPEST = 1.54;
+/** Largest number of device pixels per CSS pixel. */
+const DENSITY = 2;
+
+const canvas = /** @type {HTMLCanvasElement} */ (document.querySelector("canvas"));
+const message = /** @type {HTMLElement} */ (document.getElementById("message"));
+const { up, start } = view;
+let camera = start;
+let pivot = view.pivot;
+let stale = true;
+
+const renderer = new LocalRenderer(canvas, () => (stale = true), (problem) => (message.textContent = problem));
+if (renderer.works) renderer.load({ version: 1, background: view.background, antialias: view.antialias });
+else message.textContent = "This browser does not draw with WebGL2.";
+// For tests, and for pages that hold this one.
+Object.assign(window, { irradia: { renderer, camera: () => camera, set: (to) => ((camera = to), (stale = true)) } });
+
+/** Pixels and focal length: the picture is at least as wide and as high as at the start. */
+function intrinsics() {
+  const density = Math.min(devicePixelRatio || 1, DENSITY);
+  const [width, height] = [Math.max(1, Math.round(canvas.clientWidth * density)), Math.max(1, Math.round(canvas.clientHeight * density))];
+  const vertical = height / 2 / Math.tan(start.fov / 2);
+  const focal = Math.min(vertical, (vertical * width) / height / view.aspect);
+  return { width, height, fx: focal, fy: focal, cx: width / 2, cy: height / 2 };
+}
+
+const reach = () => Math.max(length(subtract(pivot, camera.position)), 0.02 * view.radius);
+
+/** Turns about the pivot. @param {number} dx @param {number} dy pixels */
+function orbit(dx, dy) {
+  const yaw = turn(up, -dx * TURN);
+  const [right, , ahead] = axes(camera.rotation);
+  const elevation = Math.asin(clamp(dot(ahead, up), -1, 1));
+  const pitch = clamp(-dy * TURN, Math.min(0, -STEEPEST - elevation), Math.max(0, STEEPEST - elevation));
+  const both = multiply(yaw, turn(right, pitch));
+  const rotation = unit(multiply(both, camera.rotation));
+  const position = add(pivot, rotate(both, subtract(camera.position, pivot)));
+  camera = { ...camera, position, rotation };
+  stale = true;
+}
+
+/** Moves camera and pivot across the view. @param {number} dx @param {number} dy pixels */
+function pan(dx, dy) {
+  const [right, down] = axes(camera.rotation);
+  const step = reach() / intrinsics().fy * Math.min(devicePixelRatio || 1, DENSITY);
+  const move = add(scale(right, -dx * step), scale(down, -dy * step));
+  pivot = add(pivot, move);
+  camera = { ...camera, position: add(camera.position, move) };
+  stale = true;
+}
+
+/** Comes nearer to the pivot. @param {number} amount in powers of e */
+function dolly(amount) {
+  const offset = subtract(camera.position, pivot);
+  camera = { ...camera, position: add(pivot, scale(offset, Math.exp(-amount))) };
+  stale = true;
+}
+
+/** @type {Map<number, { x: number, y: number }>} */
+const pointers = new Map();
+canvas.addEventListener("pointerdown", (event) => {
+  canvas.setPointerCapture(event.pointerId);
+  pointers.set(event.pointerId, { x: event.clientX, y: event.clientY });
+});
+canvas.addEventListener("pointermove", (event) => {
+  const before = pointers.get(event.pointerId);
+  if (!before) return;
+  const now = { x: event.clientX, y: event.clientY };
+  const [dx, dy] = [now.x - before.x, now.y - before.y];
+  const other = [...pointers].find(([id]) => id !== event.pointerId)?.[1];
+  if (other) {
+    const apart = (/** @type {{ x: number, y: number }} */ p) => Math.max(1, Math.hypot(p.x - other.x, p.y - other.y));
+    dolly(Math.log(apart(now) / apart(before)));
+    pan(dx / 2, dy / 2);
+  } else if (event.buttons & 6 || event.shiftKey) pan(dx, dy);
+  else orbit(dx, dy);
+  pointers.set(event.pointerId, now);
+});
+for (const kind of /** @type {const} */ (["pointerup", "pointercancel"])) canvas.addEventListener(kind, (event) => pointers.delete(event.pointerId));
+canvas.addEventListener("contextmenu", (event) => event.preventDefault());
+canvas.addEventListener("wheel", (event) => {
+  event.preventDefault();
+  dolly(-event.deltaY * (event.deltaMode === 1 ? 16 : 1) * (event.ctrlKey ? 0.01 : 0.0015));
+}, { passive: false });
+canvas.addEventListener("dblclick", () => {
+  [camera, pivot, stale] = [start, view.pivot, true];
+});
+addEventListener("keydown", ({ key }) => {
+  const step = 40;
+  if (key === "ArrowLeft") orbit(step, 0);
+  else if (key === "ArrowRight") orbit(-step, 0);
+  else if (key === "ArrowUp") orbit(0, step);
+  else if (key === "ArrowDown") orbit(0, -step);
+  else if (key === "+") dolly(0.2);
+  else if (key === "-") dolly(-0.2);
+  else if (key === "Home") [camera, pivot, stale] = [start, view.pivot, true];
+});
+new ResizeObserver(() => (stale = true)).observe(canvas);
+
+/** @param {number} now */
+function frame(now) {
+  if (stale) {
+    stale = false;
+    renderer.want(camera, intrinsics(), {});
+  }
+  if (renderer.draw(now) && renderer.drawn > 0) {
+    message.textContent = renderer.loaded < renderer.total ? `${Math.round((100 * renderer.loaded) / renderer.total)} %` : "";
+    document.querySelector(".poster")?.remove();
+  }
+  requestAnimationFrame(frame);
+}
+requestAnimationFrame(frame);

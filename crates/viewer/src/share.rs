@@ -1,0 +1,301 @@
+//! A scene as one page that opens from the disk, without a network, or as a folder for a web server.
+//!
+//! The page draws with the viewer's own modules and shaders, held as text; the import map gives modules their names as `data:`
+//! addresses. The scene is the compact form of `compact.rs`, gzipped, in base64 or in a file beside the page.
+
+use crate::ViewerError;
+use crate::compact::compact;
+use crate::page::file;
+use irradia_runs::Scene;
+use irradia_runs::formats::{base64, gzip, write_atomic};
+use irradia_splat::Splats;
+use serde_json::json;
+use std::fs;
+use std::path::Path;
+
+/// Files of a shared folder.
+const SCENE_FILE: &str = "scene.irs.gz";
+const POSTER_FILE: &str = "poster.png";
+/// Size of a start picture when the page is not measured yet.
+const POSTER: (u32, u32) = (1280, 720);
+/// Tries to meet a limit of bytes by leaving splats out.
+const TRIES: u32 = 5;
+
+/// What to share, and how.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct ShareOptions {
+    /// Shown on the page and in the browser's tab.
+    pub title: String,
+    /// A line below the title, such as who made the scene.
+    pub credits: String,
+    /// The page, with its scene, has at most this many bytes.
+    pub max_bytes: Option<u64>,
+    /// A folder of page, scene and start picture instead of one page.
+    pub folder: bool,
+}
+
+/// What was written, and what of the scene is in it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Shared {
+    /// Bytes of all files.
+    pub bytes: u64,
+    /// Splats in the page, and of the scene that can be seen.
+    pub splats: [usize; 2],
+    /// Degree of their spherical harmonics, and of the scene's.
+    pub degree: [u32; 2],
+}
+
+/// Writes `scene` as a page at `output`, or as the folder `output`.
+///
+/// # Errors
+/// When the scene is a field, which the page cannot draw, a limit of bytes is too small for any scene, or a file cannot be written.
+pub fn share(scene: &Scene, output: &Path, options: &ShareOptions) -> Result<Shared, ViewerError> {
+    let splats = scene.model.splats().ok_or(ViewerError::NoSplats)?;
+    // What does not depend on the scene, and the text that holds it.
+    let around = page(scene, options, None).len() as u64;
+    let cost = |packed: &[u8]| match options.folder {
+        true => around + packed.len() as u64,
+        false => around + (packed.len() as u64).div_ceil(3) * 4,
+    };
+    let (packed, count, degree) = fitting(splats, scene.options.sh_degree, options.max_bytes, &cost)?;
+    let shared = |bytes| Shared {
+        bytes,
+        splats: [count, seen(&compact(splats, 0, usize::MAX))],
+        degree: [degree, splats.sh_degree().min(scene.options.sh_degree)],
+    };
+    if !options.folder {
+        let text = page(scene, options, Some(&packed));
+        write_atomic(output, |out| out.write_all(text.as_bytes()))?;
+        return Ok(shared(text.len() as u64));
+    }
+    fs::create_dir_all(output).map_err(|source| ViewerError::Folder {
+        path: output.to_owned(),
+        source,
+    })?;
+    let poster = output.join(POSTER_FILE);
+    let camera = scene.orbit(1, Some(POSTER))[0];
+    irradia_runs::write_image(&poster, &scene.render(&camera).color)?;
+    write_atomic(&output.join(SCENE_FILE), |out| out.write_all(&packed))?;
+    let text = page(scene, options, None);
+    write_atomic(&output.join("index.html"), |out| out.write_all(text.as_bytes()))?;
+    let poster = fs::metadata(&poster).map_or(0, |metadata| metadata.len());
+    Ok(shared(poster + packed.len() as u64 + text.len() as u64))
+}
+
+/// The gzipped compact form that costs at most `most`, its splats and its degree: harmonics are left out first, then splats.
+fn fitting(
+    splats: &Splats,
+    degree: u32,
+    most: Option<u64>,
+    cost: &dyn Fn(&[u8]) -> u64,
+) -> Result<(Vec<u8>, usize, u32), ViewerError> {
+    let most = most.unwrap_or(u64::MAX);
+    let pack = |degree: u32, count: usize| {
+        let bytes = compact(splats, degree, count);
+        (gzip(&bytes), seen(&bytes))
+    };
+    let highest = degree.min(splats.sh_degree());
+    let mut last = (Vec::new(), 0);
+    for degree in (0..=highest).rev() {
+        last = pack(degree, usize::MAX);
+        if cost(&last.0) <= most {
+            return Ok((last.0, last.1, degree));
+        }
+    }
+    let around = cost(&[]);
+    for _ in 0..TRIES {
+        let share = most.saturating_sub(around) as f64 / (cost(&last.0) - around) as f64;
+        // A little less than the share, since what is left compresses a little worse.
+        let count = (last.1 as f64 * share * 0.98) as usize;
+        if count == 0 {
+            break;
+        }
+        last = pack(0, count);
+        if cost(&last.0) <= most {
+            return Ok((last.0, last.1, 0));
+        }
+    }
+    Err(ViewerError::TooSmall { bytes: most, around })
+}
+
+/// The number of splats in a compact form.
+fn seen(bytes: &[u8]) -> usize {
+    u32::from_le_bytes([bytes[4], bytes[5], bytes[6], bytes[7]]) as usize
+}
+
+/// The text of the page, with its scene or with the name of its file.
+fn page(scene: &Scene, options: &ShareOptions, packed: Option<&[u8]>) -> String {
+    let module = |name: &str| {
+        let (_, text) = file(name).expect("a file of the page");
+        // Modules name each other by their places in the folder; in one page they have names only.
+        ["\"../math.js\"", "\"./stream.js\"", "\"./assets.js\""]
+            .iter()
+            .fold(text.to_owned(), |text, place| {
+                let name = place.trim_matches('"').rsplit('/').next().unwrap_or_default();
+                text.replace(place, &format!("\"irradia/{name}\""))
+            })
+    };
+    let address = |text: &str| format!("data:text/javascript;base64,{}", base64::encode(text.as_bytes()));
+    let imports = json!({ "imports": {
+        "irradia/math.js": address(&module("js/math.js")),
+        "irradia/stream.js": address(&module("js/local/stream.js")),
+        "irradia/renderer.js": address(&module("js/local/renderer.js")),
+        "irradia/assets.js": address(include_str!("../share/assets.js")),
+    }});
+    let mut texts = String::new();
+    let mut text = |kind: &str, id: &str, text: &str| {
+        texts += &format!("<script type=\"{kind}\" id=\"{id}\">{text}</script>\n");
+    };
+    for name in ["project.vert", "project.frag", "splat.vert", "splat.frag", "shape.frag"] {
+        text(
+            "text/plain",
+            name,
+            file(&format!("shaders/{name}")).expect("a shader").1,
+        );
+    }
+    text("text/plain", "order.js", &module("js/local/order.js"));
+    text(
+        "application/json",
+        "view",
+        &view(scene, packed.is_none() && options.folder).to_string(),
+    );
+    if let Some(packed) = packed {
+        text("text/plain", "splats", &base64::encode(packed));
+    }
+    let poster = match options.folder {
+        true => format!("<img class=\"poster\" src=\"{POSTER_FILE}\" alt=\"\">\n"),
+        false => String::new(),
+    };
+    // The texts last: nothing in them is a place to fill.
+    include_str!("../share/page.html")
+        .replace("{{title}}", &escaped(&options.title))
+        .replace("{{credits}}", &escaped(&options.credits))
+        .replace("{{poster}}", &poster)
+        .replace("{{style}}", include_str!("../share/page.css"))
+        .replace("{{main}}", include_str!("../share/main.js"))
+        .replace("{{imports}}", &imports.to_string())
+        .replace("{{texts}}", &texts)
+}
+
+/// What the page knows of the scene beside its splats: the camera of `irradia render --orbit`'s first frame, and what it turns about.
+fn view(scene: &Scene, in_file: bool) -> serde_json::Value {
+    let camera = scene.orbit(1, None)[0];
+    let outlook = scene.outlook();
+    let k = camera.intrinsics;
+    let rotation = camera.pose.rotation;
+    let fov = 2.0 * (0.5 * k.height as f32 / k.fy).atan();
+    json!({
+        "start": {
+            "position": camera.pose.position.to_array(),
+            "rotation": [rotation.w, rotation.x, rotation.y, rotation.z],
+            "fov": fov,
+        },
+        "aspect": k.width as f32 / k.height as f32,
+        "pivot": outlook.center.to_array(),
+        "up": outlook.up.to_array(),
+        "radius": outlook.radius,
+        "background": scene.options.background,
+        "antialias": scene.options.antialias,
+        "file": in_file.then_some(SCENE_FILE),
+    })
+}
+
+/// Text as it stands in HTML.
+fn escaped(text: &str) -> String {
+    text.replace('&', "&amp;")
+        .replace('<', "&lt;")
+        .replace('>', "&gt;")
+        .replace('"', "&quot;")
+        .replace("{{", "{ {")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use irradia_runs::formats::{read_splats, write_splats};
+    use irradia_runs::scene::{GaussianCloud, Rng};
+
+    /// A scene of `count` splats of degree 2.
+    fn scene(folder: &Path, count: usize) -> Scene {
+        let mut rng = Rng::new(2, 1);
+        let mut values = |n: usize| (0..n).map(|_| rng.range(-1.0, 1.0)).collect::<Vec<f32>>();
+        let cloud = GaussianCloud {
+            means: values(3 * count).as_chunks().0.to_vec(),
+            quats: values(4 * count).as_chunks().0.to_vec(),
+            log_scales: values(3 * count).as_chunks().0.to_vec(),
+            opacity_logits: values(count),
+            sh: values(27 * count),
+            sh_degree: 2,
+            ..GaussianCloud::default()
+        };
+        let path = folder.join("scene.ply");
+        write_splats(&path, &cloud).expect("written");
+        assert_eq!(read_splats(&path).expect("read").len(), count);
+        Scene::read(&path).expect("read")
+    }
+
+    #[test]
+    fn the_page_holds_everything_and_fetches_nothing() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let scene = scene(folder.path(), 2000);
+        let output = folder.path().join("scene.html");
+        let options = ShareOptions {
+            title: "A <b>bold</b> {{main}} title".into(),
+            credits: "me & you".into(),
+            ..ShareOptions::default()
+        };
+        let shared = share(&scene, &output, &options).expect("shared");
+        let text = fs::read_to_string(&output).expect("written");
+        assert_eq!(
+            (shared.bytes, shared.splats, shared.degree),
+            (text.len() as u64, [2000, 2000], [2, 2])
+        );
+        assert!(text.contains("A &lt;b&gt;bold") && text.contains("me &amp; you") && !text.contains("{{"));
+        for place in ["src=", "href=", "http:", "https:", "\"./", "\"../"] {
+            assert!(!text.contains(place), "{place}");
+        }
+        // One opening tag for each end: no text ends its element early.
+        assert_eq!(text.matches("</script>").count(), text.matches("<script").count());
+    }
+
+    #[test]
+    fn a_limit_of_bytes_costs_harmonics_first_and_splats_then() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let scene = scene(folder.path(), 20_000);
+        let output = folder.path().join("scene.html");
+        let try_with = |max_bytes: u64| {
+            let options = ShareOptions {
+                max_bytes: Some(max_bytes),
+                ..ShareOptions::default()
+            };
+            share(&scene, &output, &options)
+        };
+        let whole = try_with(u64::MAX).expect("shared");
+        let without = try_with(whole.bytes * 3 / 4).expect("shared");
+        assert!(without.degree[0] < 2 && without.splats == [20_000; 2], "{without:?}");
+        let fewer = try_with(whole.bytes / 4).expect("shared");
+        assert!(
+            fewer.degree[0] == 0 && fewer.splats[0] < 20_000 && fewer.bytes <= whole.bytes / 4,
+            "{fewer:?}"
+        );
+        assert!(fewer.bytes > whole.bytes / 5, "{fewer:?}");
+        let error = try_with(1000).expect_err("too small").to_string();
+        assert!(error.contains("1000 bytes") && !error.contains('\n'), "{error}");
+    }
+
+    #[test]
+    fn a_folder_has_page_scene_and_start_picture() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let scene = scene(folder.path(), 300);
+        let output = folder.path().join("site");
+        let options = ShareOptions {
+            folder: true,
+            ..ShareOptions::default()
+        };
+        let shared = share(&scene, &output, &options).expect("shared");
+        let size = |name: &str| fs::metadata(output.join(name)).expect("there").len();
+        assert_eq!(shared.bytes, size("index.html") + size(SCENE_FILE) + size(POSTER_FILE));
+        let text = fs::read_to_string(output.join("index.html")).expect("text");
+        assert!(text.contains(SCENE_FILE) && text.contains(POSTER_FILE));
+    }
+}

@@ -58,7 +58,8 @@ pub(crate) fn encode(cloud: &GaussianCloud, quality: Quality, version: SpzVersio
         return bytes;
     }
     bytes.push(0);
-    arrays.iter().for_each(|array| bytes.extend_from_slice(array));
+    // Each array is given back as soon as it is copied.
+    arrays.into_iter().for_each(|array| bytes.extend(array));
     gzip(&bytes)
 }
 

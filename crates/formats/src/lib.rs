@@ -16,6 +16,7 @@ mod image_file;
 mod pack;
 pub mod parse;
 mod photo;
+mod photos;
 mod ply;
 mod points_ply;
 mod splats;
@@ -25,11 +26,15 @@ mod unpack;
 mod zip;
 
 pub use atomic::write_atomic;
+pub use dataset::colmap::{
+    ColmapCamera, ColmapImage, ColmapModel, ColmapPoint, PosedImage, TrackedPoint, write_colmap,
+};
 pub use dataset::{DEFAULT_MAX_SIDE, DatasetFormat, DatasetOptions, Holdout, read_dataset};
 pub use describe::{Description, Kind, describe, detect};
 pub use error::{FormatError, Malformed};
 pub use image_file::{Pixels, read_image, write_png, write_png_16};
 pub use pack::gzip;
+pub use photos::{CameraTags, PhotoEntry, PhotoFolder, has_photos, read_photo_folder};
 pub use points_ply::{read_points_ply, write_points_ply};
 pub use splats::{
     Quality, SplatFile, SplatFormat, SpzVersion, WriteOptions, read_splat_file, read_splats, splat_file_size,

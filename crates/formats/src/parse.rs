@@ -6,6 +6,7 @@ pub use crate::dataset::colmap::{
 };
 pub use crate::dataset::llff::{LlffPose, parse_poses_bounds as poses_bounds};
 pub use crate::dataset::transforms::{CameraKeys, Frame, Transforms, parse_transforms as transforms};
+pub use crate::photos::parse_camera_tags as camera_tags;
 pub use crate::points_ply::parse_points_ply as points_ply;
 pub use crate::splats::antimatter::parse as splat;
 pub use crate::splats::gltf::parse as glb;

@@ -152,6 +152,12 @@ fn cases() -> Vec<Case> {
         case("state dict, stream", torch::stream(&TENSORS), |b| {
             parse::tensors(b).is_ok()
         }),
+        // One tag, the camera's model; what is damaged is as if it were absent.
+        case(
+            "EXIF",
+            b"II\x2a\0\x08\0\0\0\x01\0\x10\x01\x02\0\x04\0\0\0One\0\0\0\0\0".into(),
+            |b| parse::camera_tags(b, [40, 30]).model.is_some(),
+        ),
         case("splats", splat_ply(), |b| parse::splat_ply(b).is_ok()),
     ]
 }

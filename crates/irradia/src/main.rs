@@ -26,7 +26,9 @@ struct Cli {
 enum Command {
     /// Ray trace a scene, train on it, evaluate and report: no data needed
     Demo(command::demo::Args),
-    /// Train a scene from posed photographs
+    /// Find the poses of photographs, or of the frames of a film
+    Pose(command::pose::Args),
+    /// Train a scene from photographs, or a film
     Train(command::train::Args),
     /// Train several recipes under the same conditions and compare them
     Compare(command::compare::Args),
@@ -65,6 +67,7 @@ impl std::error::Error for Usage {}
 fn main() -> ExitCode {
     let result = match Cli::parse().command {
         Command::Demo(args) => command::demo::run(&args),
+        Command::Pose(args) => command::pose::run(&args),
         Command::Train(args) => command::train::run(&args),
         Command::Compare(args) => command::compare::run(&args),
         Command::Recipe(args) => command::recipe::run(&args),

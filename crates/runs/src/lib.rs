@@ -22,6 +22,7 @@
 //! | to | start with |
 //! |---|---|
 //! | train on a folder | [`TrainInput`], which becomes a validated [`TrainRequest`]; [`Run::begin`] |
+//! | find the poses of photographs | [`PoseInput`], [`pose`] |
 //! | train on a dataset in memory | [`Run::begin_on`] |
 //! | resume an interrupted run | [`TrainInput::of_run`], [`Run::resume`] |
 //! | show progress, pause, save or stop | an [`Observer`](train::event::Observer) given to [`Run::train`] |
@@ -48,6 +49,7 @@ mod journal;
 mod lock;
 mod orbit;
 mod path;
+mod pose;
 mod protocol;
 mod provenance;
 mod request;
@@ -71,6 +73,7 @@ pub use irradia_train as train;
 pub use journal::logged_errors;
 pub use orbit::Outlook;
 pub use path::{CameraPath, Film, PathKey};
+pub use pose::{CameraReport, LeftOutPhoto, PoseInput, PoseProgress, PoseReport, StageReport, is_film, pose};
 pub use protocol::Protocol;
 pub use provenance::{data_fingerprint, program_fingerprint};
 pub use request::{DEFAULT_RECIPE, HOW_TO_GET_LPIPS, Reading, TrainInput, TrainRequest, read_recipe};

@@ -51,6 +51,7 @@ fn options(golden: &Golden) -> RenderOptions {
         sh_degree: golden.scalar("sh_degree") as u32,
         antialias: golden.scalar("antialias") != 0.0,
         depth: true,
+        ..RenderOptions::default()
     }
 }
 

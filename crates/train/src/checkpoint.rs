@@ -29,6 +29,8 @@ const FORMAT_4: &str = "irradia-checkpoint-4";
 const FIELD: &str = "field.";
 /// The time breakdown; absent from earlier checkpoints.
 const TIMES: &str = "times";
+/// Views to train on, where misfits are left out.
+const TRAINED: &str = "trained_views";
 const OWNERS: [&str; 3] = ["splats", "first_moments", "second_moments"];
 
 /// A training run between two steps, as it is written: the splats' columns are borrowed, or copied to be written while training
@@ -78,6 +80,10 @@ impl<'a> Checkpoint<'a> {
         others.push(NamedTensor::whole("clock.whole", &whole));
         others.push(NamedTensor::double("clock.real", &real));
         others.push(NamedTensor::double(TIMES, &trainer.times.to_array()));
+        if trainer.trained.len() < trainer.dataset.train.len() {
+            let trained: Vec<u64> = trainer.trained.iter().map(|view| *view as u64).collect();
+            others.push(NamedTensor::whole(TRAINED, &trained));
+        }
         let carried = carried::named(&clock.carried);
         others.extend(carried.map(|(name, value)| NamedTensor::double(name, &[value])));
         Self {
@@ -328,6 +334,14 @@ pub fn from_bytes(bytes: &[u8], dataset: Arc<Dataset>, options: TrainOptions) ->
         let prefix = format!("{}.", occupant.name());
         let restored = occupant.restore(TensorSource::new(&file, &prefix));
         restored.map_err(|why| wrong(format!("{prefix}{why}")))?;
+    }
+    // The run left out photographs.
+    if let Some(trained) = tensors("").whole(TRAINED) {
+        let known = |view: &u64| trainer.dataset.train.contains(&(*view as usize));
+        if trained.is_empty() || !trained.iter().all(known) {
+            return Err(wrong(format!("{TRAINED} and the dataset do not agree")));
+        }
+        trainer.trained = trained.iter().map(|view| *view as usize).collect();
     }
     (trainer.pace, trainer.seconds, trainer.cpu_seconds) = (*pace, *seconds, *cpu_seconds);
     if let Ok((_, bytes)) = array(TIMES, Dtype::F64) {

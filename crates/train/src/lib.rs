@@ -15,6 +15,7 @@ mod forecast;
 mod free_space;
 pub mod half_fit;
 pub mod memory;
+mod misfits;
 pub mod model;
 mod objective;
 pub mod paces;

@@ -7,6 +7,7 @@ use crate::first_splats::first_count;
 use crate::free_space::FreeSpace;
 use crate::half_fit::HalfFit;
 use crate::memory::{MemoryPlan, Needs};
+use crate::misfits;
 use crate::model::Model;
 use crate::objective::{Objective, Reference};
 use crate::photos::{PhotoCache, Prepared};
@@ -111,6 +112,8 @@ pub struct Trainer {
     pub recipe: Recipe,
     /// The dataset.
     pub dataset: Arc<Dataset>,
+    /// Indices of the views to train on: those of the dataset without misfits.
+    pub(crate) trained: Vec<usize>,
     /// The splats; none while a field is trained.
     pub engine: Engine,
     /// The field, in stages that train one.
@@ -208,6 +211,7 @@ impl Trainer {
             engine: Engine::new(SplatState::new(Splats::zeros(0, sh::MAX_DEGREE))),
             field: None,
             sockets: Sockets::default(),
+            trained: dataset.train.clone(),
             recipe,
             dataset,
             options,
@@ -271,15 +275,15 @@ impl Trainer {
         } else {
             self.splat_step(events)?
         };
-        let probe_at = exposure_probe::AT * self.recipe.total_steps() as f64;
         let before = self.clock.time;
         let entered = self.tick(metrics) && !self.finished();
-        if before < probe_at
-            && self.clock.time >= probe_at
-            && self.recipe.exposure == Choice::Auto
-            && self.field.is_none()
-        {
+        let total = self.recipe.total_steps() as f64;
+        let passes = |at: f64, clock: &Clock| before < at * total && clock.time >= at * total;
+        if self.recipe.exposure == Choice::Auto && self.field.is_none() && passes(exposure_probe::AT, &self.clock) {
             events.extend(self.decide_exposure()?);
+        }
+        if self.recipe.drop_misfits && self.field.is_none() && passes(misfits::AT, &self.clock) {
+            events.extend(self.leave_out_misfits()?);
         }
         if entered {
             events.push(Event::StageEntered {
@@ -296,7 +300,7 @@ impl Trainer {
 
     fn splat_step(&mut self, events: &mut Vec<Event>) -> Result<(StepReport, StepMetrics), TrainError> {
         let plan = plan(&self.recipe, &self.clock);
-        let upcoming = upcoming_views(&self.dataset.train, self.options.seed, &self.clock);
+        let upcoming = upcoming_views(&self.trained, self.options.seed, &self.clock);
         let photo = self.photos.get(&upcoming, plan.image_scale)?;
         let (started, cpu_started) = (Instant::now(), ProcessTime::now());
         let mut rng = Rng::new(self.options.seed ^ self.clock.step << 20, STREAM_STEP);
@@ -535,12 +539,17 @@ impl Trainer {
     fn measure_error(&mut self, plan: &StepPlan) -> Result<f64, TrainError> {
         let (mut sum, mut count) = (0.0, 0);
         self.show_training_views(MEASURED_VIEWS, plan, |trainer, _, photo| {
-            let color = trainer.sockets.frame_color(&trainer.engine);
-            trainer.objective.error(color, photo, false);
-            sum += trainer.objective.mean_error();
+            sum += trainer.error_of_frame(photo);
             count += 1;
         })?;
         Ok(sum / f64::from(count.max(1)))
+    }
+
+    /// Mean L1 error of the last frame against its photograph.
+    pub(crate) fn error_of_frame(&mut self, photo: &Prepared) -> f64 {
+        let color = self.sockets.frame_color(&self.engine);
+        self.objective.error(color, photo, false);
+        self.objective.mean_error()
     }
 
     /// Renders at most `most` training views, evenly spaced, as the plan does, and passes each with its photograph to `see`.
@@ -550,8 +559,8 @@ impl Trainer {
         plan: &StepPlan,
         mut see: impl FnMut(&mut Self, usize, &Prepared),
     ) -> Result<(), TrainError> {
-        let upcoming = upcoming_views(&self.dataset.train, self.options.seed, &self.clock);
-        let train = self.dataset.train.clone();
+        let upcoming = upcoming_views(&self.trained, self.options.seed, &self.clock);
+        let train = self.trained.clone();
         let stride = train.len().div_ceil(most).max(1);
         for view in train.into_iter().step_by(stride) {
             let order: Vec<usize> = std::iter::once(view)
@@ -587,7 +596,7 @@ impl Trainer {
             background: self.recipe.render.background,
             sh_degree,
             antialias: self.recipe.render.antialias,
-            depth: false,
+            ..RenderOptions::default()
         }
     }
 

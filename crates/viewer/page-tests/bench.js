@@ -1,13 +1,15 @@
 // Measures the viewer: npm run bench [-- served|local|train ..]. Figures are those of this machine and of what else it does; compare
 // within one run.
 
-import { existsSync, readFileSync, rmSync } from "node:fs";
+import { existsSync, readFileSync } from "node:fs";
 import { join } from "node:path";
-import { browse, open, run, scratch, serve, set } from "./tests/harness.js";
+import { browse, open, scratch, serve, set } from "./tests/harness.js";
 import { random } from "./tests/scenes.js";
 
 const SPLATS = 500_000;
-const STEPS = 500;
+/** Seconds of a window of a training, and how often each kind comes. */
+const WINDOW = 8;
+const ROUNDS = 4;
 const wanted = process.argv.slice(2);
 const wants = (name) => wanted.length === 0 || wanted.includes(name);
 const say = (name, value) => console.log(`${name.padEnd(58)} ${value}`);
@@ -107,30 +109,25 @@ if (wants("train")) {
   const data = join(import.meta.dirname, "../../../../shared/data/fox_colmap");
   if (!existsSync(data)) console.log("SKIPPED (no ../shared): training with pages");
   else {
-    const args = (name) => {
-      rmSync(join(scratch, name), { recursive: true, force: true });
-      return ["train", data, "--out", join(scratch, name), "--steps", `${STEPS}`, "--downscale", "2", "--holdout", "0"];
-    };
-    const seconds = (name) => JSON.parse(readFileSync(join(scratch, name, "report.json"), "utf8")).training_seconds;
+    // One run, its windows in turn, so that neither the growth of the scene nor the opening of the page counts.
+    const out = join(scratch, "watched");
+    const server = await serve("train", data, "--out", out, "--steps", "100000", "--downscale", "2", "--holdout", "0", "--view", "--port", "0");
+    const steps = () => Number(/.*"step":(\d+)/s.exec(readFileSync(join(out, "events.jsonl"), "utf8").slice(-4000))?.[1] ?? 0);
+    const { page } = await open(browser, server.address, { width: 1280, height: 800 });
     const rows = { alone: [], resting: [], moving: [] };
-    for (let round = 0; round < 2; round += 1) {
-      run(...args("alone"));
-      rows.alone.push(seconds("alone"));
-      for (const kind of /** @type {const} */ (["resting", "moving"])) {
-        const server = await serve(...args(kind), "--view", "--port", "0");
-        const { page } = await open(browser, server.address, { width: 1280, height: 800 });
-        while (server.child.exitCode === null) {
-          const phase = await page.evaluate(async () => (await import("/page/js/state.js")).state.get("train")?.phase).catch(() => "finished");
-          if (phase === "finished") break;
-          if (kind === "moving") await turn(page, 1);
-          else await page.waitForTimeout(300);
-        }
-        await page.close();
-        await server.ended;
-        rows[kind].push(seconds(kind));
+    for (let round = 0; round < ROUNDS; round += 1) {
+      for (const kind of /** @type {const} */ (["alone", "resting", "moving"])) {
+        await page.goto(kind === "alone" ? "about:blank" : server.address);
+        await page.waitForTimeout(2500);
+        const [from, since] = [steps(), performance.now()];
+        if (kind === "moving") say("train: pictures/s while moving", (await turn(page, WINDOW)).fps.toFixed(1));
+        else await page.waitForTimeout(1000 * WINDOW);
+        rows[kind].push((1000 * (steps() - from)) / (performance.now() - since));
       }
     }
-    for (const [name, values] of Object.entries(rows)) say(`train: seconds of ${STEPS} steps, ${name}`, values.map((value) => value.toFixed(2)).join(" "));
+    for (const [name, values] of Object.entries(rows)) say(`train: steps/s, ${name}`, values.map((value) => value.toFixed(0)).join(" "));
+    await page.close();
+    await server.stop();
   }
 }
 

@@ -8,10 +8,10 @@
 //! A rotation is the unit quaternion w, x, y, z without its largest component, which is made positive: its index in the top two
 //! of 48 bits (one is unused), then the others in order, 15 bits each, from -1/sqrt(2) to 1/sqrt(2).
 
+use crate::importance::by_importance;
 use irradia_scene::half::{from_half, half};
 use irradia_scene::sh;
 use irradia_splat::Splats;
-use irradia_splat::render::ALPHA_MIN;
 use rayon::prelude::*;
 
 /// Splats per block: of 500,000 the first block is 1.6 %.
@@ -29,29 +29,8 @@ pub(crate) const fn band_bytes(degree: u32) -> usize {
 /// `splats` in compact form, with bands up to `degree`, the `most` important of them. Splats that can never be seen are left out.
 pub(crate) fn compact(splats: &Splats, degree: u32, most: usize) -> Vec<u8> {
     let degree = degree.min(splats.sh_degree());
-    // Light that a splat may cover: opacity times the area of its largest cross section.
-    let importance = |i: usize| {
-        let mut scales: [f32; 3] = std::array::from_fn(|c| splats.log_scales.get(c, i));
-        scales.sort_unstable_by(f32::total_cmp);
-        splats.opacity(i).ln() + scales[2] + scales[1]
-    };
-    let is_drawn = |i: &u32| {
-        let i = *i as usize;
-        let values = splats
-            .columns()
-            .into_iter()
-            .take(4)
-            .flat_map(|column| (0..column.count()).map(move |c| column.get(c, i)));
-        splats.opacity(i) >= ALPHA_MIN as f32 && values.into_iter().all(f32::is_finite)
-    };
-    let mut order: Vec<(f32, u32)> = (0..splats.len() as u32)
-        .into_par_iter()
-        .filter(is_drawn)
-        .map(|i| (importance(i as usize), i))
-        .collect();
-    order.par_sort_unstable_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
+    let mut order = by_importance(splats);
     order.truncate(most);
-
     let band = band_bytes(degree);
     let mut bytes = vec![0; HEADER + order.len() * (CORE + band)];
     bytes[..4].copy_from_slice(b"IRS1");
@@ -63,11 +42,11 @@ pub(crate) fn compact(splats: &Splats, degree: u32, most: usize) -> Vec<u8> {
         .zip(order.par_chunks(BLOCK))
         .for_each(|(to, order)| {
             let (cores, bands) = to.split_at_mut(order.len() * CORE);
-            for (to, (_, i)) in cores.chunks_exact_mut(CORE).zip(order) {
+            for (to, i) in cores.chunks_exact_mut(CORE).zip(order) {
                 write_core(splats, *i as usize, to);
             }
             if band > 0 {
-                for (to, (_, i)) in bands.chunks_exact_mut(band).zip(order) {
+                for (to, i) in bands.chunks_exact_mut(band).zip(order) {
                     write_bands(splats, *i as usize, degree, to);
                 }
             }

@@ -3,7 +3,7 @@
 //! pictures, and its own only.
 
 use crate::message::{RawShot, Shot};
-use crate::pace::Pace;
+use crate::pace::{Detail, Pace};
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
@@ -18,9 +18,9 @@ const REST: Duration = Duration::from_millis(100);
 /// Wishes other than pictures that wait.
 const JOBS: usize = 4;
 /// Between two copies of a training's scene passes this many times what a copy and its picture take.
-const AT_REST: u32 = 15;
+const AT_REST: u32 = 40;
 /// Least time between two copies of a training's scene.
-const COPIES: Duration = Duration::from_millis(700);
+const COPIES: Duration = Duration::from_millis(1000);
 
 /// A message to a page.
 pub(crate) enum Out {
@@ -30,29 +30,22 @@ pub(crate) enum Out {
 
 /// A thing to draw or to find out for a page.
 pub(crate) enum Task {
-    Picture {
-        shot: Shot,
-        /// Share of the window's pixels.
-        share: f32,
-        moving: bool,
-        sharp: bool,
-    },
-    Pick {
-        x: f32,
-        y: f32,
-        tag: String,
-        shot: RawShot,
-    },
-    Score {
-        view: usize,
-    },
+    Picture { shot: Shot, detail: Detail },
+    Pick { x: f32, y: f32, tag: String, shot: RawShot },
+    Score { view: usize },
 }
 
 struct Drawn {
     id: u64,
     version: u64,
-    share: f32,
-    sharp: bool,
+    detail: Detail,
+}
+
+impl Drawn {
+    /// The share of pixels, if all splats were drawn.
+    fn share(&self) -> Option<f32> {
+        (self.detail.splats == 1.0).then_some(self.detail.pixels)
+    }
 }
 
 struct Seat {
@@ -236,26 +229,22 @@ impl Desk {
     }
 
     /// Delivers a picture drawn in `seconds`.
-    #[expect(clippy::too_many_arguments, reason = "a picture and how it came about")]
     pub fn deliver(
         &self,
         seat: u64,
         shot: &Shot,
+        detail: Detail,
         bytes: Vec<u8>,
         pixels: f32,
         seconds: f32,
-        share: f32,
-        moving: bool,
-        sharp: bool,
         version: u64,
     ) {
         self.with_seat(seat, |seat| {
-            seat.pace.learn(pixels, seconds, moving);
+            seat.pace.learn(&detail, pixels, seconds);
             seat.drawn = Some(Drawn {
                 id: shot.id,
                 version,
-                share,
-                sharp,
+                detail,
             });
             // The outbox has more room than pictures may be in flight: a full one belongs to a page that is being closed.
             if seat.outbox.try_send(Out::Binary(bytes)).is_ok() {
@@ -269,9 +258,9 @@ impl Desk {
         self.with_seat(seat, |seat| drop(seat.outbox.try_send(Out::Text(text))));
     }
 
-    /// Leaves time to a training after `seconds` of drawing a moving camera.
+    /// Leaves time to a training after `seconds` of drawing a moving camera, of which the browser's share is about as much.
     pub fn rest(&self, seconds: f32) {
-        self.lock().rest_until = Some(Instant::now() + Duration::from_secs_f32(2.0 * seconds));
+        self.lock().rest_until = Some(Instant::now() + Duration::from_secs_f32(4.5 * seconds));
     }
 
     /// When the next copy of a training's scene is due, after a picture of the present one that took `seconds` and a copy that took
@@ -322,26 +311,19 @@ impl Seat {
             return Next::Nothing;
         };
         let same = self.drawn.as_ref().filter(|drawn| drawn.id == shot.id);
-        let picture = |moving: bool, last: Option<f32>| {
-            let (share, sharp) = self.pace.share(&shot, moving, last);
-            Next::Now(Box::new(Task::Picture {
-                shot,
-                share,
-                moving,
-                sharp,
-            }))
-        };
+        let picture = |detail| Next::Now(Box::new(Task::Picture { shot, detail }));
+        let resting = |last| picture(self.pace.resting(&shot, last));
         let rests_at = self.shot_at + REST;
         match same {
-            None => picture(true, None),
+            None => picture(self.pace.moving(&shot, now.training)),
             Some(drawn) if drawn.version != now.version => match renew_after.filter(|after| *after > clock) {
                 // The camera has just stopped: it becomes sharp first.
-                _ if !drawn.sharp && rests_at <= clock => picture(false, None),
+                _ if !drawn.detail.sharp && rests_at <= clock => resting(None),
                 Some(after) => Next::At(after.min(rests_at.max(clock))),
-                None => picture(false, Some(drawn.share)),
+                None => resting(drawn.share()),
             },
-            Some(drawn) if !drawn.sharp && rests_at <= clock => picture(false, Some(drawn.share)),
-            Some(drawn) if !drawn.sharp => Next::At(rests_at),
+            Some(drawn) if !drawn.detail.sharp && rests_at <= clock => resting(drawn.share()),
+            Some(drawn) if !drawn.detail.sharp => Next::At(rests_at),
             Some(_) => Next::Nothing,
         }
     }
@@ -374,20 +356,15 @@ mod tests {
         training: false,
     };
 
-    fn next(desk: &Desk) -> (u64, Shot, bool, bool) {
+    fn next(desk: &Desk) -> (u64, Shot, Detail) {
         match desk.next(|| STILL) {
-            Some((
-                seat,
-                Task::Picture {
-                    shot, moving, sharp, ..
-                },
-            )) => (seat, shot, moving, sharp),
+            Some((seat, Task::Picture { shot, detail })) => (seat, shot, detail),
             _ => panic!("a picture"),
         }
     }
 
-    fn deliver(desk: &Desk, seat: u64, shot: &Shot, moving: bool, sharp: bool) {
-        desk.deliver(seat, shot, vec![], 1e4, 0.001, 1.0, moving, sharp, 1);
+    fn deliver(desk: &Desk, seat: u64, shot: &Shot, detail: Detail) {
+        desk.deliver(seat, shot, detail, vec![], 1e4, 0.001, 1);
     }
 
     #[test]
@@ -397,18 +374,18 @@ mod tests {
         let seat = desk.sit(outbox).expect("free");
         desk.want(seat, Some(shot(1)));
         desk.want(seat, Some(shot(2)));
-        let (_, drawn, moving, sharp) = next(&desk);
-        assert!(drawn.id == 2 && moving && !sharp);
+        let (_, drawn, detail) = next(&desk);
+        assert!(drawn.id == 2 && detail.moving && !detail.sharp);
         desk.want(seat, Some(shot(3)));
         assert!(!desk.is_wanted(seat, &drawn));
-        deliver(&desk, seat, &drawn, true, false);
+        deliver(&desk, seat, &drawn, detail);
         let (_, drawn, ..) = next(&desk);
         assert_eq!(drawn.id, 3);
-        deliver(&desk, seat, &drawn, true, false);
+        deliver(&desk, seat, &drawn, detail);
         desk.shown(seat, 2);
         // Nothing newer: the next one, after a moment, is the sharp one of the same wish.
-        let (_, drawn, moving, sharp) = next(&desk);
-        assert!(drawn.id == 3 && !moving && sharp);
+        let (_, drawn, resting) = next(&desk);
+        assert!(drawn.id == 3 && !resting.moving && resting.sharp);
         assert!(inbox.try_recv().is_ok() && inbox.try_recv().is_ok() && inbox.try_recv().is_err());
     }
 
@@ -421,12 +398,12 @@ mod tests {
         for id in 1..=6 {
             desk.want(slow, Some(shot(id)));
             desk.want(fast, Some(shot(id)));
-            let (first, drawn, ..) = next(&desk);
-            deliver(&desk, first, &drawn, true, false);
+            let (first, drawn, detail) = next(&desk);
+            deliver(&desk, first, &drawn, detail);
             if id <= IN_FLIGHT as u64 {
-                let (second, drawn, ..) = next(&desk);
+                let (second, drawn, detail) = next(&desk);
                 assert_ne!(first, second, "in turn");
-                deliver(&desk, second, &drawn, true, false);
+                deliver(&desk, second, &drawn, detail);
             } else {
                 assert_eq!(first, fast);
             }

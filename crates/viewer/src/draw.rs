@@ -2,6 +2,7 @@
 
 use crate::desk::{Desk, Now, Task};
 use crate::message::{PictureHeader, Shot, picture};
+use crate::pace::Detail;
 use crate::paint::{Painter, Picture};
 use crate::subject::{Edition, Subject};
 use jpeg_encoder::{ColorType, Encoder, SamplingFactor};
@@ -27,23 +28,9 @@ pub(crate) fn draw(subject: &Subject, desk: &Desk) {
     while let Some((seat, task)) = desk.next(now) {
         let Some(edition) = subject.edition() else { continue };
         match task {
-            Task::Picture {
-                shot,
-                share,
-                moving,
-                sharp,
-            } => draw_picture(
-                subject,
-                desk,
-                &mut painter,
-                &edition,
-                seat,
-                &shot,
-                share,
-                moving,
-                sharp,
-                &mut renewed,
-            ),
+            Task::Picture { shot, detail } => {
+                draw_picture(subject, desk, &mut painter, &edition, seat, &shot, detail, &mut renewed);
+            }
             Task::Pick { x, y, tag, shot } => {
                 if let Some(shot) = shot.check() {
                     let picked = painter.pick(&edition, &shot, x, y, tag);
@@ -68,13 +55,14 @@ fn draw_picture(
     edition: &Edition,
     seat: u64,
     shot: &Shot,
-    share: f32,
-    moving: bool,
-    sharp: bool,
+    detail: Detail,
     renewed: &mut u64,
 ) {
+    let opened = Instant::now();
+    painter.prepare(edition, &detail);
+    // What is done once a version does not tell what pictures cost.
     let started = Instant::now();
-    let k = shot.camera.intrinsics.scaled(share.sqrt());
+    let k = shot.camera.intrinsics.scaled(detail.pixels.sqrt());
     let view = shot.view.and_then(|view| subject.views.0.get(view));
     // Its photograph may be missing: then there is no picture of errors.
     let shot_drawn = match view.is_some_and(|view| view.photo.is_some()) {
@@ -89,35 +77,26 @@ fn draw_picture(
         },
     };
     let wanted = || desk.is_wanted(seat, shot);
-    let Some(drawn) = painter.paint(edition, &shot_drawn, (k.width, k.height), view, &wanted) else {
+    let Some(drawn) = painter.paint(edition, &shot_drawn, &detail, (k.width, k.height), view, &wanted) else {
         return;
     };
-    let jpeg = to_jpeg(&drawn, if sharp { SHARP_QUALITY } else { MOVING_QUALITY });
+    let jpeg = to_jpeg(&drawn, if detail.sharp { SHARP_QUALITY } else { MOVING_QUALITY });
     let seconds = started.elapsed().as_secs_f32();
     let header = PictureHeader {
         id: shot.id,
         width: drawn.width,
         height: drawn.height,
-        sharp,
+        sharp: detail.sharp,
         version: edition.version,
         milliseconds: 1e3 * seconds,
         range: drawn.range,
     };
     let pixels = drawn.width as f32 * drawn.height as f32;
     let bytes = picture(&header, &jpeg);
-    desk.deliver(
-        seat,
-        shot,
-        bytes,
-        pixels,
-        seconds,
-        share,
-        moving,
-        sharp,
-        edition.version,
-    );
+    desk.deliver(seat, shot, detail, bytes, pixels, seconds, edition.version);
     if let Some(live) = &subject.live {
-        if moving {
+        let seconds = opened.elapsed().as_secs_f32();
+        if detail.moving {
             desk.rest(seconds);
         }
         if *renewed < edition.version {

@@ -1,21 +1,48 @@
-//! How many pixels are drawn: as many as fit into a frame's time while the camera moves, then step by step all of them.
+//! How much is drawn: as many pixels and splats as fit into a frame's time while the camera moves, then step by step all of them.
 
 use crate::message::{MAX_PIXELS, Shot};
 
 /// Seconds of drawing and encoding a picture of a moving camera: 25 pictures a second.
 const MOVING: f32 = 0.04;
+/// The same while a training shares the processor: smaller pictures, so that as many remain beside its steps.
+const MOVING_IN_TRAINING: f32 = 0.015;
 /// Seconds within which a camera at rest gets a better picture.
 const RESTING: f32 = 0.2;
 /// Least share of the window's pixels.
 const LEAST: f32 = 0.03;
+/// Share of a moving picture's time that half of the splats must leave unused at every pixel before all of them are drawn: all take
+/// less than twice the time.
+const SPARE: f32 = 0.5;
 
-/// The cost of pictures as measured, as `fixed + per_pixel * pixels`.
+/// How much of a picture is drawn.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Detail {
+    /// Share of the window's pixels.
+    pub pixels: f32,
+    /// Share of the splats, most important first: 1, or at most [`Detail::MOST_SPLATS`].
+    pub splats: f32,
+    /// Whether the camera moves.
+    pub moving: bool,
+    /// Seconds that drawing it should take.
+    pub seconds: f32,
+    /// Whether nothing better follows.
+    pub sharp: bool,
+}
+
+impl Detail {
+    /// The largest share of splats that is not all.
+    pub const MOST_SPLATS: f32 = 0.5;
+}
+
+/// The cost of pictures as measured.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Pace {
-    /// Seconds per pixel, with the fixed part; of the last pictures.
+    /// Seconds per pixel of the last picture, with what does not depend on the pixels.
     per_pixel: f32,
     /// Share of the window's pixels drawn while moving.
     share: f32,
+    /// Whether all splats are drawn while moving.
+    all: bool,
 }
 
 impl Default for Pace {
@@ -23,6 +50,7 @@ impl Default for Pace {
         Self {
             per_pixel: 1e-7,
             share: 0.1,
+            all: false,
         }
     }
 }
@@ -34,27 +62,50 @@ fn most(shot: &Shot) -> f32 {
 }
 
 impl Pace {
-    /// The share of pixels for the next picture, and whether it is the final one. `last`: the share of the last picture of the same
-    /// camera at rest, if there is one.
-    pub fn share(&self, shot: &Shot, moving: bool, last: Option<f32>) -> (f32, bool) {
-        let most = most(shot);
-        if moving {
-            return (self.share.min(most), false);
+    /// How the next picture of a moving camera is drawn.
+    pub fn moving(&self, shot: &Shot, training: bool) -> Detail {
+        Detail {
+            seconds: if training { MOVING_IN_TRAINING } else { MOVING },
+            pixels: self.share.min(most(shot)),
+            // Coarser pixels hide that fewer splats are drawn.
+            splats: if self.all {
+                1.0
+            } else {
+                Detail::MOST_SPLATS * self.share.sqrt()
+            },
+            moving: true,
+            sharp: false,
         }
+    }
+
+    /// How the next picture of a camera at rest is drawn. `last`: the pixels' share of its last picture, if it had all splats.
+    pub fn resting(&self, shot: &Shot, last: Option<f32>) -> Detail {
+        let most = most(shot);
         let k = &shot.camera.intrinsics;
         let affordable = RESTING / (self.per_pixel * k.width as f32 * k.height as f32);
         // Four times as many pixels cost at most four times as much.
         let next = affordable.max(last.map_or(0.0, |last| 4.0 * last)).max(self.share);
-        if next >= most { (most, true) } else { (next, false) }
+        Detail {
+            seconds: RESTING,
+            pixels: next.min(most),
+            splats: 1.0,
+            moving: false,
+            sharp: next >= most,
+        }
     }
 
     /// Learns from a picture of `pixels` that took `seconds`.
-    pub fn learn(&mut self, pixels: f32, seconds: f32, moving: bool) {
+    pub fn learn(&mut self, detail: &Detail, pixels: f32, seconds: f32) {
         self.per_pixel = seconds / pixels.max(1.0);
-        if moving {
-            // The fixed part makes the cost grow slower than the pixels: several pictures find the share.
-            let factor = (MOVING / seconds.max(1e-4)).clamp(0.4, 1.4);
+        if detail.moving {
+            // Part of the cost is fixed, so that it grows slower than the share: several pictures find it.
+            let factor = (detail.seconds / seconds.max(1e-4)).clamp(0.4, 1.4);
             self.share = (self.share * factor).clamp(LEAST, 1.0);
+            self.all = if self.all {
+                seconds <= detail.seconds
+            } else {
+                self.share == 1.0 && seconds < SPARE * detail.seconds
+            };
         }
     }
 }
@@ -81,36 +132,53 @@ mod tests {
     }
 
     #[test]
-    fn moving_pictures_find_the_size_that_fits() {
+    fn moving_pictures_find_what_fits() {
         let (mut pace, shot) = (Pace::default(), shot(1000, 1000));
-        let cost = |share: f32| 0.01 + 1e-7 * 1e6 * share;
+        let cost = |detail: &Detail| 0.05 * detail.splats + 1e-7 * 1e6 * detail.pixels;
         for _ in 0..20 {
-            let (share, sharp) = pace.share(&shot, true, None);
-            assert!(!sharp);
-            pace.learn(1e6 * share, cost(share), true);
+            let detail = pace.moving(&shot, false);
+            assert!(!detail.sharp && detail.splats <= Detail::MOST_SPLATS);
+            pace.learn(&detail, 1e6 * detail.pixels, cost(&detail));
         }
-        let (share, _) = pace.share(&shot, true, None);
-        assert!((cost(share) - MOVING).abs() < 0.004, "{share}");
+        let found = cost(&pace.moving(&shot, false));
+        assert!((found - MOVING).abs() < 0.004, "{found}");
+    }
+
+    #[test]
+    fn all_splats_are_drawn_while_moving_where_they_fit_and_it_stays_so() {
+        for (cost, all) in [(0.02, true), (0.039, true), (0.07, false)] {
+            let (mut pace, shot) = (Pace::default(), shot(1000, 1000));
+            let seconds = |detail: &Detail| cost * (0.1 + 0.9 * detail.splats * detail.pixels);
+            let mut drawn = Vec::new();
+            for _ in 0..40 {
+                let detail = pace.moving(&shot, false);
+                drawn.push(detail.splats == 1.0);
+                pace.learn(&detail, 1e6 * detail.pixels, seconds(&detail));
+            }
+            assert!(drawn[20..].iter().all(|drawn| *drawn == all), "{cost}: {drawn:?}");
+        }
     }
 
     #[test]
     fn a_camera_at_rest_gets_every_pixel_at_once_or_in_steps() {
         let (mut pace, shot) = (Pace::default(), shot(1000, 1000));
-        pace.learn(1e6, 0.1, false);
-        assert_eq!(pace.share(&shot, false, None), (1.0, true));
+        let full = pace.resting(&shot, None);
+        pace.learn(&full, 1e6, 0.1);
+        let detail = pace.resting(&shot, None);
+        assert_eq!((detail.pixels, detail.splats, detail.sharp), (1.0, 1.0, true));
         // A field of 10 microseconds a pixel.
-        pace.learn(1e5, 1.0, true);
-        let (mut share, mut sharp) = pace.share(&shot, false, None);
-        assert!(share < 0.2 && !sharp);
+        pace.learn(&pace.moving(&shot, false), 1e5, 1.0);
+        let mut detail = pace.resting(&shot, None);
+        assert!(detail.pixels < 0.2 && !detail.sharp);
         for _ in 0..4 {
-            (share, sharp) = pace.share(&shot, false, Some(share));
+            detail = pace.resting(&shot, Some(detail.pixels));
         }
-        assert_eq!((share, sharp), (1.0, true));
+        assert_eq!((detail.pixels, detail.sharp), (1.0, true));
     }
 
     #[test]
     fn huge_windows_get_a_smaller_picture() {
-        let (share, sharp) = Pace::default().share(&shot(4096, 4096), false, Some(0.1));
-        assert!(sharp && share * 4096.0 * 4096.0 <= MAX_PIXELS * 1.001);
+        let detail = Pace::default().resting(&shot(4096, 4096), Some(0.1));
+        assert!(detail.sharp && detail.pixels * 4096.0 * 4096.0 <= MAX_PIXELS * 1.001);
     }
 }

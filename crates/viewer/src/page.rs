@@ -44,6 +44,7 @@ const FILES: &[(&str, &str, &str)] = files![
     SCRIPT "js/xr.js",
     TEXT "shaders/project.frag",
     TEXT "shaders/project.vert",
+    TEXT "shaders/shape.frag",
     TEXT "shaders/splat.frag",
     TEXT "shaders/splat.vert",
     CSS "style/controls.css",

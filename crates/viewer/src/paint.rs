@@ -1,6 +1,8 @@
 //! The picture of a camera: colours, depth, alpha, normals, counts, ellipses, or the error against a photograph.
 
+use crate::importance::by_importance;
 use crate::message::{Mode, Picked, PickedSplat, Shot};
+use crate::pace::Detail;
 use crate::palette;
 use crate::subject::Edition;
 use crate::views::SeenView;
@@ -45,6 +47,8 @@ struct Planes {
 #[derive(Default)]
 pub(crate) struct Painter {
     renderer: Renderer,
+    /// The most important splats of a version, most important first.
+    most: Option<(u64, Splats)>,
     /// Splats that differ from the scene's: clipped, or coloured by their normals.
     altered: Option<(Alteration, Splats)>,
     /// The last photograph that was read, by its view.
@@ -54,16 +58,37 @@ pub(crate) struct Painter {
 #[derive(Clone, Copy, PartialEq)]
 struct Alteration {
     version: u64,
+    /// Whether they are altered from [`Painter::most`].
+    most: bool,
     clip: Option<[[f32; 3]; 2]>,
     normals: bool,
 }
 
 impl Painter {
-    /// Draws `shot` with `width` x `height` pixels; `None` if it is abandoned meanwhile, or its photograph cannot be read.
+    /// Makes what pictures of this detail need, once a version.
+    pub fn prepare(&mut self, edition: &Edition, detail: &Detail) {
+        if detail.splats == 1.0
+            || self
+                .most
+                .as_ref()
+                .is_some_and(|(version, _)| *version == edition.version)
+        {
+            return;
+        }
+        self.most = edition.scene().model.splats().map(|splats| {
+            let count = (splats.len() as f32 * Detail::MOST_SPLATS).ceil() as usize;
+            let mut order = by_importance(splats);
+            order.truncate(count);
+            (edition.version, splats.gather(&order))
+        });
+    }
+
+    /// Draws `shot` with `width` x `height` pixels, after [`Self::prepare`]; `None` if it is abandoned meanwhile, or its photograph cannot be read.
     pub fn paint(
         &mut self,
         edition: &Edition,
         shot: &Shot,
+        detail: &Detail,
         (width, height): (u32, u32),
         view: Option<&SeenView>,
         wanted: &(dyn Fn() -> bool + Sync),
@@ -78,16 +103,20 @@ impl Painter {
         };
         let (rgb, range) = match (&scene.model, shot.mode) {
             (Model::Splats { splats, residual }, mode) => {
-                let altered = self.altered(edition, splats, shot, &camera);
+                let most = self.most.take();
+                let few = most.as_ref().filter(|_| detail.splats < 1.0);
                 let options = RenderOptions {
                     sh_degree: if mode == Mode::Normals { 0 } else { options.sh_degree },
+                    first: few.map_or(usize::MAX, |_| (detail.splats * splats.len() as f32) as usize),
                     ..options
                 };
-                let splats = altered.as_ref().map_or(splats.as_ref(), |(_, splats)| splats);
+                let splats = few.map_or(splats.as_ref(), |(_, splats)| splats);
+                let altered = self.altered(edition, splats, few.is_some(), shot, &camera);
+                let splats = altered.as_ref().map_or(splats, |(_, splats)| splats);
                 let residual = residual.as_deref().filter(|_| mode != Mode::Normals);
                 render_splats(splats, residual, &mut self.renderer, &camera, &options);
                 let drawn = self.splats_picture(mode, &options, (width, height), shot, view);
-                self.altered = altered;
+                (self.altered, self.most) = (altered, most);
                 drawn?
             }
             (Model::Field(field), mode) => {
@@ -108,11 +137,13 @@ impl Painter {
         &mut self,
         edition: &Edition,
         splats: &Splats,
+        most: bool,
         shot: &Shot,
         camera: &Camera,
     ) -> Option<(Alteration, Splats)> {
         let alteration = Alteration {
             version: edition.version,
+            most,
             clip: shot.clip,
             normals: shot.mode == Mode::Normals,
         };
@@ -240,6 +271,7 @@ impl Painter {
                 let altered = self.altered(
                     edition,
                     splats,
+                    false,
                     &Shot {
                         mode: Mode::Color,
                         ..*shot

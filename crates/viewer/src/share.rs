@@ -146,7 +146,7 @@ fn page(scene: &Scene, options: &ShareOptions, packed: Option<&[u8]>) -> String 
     let mut text = |kind: &str, id: &str, text: &str| {
         texts += &format!("<script type=\"{kind}\" id=\"{id}\">{text}</script>\n");
     };
-    for name in ["project.vert", "project.frag", "splat.vert", "splat.frag"] {
+    for name in ["project.vert", "project.frag", "splat.vert", "splat.frag", "shape.frag"] {
         text(
             "text/plain",
             name,
@@ -154,7 +154,11 @@ fn page(scene: &Scene, options: &ShareOptions, packed: Option<&[u8]>) -> String 
         );
     }
     // A worker of a page from the disk can be no module: what it exports is for tests.
-    text("text/plain", "order.js", &module("js/local/order.js").replace("\nexport ", "\n"));
+    text(
+        "text/plain",
+        "order.js",
+        &module("js/local/order.js").replace("\nexport ", "\n"),
+    );
     text(
         "application/json",
         "view",

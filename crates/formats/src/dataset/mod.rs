@@ -17,8 +17,10 @@ pub(crate) mod transforms;
 mod world;
 
 use crate::FormatError;
+pub(crate) use assemble::{oriented_size, turned_as_stored};
 use declared::Declared;
 pub(crate) use declared::DeclaredPoints;
+pub(crate) use files::is_image_name;
 use irradia_scene::Dataset;
 pub use split::Holdout;
 use std::fmt;

@@ -7,6 +7,7 @@ pub mod eval;
 pub mod files;
 mod film;
 pub mod lpips;
+pub mod pose;
 mod progress;
 pub mod recipe;
 mod recipe_keys;

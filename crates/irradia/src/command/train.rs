@@ -1,6 +1,7 @@
 //! `irradia train`
 
 use super::lpips::{self, lpips_path, unseen_lpips_path};
+use super::pose::{is_unposed, pose_first};
 use super::progress::{Progress, size_in_words};
 use super::view::ListenArgs;
 use super::{DataArgs, by_option, thread_count, use_threads, warn};
@@ -15,7 +16,8 @@ use std::sync::atomic::Ordering;
 
 #[derive(clap::Args)]
 pub struct Args {
-    /// Folder of posed photographs (COLMAP, nerfstudio, Blender, LLFF); not needed with --resume and --replay
+    /// Folder of posed photographs (COLMAP, nerfstudio, Blender, LLFF), or photographs or a film without poses, which are posed
+    /// first; not needed with --resume and --replay
     #[arg(required_unless_present_any = ["resume", "replay"])]
     pub data: Option<PathBuf>,
     /// Folder for the run
@@ -24,6 +26,9 @@ pub struct Args {
     /// Built-in recipe or a .toml file
     #[arg(long, value_name = "NAME|FILE", default_value = DEFAULT_RECIPE, conflicts_with = "resume")]
     pub recipe: String,
+    /// Train although fewer than 80 % of the photographs could be posed
+    #[arg(long)]
+    pub anyway: bool,
     /// Override one key of the recipe, such as stage.grow.params.ssim_weight=0.3
     #[arg(long, value_name = "KEY=VALUE", conflicts_with = "resume")]
     pub set: Vec<String>,
@@ -124,7 +129,16 @@ pub fn run(args: &Args) -> Result<()> {
     match (&args.resume, &args.replay) {
         (Some(run), _) => resume(run, args),
         (None, Some(run)) => begin(replay(run, args)?, args.viewer()),
-        (None, None) => begin(input(args)?, args.viewer()),
+        (None, None) => {
+            let mut input = input(args)?;
+            if is_unposed(&input.data) {
+                // Posing takes a while: mistakes are reported first.
+                input.clone().check().map_err(by_option)?;
+                RunFolder::check_free(&input.out, input.overwrite)?;
+                pose_first(&mut input, args.anyway)?;
+            }
+            begin(input, args.viewer())
+        }
     }
 }
 

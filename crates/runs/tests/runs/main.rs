@@ -1,6 +1,7 @@
 //! The library as a program uses it: requests, runs, observers, and scenes.
 
 mod every_recipe;
+mod pose;
 mod requests;
 mod scenes;
 mod snapshots;

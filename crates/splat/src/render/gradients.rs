@@ -431,6 +431,7 @@ fn every_level_matches_double_precision() {
             sh_degree: scene.degree,
             antialias: scene.antialias,
             depth: true,
+            ..RenderOptions::default()
         };
         let plane = |c: usize| scene.weights.iter().map(move |w| w[c] as f32);
         let (v_color, v_alpha, v_depth): (Vec<f32>, Vec<f32>, Vec<f32>) =

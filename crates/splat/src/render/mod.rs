@@ -45,6 +45,8 @@ pub struct RenderOptions {
     pub antialias: bool,
     /// Fill [`Renderer::depth`].
     pub depth: bool,
+    /// Splats to draw: the first ones, rounded up to a multiple of [`CHUNK`].
+    pub first: usize,
 }
 
 impl Default for RenderOptions {
@@ -54,6 +56,7 @@ impl Default for RenderOptions {
             sh_degree: 3,
             antialias: false,
             depth: false,
+            first: usize::MAX,
         }
     }
 }
@@ -373,6 +376,7 @@ impl Renderer {
             self.seen.clear();
             self.seen.resize(chunks, true);
         }
+        self.seen[options.first.div_ceil(CHUNK).min(chunks)..].fill(false);
         let footprints = self.footprints.chunks_mut(CHUNK);
         let depth_keys = self.depth_keys.chunks_mut(CHUNK);
         let mut jobs: Vec<ChunkJob> = footprints

@@ -107,6 +107,9 @@ documented! {
         /// of the run, photographs differ in exposure beyond what adjacent cameras predict.
         #[serde(default, skip_serializing_if = "Choice::is_no")]
         pub exposure: Choice,
+        /// Leave out photographs whose error, after a fifth of the run, is far beyond the others': wrong poses, or another scene.
+        #[serde(default, skip_serializing_if = "is_false")]
+        pub drop_misfits: bool,
         /// Refine the cameras' poses.
         #[serde(default, skip_serializing_if = "is_false")]
         pub refine_poses: bool,

@@ -130,7 +130,7 @@ function gizmo(owner) {
   }));
   svg.append(...ends.map(({ group }) => group));
   const place = () => {
-    const [right, down, ahead] = axes(state.get("camera").rotation);
+    const [right, down, ahead] = axes((owner.shown?.camera ?? state.get("camera")).rotation);
     const at = (/** @type {Vec3} */ v) => [right, down, ahead].map((axis) => axis[0] * v[0] + axis[1] * v[1] + axis[2] * v[2]);
     const order = ends.map((end) => ({ end, place: at(end.from) })).sort((a, b) => b.place[2] - a.place[2]);
     for (const { end, place: [x, y] } of order) {
@@ -145,7 +145,9 @@ function gizmo(owner) {
     // Nearest last, so that it is on top; untouched while an end has the keyboard's focus.
     if (!svg.contains(document.activeElement)) svg.append(...order.map(({ end }) => end.group));
   };
-  state.watch(["camera"], place);
+  place();
+  // With the picture, not with each of the camera's changes in between.
+  owner.addEventListener("drawing", place);
   return svg;
 }
 

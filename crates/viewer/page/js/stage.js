@@ -22,8 +22,8 @@ const DENSITY = 2;
 /** Milliseconds between the two pictures of a blink. */
 const BLINK = 700;
 
-/** What lines and layout depend on. @type {(keyof import("./state.js").Values)[]} */
-const LINES = ["camera", "pivot", "view", "views", "frusta", "axes", "clip", "measured", "metres", "scores", "compare", "tab", "scene", "sidebar"];
+/** What lines and layout depend on, beside the camera. @type {(keyof import("./state.js").Values)[]} */
+const LINES = ["pivot", "view", "views", "frusta", "axes", "clip", "measured", "metres", "scores", "compare", "tab", "scene", "sidebar"];
 
 export class Stage extends HTMLElement {
   /** What is on the screen now. @type {{ camera: Camera, k: Intrinsics, header: Header | null } | null} */
@@ -64,6 +64,9 @@ export class Stage extends HTMLElement {
     }
     const touch = () => (this.stale = true);
     for (const key of LINES) state.addEventListener(key, touch);
+    // The lines over a served picture have its camera: its arrival renews them. A canvas renewed 60 times a second costs half a core
+    // where the browser composes without a GPU.
+    state.addEventListener("camera", () => (this.stale ||= this.drawsLocally));
     for (const source of [this, path, thumbnails]) for (const kind of ["drawing", "change", "load"]) source.addEventListener(kind, touch);
     state.addEventListener("scene", () => local.load(state.get("scene")));
     state.watch(["view", "compare", "views"], () => this.showPhoto());

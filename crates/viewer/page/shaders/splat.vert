@@ -4,7 +4,9 @@ precision highp float;
 precision highp int;
 precision highp usampler2D;
 
-layout(location = 0) in uint a_splat;
+const int BATCH = 128; // splats an instance, as in js/local/renderer.js
+uniform usampler2D u_order; // [rows, 1024]
+uniform int u_drawn;
 uniform usampler2D u_place;
 uniform usampler2D u_look;
 uniform vec2 u_size; // pixels
@@ -14,12 +16,15 @@ flat out vec4 v_color;
 out vec2 v_at; // standard deviations; pixels for points
 
 void main() {
-  ivec2 texel = ivec2(int(a_splat & 1023u), int(a_splat >> 10));
-  uvec4 look = texelFetch(u_look, texel, 0);
-  vec2 blue_opacity = unpackHalf2x16(look.y);
   gl_Position = vec4(2.0, 2.0, 2.0, 1.0);
   v_at = vec2(0.0);
   v_color = vec4(0.0);
+  int at = gl_InstanceID * BATCH + (gl_VertexID >> 2);
+  if (at >= u_drawn) return;
+  int splat = int(texelFetch(u_order, ivec2(at & 1023, at >> 10), 0).x);
+  ivec2 texel = ivec2(splat & 1023, splat >> 10);
+  uvec4 look = texelFetch(u_look, texel, 0);
+  vec2 blue_opacity = unpackHalf2x16(look.y);
   if (blue_opacity.y == 0.0) return;
   uvec4 place = texelFetch(u_place, texel, 0);
   float reach = uintBitsToFloat(look.z);

@@ -5,7 +5,7 @@ use crate::Malformed;
 use crate::bytes::Bytes;
 
 /// The id that means "no point".
-const NO_POINT: u64 = u64::MAX;
+pub(super) const NO_POINT: u64 = u64::MAX;
 
 /// Parses `cameras.bin`.
 ///

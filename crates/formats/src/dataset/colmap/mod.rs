@@ -3,6 +3,7 @@
 
 pub mod binary;
 pub mod text;
+mod write;
 
 use super::declared::{Declared, DeclaredCamera, DeclaredPoints, DeclaredPose, DeclaredView, Focal, lens_or_pinhole};
 use super::files::{ImageFolder, choose_image_folder, find_image};
@@ -13,6 +14,7 @@ use glam::{DQuat, DVec3};
 use irradia_scene::Lens;
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
+pub use write::{ColmapModel, PosedImage, TrackedPoint, write_colmap};
 
 /// A row of `cameras`.
 #[derive(Clone, Debug, PartialEq)]

@@ -1,0 +1,113 @@
+#!/usr/bin/env python3
+"""Poses the same photographs with `irradia pose` and with COLMAP, and compares time, registration and relative poses.
+
+    python3 -m venv venv && venv/bin/pip install pycolmap numpy
+    venv/bin/python bench/pose.py target/release/irradia PHOTOS [PHOTOS ..]
+
+COLMAP runs twice on the CPU with its defaults (SIFT, exhaustive matching, incremental mapping), one camera for all photographs: its
+second run against its first shows how far two runs differ. AUC@t is the area under the recall of relative poses, the error of a pair
+being the larger of the angles between rotations and between directions of translation, up to t degrees, in per cent; a photograph
+without a pose counts as wrong.
+"""
+
+import itertools
+import json
+import pathlib
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+
+import numpy as np
+import pycolmap
+
+
+def run_irradia(program, photos, out):
+    start = time.perf_counter()
+    subprocess.run([program, "pose", photos, "--out", out], check=True, stdout=subprocess.DEVNULL)
+    seconds = time.perf_counter() - start
+    report = json.loads((out / "pose.json").read_text())
+    stages = {stage["name"]: stage["seconds"] for stage in report["stages"]}
+    return seconds, stages, pycolmap.Reconstruction(out / "sparse" / "0")
+
+
+def run_colmap(photos, out):
+    out.mkdir()
+    database = out / "database.db"
+    times = [time.perf_counter()]
+    pycolmap.extract_features(
+        database, photos, camera_mode=pycolmap.CameraMode.SINGLE, device=pycolmap.Device.cpu
+    )
+    times.append(time.perf_counter())
+    pycolmap.match_exhaustive(database, device=pycolmap.Device.cpu)
+    times.append(time.perf_counter())
+    models = pycolmap.incremental_mapping(database, photos, out)
+    times.append(time.perf_counter())
+    names = ["features", "matches", "poses"]
+    stages = {name: b - a for name, a, b in zip(names, times, times[1:])}
+    model = max(models.values(), key=lambda model: model.num_reg_images()) if models else pycolmap.Reconstruction()
+    return times[-1] - times[0], stages, model
+
+
+def poses(model):
+    """Rotation camera-from-world and centre, by name."""
+    found = {}
+    for image in model.images.values():
+        if image.has_pose:
+            found[image.name] = (image.cam_from_world().rotation.matrix(), image.projection_center())
+    return found
+
+
+def angle(cosine):
+    return np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+
+
+def pair_errors(truth, other):
+    errors = []
+    for a, b in itertools.combinations(sorted(truth), 2):
+        if a not in other or b not in other:
+            errors.append(180.0)
+            continue
+        relative = [of[b][0] @ of[a][0].T for of in (truth, other)]
+        direction = [of[a][0] @ (of[b][1] - of[a][1]) for of in (truth, other)]
+        lengths = [np.linalg.norm(d) for d in direction]
+        rotation = angle((np.trace(relative[0].T @ relative[1]) - 1.0) / 2.0)
+        translation = angle(direction[0] @ direction[1] / max(lengths[0] * lengths[1], 1e-12))
+        errors.append(max(rotation, translation))
+    return np.array(errors)
+
+
+def auc(errors, threshold):
+    return 100.0 * np.mean(np.maximum(0.0, 1.0 - errors / threshold)) if len(errors) else 0.0
+
+
+def main():
+    if len(sys.argv) < 3:
+        sys.exit(__doc__)
+    program = pathlib.Path(sys.argv[1]).resolve()
+    for photos in map(pathlib.Path, sys.argv[2:]):
+        folder = pathlib.Path(tempfile.mkdtemp())
+        try:
+            ours = run_irradia(program, photos, folder / "irradia")
+            colmap = run_colmap(photos, folder / "colmap")
+            again = run_colmap(photos, folder / "again")
+            count = sum(1 for file in photos.iterdir() if file.suffix.lower() in (".jpg", ".jpeg", ".png"))
+            print(f"{photos}: {count} photographs")
+            for name, (seconds, stages, model) in (("irradia", ours), ("COLMAP", colmap), ("COLMAP again", again)):
+                times = ", ".join(f"{stage} {value:.1f}" for stage, value in stages.items())
+                focal = np.mean([camera.mean_focal_length() for camera in model.cameras.values()] or [0.0])
+                print(
+                    f"  {name:13} {seconds:6.1f} s ({times}); {model.num_reg_images()} registered, "
+                    f"{model.num_points3D()} points, {model.compute_mean_reprojection_error():.2f} px, focal {focal:.1f}"
+                )
+            truth = poses(colmap[2])
+            for name, model in (("irradia", ours[2]), ("COLMAP again", again[2])):
+                errors = pair_errors(truth, poses(model))
+                print(f"  {name} against COLMAP: AUC@1 {auc(errors, 1):.1f}, AUC@5 {auc(errors, 5):.1f}, median {np.median(errors):.3f} degrees")
+        finally:
+            shutil.rmtree(folder)
+
+
+if __name__ == "__main__":
+    main()

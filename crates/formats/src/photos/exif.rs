@@ -1,0 +1,195 @@
+//! What a camera wrote into its photograph: EXIF 2.32 (CIPA DC-008).
+
+use exif::{Exif, In, Reader, Tag, Value};
+
+/// Width of a frame of 35 mm film, to which equivalent focal lengths refer.
+const FILM_WIDTH_MM: f64 = 36.0;
+
+/// The tags that tell something about the camera.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct CameraTags {
+    /// Manufacturer.
+    pub make: Option<String>,
+    /// Model.
+    pub model: Option<String>,
+    /// Focal length relative to the longer side of the photograph.
+    pub focal: Option<f64>,
+    /// When it was taken: `2024:05:31 12:00:00`, local time.
+    pub time: Option<String>,
+    /// Latitude and longitude in degrees, north and east positive, and altitude in metres.
+    pub gps: Option<[f64; 3]>,
+}
+
+/// The tags of an EXIF block, which begins with the TIFF header; what is absent or damaged is `None`. `size` is that of the stored
+/// pixels.
+pub fn parse_camera_tags(block: &[u8], size: [u32; 2]) -> CameraTags {
+    let Ok(exif) = Reader::new().read_raw(block.to_vec()) else {
+        return CameraTags::default();
+    };
+    CameraTags {
+        make: text(&exif, Tag::Make),
+        model: text(&exif, Tag::Model),
+        focal: focal(&exif, size).filter(|focal| (0.1..50.0).contains(focal)),
+        time: text(&exif, Tag::DateTimeOriginal).or_else(|| text(&exif, Tag::DateTime)),
+        gps: gps(&exif),
+    }
+}
+
+fn text(exif: &Exif, tag: Tag) -> Option<String> {
+    let Value::Ascii(lines) = &exif.get_field(tag, In::PRIMARY)?.value else {
+        return None;
+    };
+    let text = String::from_utf8_lossy(lines.first()?)
+        .trim_matches(['\0', ' '])
+        .to_owned();
+    (!text.is_empty()).then_some(text)
+}
+
+fn number(exif: &Exif, tag: Tag) -> Option<f64> {
+    numbers(exif, tag)?.first().copied()
+}
+
+/// Finite numbers of any type.
+fn numbers(exif: &Exif, tag: Tag) -> Option<Vec<f64>> {
+    let value = &exif.get_field(tag, In::PRIMARY)?.value;
+    let numbers: Vec<f64> = match value {
+        Value::Rational(values) => values.iter().map(|value| value.to_f64()).collect(),
+        _ => (0..).map_while(|i| value.get_uint(i)).map(f64::from).collect(),
+    };
+    numbers.iter().all(|number| number.is_finite()).then_some(numbers)
+}
+
+/// From the focal length in terms of 35 mm film, or in millimetres and the density of the sensor's pixels.
+fn focal(exif: &Exif, size: [u32; 2]) -> Option<f64> {
+    let film = number(exif, Tag::FocalLengthIn35mmFilm).filter(|mm| *mm > 0.0);
+    if let Some(mm) = film {
+        return Some(mm / FILM_WIDTH_MM);
+    }
+    let mm = number(exif, Tag::FocalLength).filter(|mm| *mm > 0.0)?;
+    let density = number(exif, Tag::FocalPlaneXResolution).filter(|density| *density > 0.0)?;
+    let unit_mm = match number(exif, Tag::FocalPlaneResolutionUnit) {
+        Some(3.0) => 10.0,
+        Some(4.0) => 1.0,
+        Some(5.0) => 0.001,
+        // Inches unless stated otherwise.
+        _ => 25.4,
+    };
+    // The density is that of the photograph as taken, which may have been larger.
+    let taken = number(exif, Tag::PixelXDimension).filter(|width| *width > 0.0);
+    let width = taken.unwrap_or(f64::from(size[0]));
+    let [short, long] = [size[0].min(size[1]), size[0].max(size[1])].map(f64::from);
+    let long = if size[0] >= size[1] {
+        width
+    } else {
+        width * long / short
+    };
+    Some(mm * density / unit_mm / long)
+}
+
+fn gps(exif: &Exif) -> Option<[f64; 3]> {
+    let angle = |tag: Tag, reference: Tag, negative: &str| {
+        let parts = numbers(exif, tag)?;
+        let [degrees, minutes, seconds] = [0, 1, 2].map(|i| parts.get(i).copied().unwrap_or(0.0));
+        let sign = if text(exif, reference)?.starts_with(negative) {
+            -1.0
+        } else {
+            1.0
+        };
+        Some(sign * (degrees + minutes / 60.0 + seconds / 3600.0))
+    };
+    let latitude = angle(Tag::GPSLatitude, Tag::GPSLatitudeRef, "S").filter(|v| v.abs() <= 90.0)?;
+    let longitude = angle(Tag::GPSLongitude, Tag::GPSLongitudeRef, "W").filter(|v| v.abs() <= 180.0)?;
+    let below = number(exif, Tag::GPSAltitudeRef) == Some(1.0);
+    let altitude = number(exif, Tag::GPSAltitude).unwrap_or(0.0);
+    Some([latitude, longitude, if below { -altitude } else { altitude }])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use exif::experimental::Writer;
+    use exif::{Field, Rational};
+
+    fn block(fields: &[(Tag, Value)]) -> Vec<u8> {
+        let fields: Vec<Field> = fields
+            .iter()
+            .map(|(tag, value)| Field {
+                tag: *tag,
+                ifd_num: In::PRIMARY,
+                value: value.clone(),
+            })
+            .collect();
+        let mut writer = Writer::new();
+        fields.iter().for_each(|field| writer.push_field(field));
+        let mut bytes = std::io::Cursor::new(Vec::new());
+        writer.write(&mut bytes, true).unwrap();
+        bytes.into_inner()
+    }
+
+    fn ratio(num: u32, denom: u32) -> Value {
+        Value::Rational(vec![Rational { num, denom }])
+    }
+
+    #[test]
+    fn the_focal_length_is_that_of_film_or_of_the_sensor() {
+        let film = block(&[
+            (Tag::FocalLengthIn35mmFilm, Value::Short(vec![27])),
+            (Tag::FocalLength, ratio(4, 1)),
+        ]);
+        assert_eq!(parse_camera_tags(&film, [4000, 3000]).focal, Some(0.75));
+        // 6 mm on a sensor of 200 pixels a millimetre, 4000 wide: 20 mm; the file was halved since.
+        let sensor = block(&[
+            (Tag::FocalLength, ratio(6, 1)),
+            (Tag::FocalPlaneXResolution, ratio(2000, 1)),
+            (Tag::FocalPlaneResolutionUnit, Value::Short(vec![3])),
+            (Tag::PixelXDimension, Value::Long(vec![4000])),
+        ]);
+        assert_eq!(parse_camera_tags(&sensor, [2000, 1500]).focal, Some(0.3));
+        for nonsense in [ratio(6, 0), ratio(0, 1), ratio(u32::MAX, 1)] {
+            let broken = block(&[
+                (Tag::FocalLength, nonsense),
+                (Tag::FocalPlaneXResolution, ratio(2000, 1)),
+            ]);
+            assert_eq!(parse_camera_tags(&broken, [2000, 1500]).focal, None);
+        }
+    }
+
+    #[test]
+    fn camera_time_and_place_are_read() {
+        let three = |values: [u32; 3]| Value::Rational(values.map(|num| Rational { num, denom: 1 }).to_vec());
+        let ascii = |text: &str| Value::Ascii(vec![text.as_bytes().to_vec()]);
+        let tags = block(&[
+            (Tag::Make, ascii("ACME ")),
+            (Tag::Model, ascii("One")),
+            (Tag::DateTimeOriginal, ascii("2024:05:31 12:00:00")),
+            (Tag::GPSLatitude, three([33, 30, 0])),
+            (Tag::GPSLatitudeRef, ascii("S")),
+            (Tag::GPSLongitude, three([70, 0, 36])),
+            (Tag::GPSLongitudeRef, ascii("W")),
+            (Tag::GPSAltitude, ratio(520, 1)),
+        ]);
+        let tags = parse_camera_tags(&tags, [100, 100]);
+        assert_eq!(
+            (tags.make.as_deref(), tags.model.as_deref()),
+            (Some("ACME"), Some("One"))
+        );
+        assert_eq!(tags.time.as_deref(), Some("2024:05:31 12:00:00"));
+        assert_eq!(tags.gps, Some([-33.5, -70.01, 520.0]));
+    }
+
+    #[test]
+    fn damaged_blocks_are_no_trouble() {
+        let whole = block(&[
+            (Tag::Model, Value::Ascii(vec![b"One".to_vec()])),
+            (Tag::FocalLength, ratio(4, 1)),
+        ]);
+        for length in 0..whole.len() {
+            parse_camera_tags(&whole[..length], [10, 10]);
+        }
+        for i in 0..whole.len() {
+            let mut bytes = whole.clone();
+            bytes[i] ^= 0xff;
+            parse_camera_tags(&bytes, [10, 10]);
+        }
+    }
+}

@@ -1,0 +1,198 @@
+//! A folder of photographs without poses: which there are, and what took them.
+
+mod exif;
+
+use crate::dataset::{is_image_name, oriented_size, turned_as_stored};
+use crate::error::read_file;
+use crate::image_file::{Colour, decode, decode_jpeg_at, read_exif, read_header};
+use crate::{FormatError, Pixels};
+pub use exif::{CameraTags, parse_camera_tags};
+use image::metadata::Orientation;
+use rayon::prelude::*;
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+/// Extensions of photographs that are not read.
+const UNREAD: [&str; 10] = [
+    "heic", "heif", "avif", "webp", "tif", "tiff", "dng", "cr2", "nef", "arw",
+];
+
+/// A photograph on disk.
+#[derive(Clone, Debug, PartialEq)]
+pub struct PhotoEntry {
+    /// File name.
+    pub name: String,
+    /// The file.
+    pub path: PathBuf,
+    /// Width in pixels as [`crate::read_dataset`] decodes it.
+    pub width: u32,
+    /// Height in pixels as [`crate::read_dataset`] decodes it.
+    pub height: u32,
+    /// What the camera wrote.
+    pub tags: CameraTags,
+    /// Of the file's bytes.
+    pub hash: u64,
+    /// Where up is in the decoded picture: `[right, down]`; `[0, -1]` unless it is decoded as stored, against its EXIF orientation.
+    pub up: [i8; 2],
+    orientation: Orientation,
+    jpeg: bool,
+}
+
+impl PhotoEntry {
+    /// Focal length in pixels, if the camera wrote it.
+    pub fn focal_px(&self) -> Option<f64> {
+        Some(self.tags.focal? * f64::from(self.width.max(self.height)))
+    }
+
+    /// The pixels, with 3 or 4 channels; a large JPEG at a half, quarter or eighth of its size, but with a longer side of at least
+    /// `side` pixels.
+    ///
+    /// # Errors
+    /// When the file cannot be read or decoded.
+    pub fn read(&self, side: u32) -> Result<Pixels, FormatError> {
+        let long = self.width.max(self.height);
+        let fraction = [8, 4, 2]
+            .into_iter()
+            .find(|divisor| self.jpeg && long / divisor >= side);
+        match fraction {
+            Some(divisor) => decode_jpeg_at(&self.path, divisor, self.orientation),
+            None => decode(&self.path, self.orientation, Colour::Keep),
+        }
+    }
+}
+
+/// The photographs of a folder.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct PhotoFolder {
+    /// Sorted by name; no two have the same bytes.
+    pub photos: Vec<PhotoEntry>,
+    /// Names of the other pictures, and why they are not used.
+    pub left_out: Vec<(String, String)>,
+}
+
+impl PhotoFolder {
+    /// The number of each photograph's group: those of a group have the same make, model, focal length and size.
+    pub fn groups(&self) -> Vec<usize> {
+        let mut known = Vec::new();
+        let group = |photo: &PhotoEntry| {
+            let tags = &photo.tags;
+            let key = (
+                tags.make.clone(),
+                tags.model.clone(),
+                tags.focal.map(f64::to_bits),
+                [photo.width, photo.height],
+            );
+            known.iter().position(|other| *other == key).unwrap_or_else(|| {
+                known.push(key);
+                known.len() - 1
+            })
+        };
+        self.photos.iter().map(group).collect()
+    }
+}
+
+/// The photographs in `folder` itself, or in its folder `images`. Hidden files and those that are not pictures by their extension
+/// are ignored; pictures that cannot be read, and copies, are left out.
+///
+/// # Errors
+/// When the folder cannot be read.
+pub fn read_photo_folder(folder: &Path) -> Result<PhotoFolder, FormatError> {
+    let mut files = list_pictures(folder)?;
+    if files.is_empty() && folder.join("images").is_dir() {
+        files = list_pictures(&folder.join("images"))?;
+    }
+    let entries: Vec<(String, Result<PhotoEntry, String>)> = files
+        .into_par_iter()
+        .map(|path| {
+            let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+            let entry = read_entry(&path, &name);
+            (name, entry)
+        })
+        .collect();
+    let mut found = PhotoFolder::default();
+    let mut first_with: BTreeMap<u64, String> = BTreeMap::new();
+    for (name, entry) in entries {
+        match entry {
+            Ok(photo) => match first_with.get(&photo.hash) {
+                Some(first) => found.left_out.push((name, format!("a copy of {first}, byte for byte"))),
+                None => {
+                    first_with.insert(photo.hash, name);
+                    found.photos.push(photo);
+                }
+            },
+            Err(reason) => found.left_out.push((name, reason)),
+        }
+    }
+    Ok(found)
+}
+
+/// Whether `path` is a folder with at least one picture that can be read by its extension, itself or in `images`.
+pub fn has_photos(path: &Path) -> bool {
+    let any = |folder: &Path| list_pictures(folder).is_ok_and(|files| files.iter().any(|file| is_image_name(file)));
+    any(path) || any(&path.join("images"))
+}
+
+/// Pictures by their extension, sorted.
+fn list_pictures(folder: &Path) -> Result<Vec<PathBuf>, FormatError> {
+    let read_error = |source| FormatError::Read {
+        path: folder.to_owned(),
+        source,
+    };
+    let mut files = Vec::new();
+    for entry in std::fs::read_dir(folder).map_err(read_error)? {
+        let path = entry.map_err(read_error)?.path();
+        let is_hidden = path
+            .file_name()
+            .is_some_and(|name| name.to_string_lossy().starts_with('.'));
+        if (is_image_name(&path) || is_unread(&path).is_some()) && !is_hidden && path.is_file() {
+            files.push(path);
+        }
+    }
+    files.sort();
+    Ok(files)
+}
+
+/// The extension of a kind of picture that is not read.
+fn is_unread(path: &Path) -> Option<&'static str> {
+    let extension = path.extension()?.to_str()?.to_ascii_lowercase();
+    UNREAD.into_iter().find(|unread| *unread == extension)
+}
+
+fn read_entry(path: &Path, name: &str) -> Result<PhotoEntry, String> {
+    if let Some(kind) = is_unread(path) {
+        return Err(format!("{kind} is not read: convert it to JPEG or PNG"));
+    }
+    // The folder and the name are known to the reader of the reason.
+    let reason = |error: FormatError| match error {
+        FormatError::Malformed { source, .. } => source.0,
+        FormatError::Read { source, .. } => format!("cannot be read: {source}"),
+        other => other.to_string(),
+    };
+    let header = read_header(path).map_err(reason)?;
+    let bytes = read_file(path).map_err(reason)?;
+    let stored = [header.width, header.height];
+    let tags = read_exif(path).map_or_else(CameraTags::default, |block| parse_camera_tags(&block, stored));
+    let (orientation, up) = turned_as_stored(&header);
+    let (width, height) = oriented_size(&header, orientation);
+    Ok(PhotoEntry {
+        name: name.to_owned(),
+        path: path.to_owned(),
+        width,
+        height,
+        tags,
+        hash: fnv(&bytes),
+        up,
+        orientation,
+        jpeg: header.jpeg,
+    })
+}
+
+/// FNV-1a, 64 bits, of words of 8 bytes: enough to tell files apart, at a byte in a fraction of a nanosecond.
+fn fnv(bytes: &[u8]) -> u64 {
+    let mut hash = 0xcbf2_9ce4_8422_2325u64 ^ bytes.len() as u64;
+    let mut add = |word: u64| hash = (hash ^ word).wrapping_mul(0x0100_0000_01b3).rotate_left(29);
+    let (words, rest) = bytes.as_chunks::<8>();
+    words.iter().for_each(|word| add(u64::from_le_bytes(*word)));
+    rest.iter().for_each(|byte| add(u64::from(*byte)));
+    hash
+}

@@ -1,0 +1,121 @@
+//! Folders of photographs without poses.
+
+use irradia_formats::{ColmapCamera, ColmapImage, ColmapModel, PosedImage, write_colmap};
+use irradia_formats::{DatasetOptions, has_photos, read_dataset, read_photo_folder};
+use std::fs;
+use std::path::Path;
+
+fn picture(width: u32, height: u32, red: u8) -> image::RgbImage {
+    image::RgbImage::from_fn(width, height, |x, y| image::Rgb([red, (x * 5) as u8, (y * 5) as u8]))
+}
+
+/// A JPEG whose EXIF block holds nothing but its orientation.
+fn save_turned(path: &Path, picture: &image::RgbImage, orientation: u8) {
+    picture.save(path).unwrap();
+    let mut exif = b"\xff\xe1\x00\x22Exif\0\0II\x2a\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0".to_vec();
+    exif.extend([orientation, 0, 0, 0, 0, 0, 0, 0]);
+    let mut bytes = fs::read(path).unwrap();
+    exif.extend(bytes.split_off(2));
+    bytes.extend(exif);
+    fs::write(path, bytes).unwrap();
+}
+
+#[test]
+fn what_is_no_photograph_or_a_copy_is_named_with_its_reason() {
+    let folder = tempfile::tempdir().unwrap();
+    let root = folder.path();
+    assert!(!has_photos(root));
+    picture(40, 30, 10).save(root.join("b.jpg")).unwrap();
+    picture(40, 30, 20).save(root.join("a.png")).unwrap();
+    fs::copy(root.join("b.jpg"), root.join("c.jpg")).unwrap();
+    fs::write(root.join("d.jpg"), "not a picture").unwrap();
+    fs::write(root.join("e.jpg"), &fs::read(root.join("b.jpg")).unwrap()[..400]).unwrap();
+    fs::write(root.join("f.HEIC"), "ftypheic").unwrap();
+    fs::write(root.join("notes.txt"), "ignored").unwrap();
+    fs::write(root.join(".hidden.jpg"), "ignored").unwrap();
+    let found = read_photo_folder(root).unwrap();
+    let names: Vec<&str> = found.photos.iter().map(|photo| photo.name.as_str()).collect();
+    assert_eq!(names, ["a.png", "b.jpg"]);
+    let reasons: Vec<(&str, &str)> = found.left_out.iter().map(|(a, b)| (a.as_str(), b.as_str())).collect();
+    assert_eq!(reasons.len(), 4, "{reasons:?}");
+    for ((name, reason), (expected, word)) in reasons.iter().zip([
+        ("c.jpg", "copy of b.jpg"),
+        ("d.jpg", "not a readable"),
+        ("e.jpg", "truncated"),
+        ("f.HEIC", "convert"),
+    ]) {
+        assert!(*name == expected && reason.contains(word), "{name}: {reason}");
+    }
+    assert!(has_photos(root));
+    // Photographs in `images` are found from the folder above.
+    let below = tempfile::tempdir().unwrap();
+    fs::create_dir(below.path().join("images")).unwrap();
+    fs::copy(root.join("a.png"), below.path().join("images/a.png")).unwrap();
+    assert!(has_photos(below.path()));
+    assert_eq!(read_photo_folder(below.path()).unwrap().photos.len(), 1);
+    assert!(read_photo_folder(&root.join("none")).is_err());
+}
+
+#[test]
+fn photographs_are_as_read_dataset_decodes_them() {
+    let folder = tempfile::tempdir().unwrap();
+    let images = folder.path().join("images");
+    fs::create_dir(&images).unwrap();
+    // Upright, quarter turns, a half turn, and quarter turns of squares.
+    for (name, size, orientation) in [
+        ("a.jpg", [60, 40], 1),
+        ("b.jpg", [60, 40], 6),
+        ("c.jpg", [60, 40], 8),
+        ("d.jpg", [60, 40], 3),
+        ("e.jpg", [50, 50], 6),
+        ("f.jpg", [50, 50], 8),
+    ] {
+        save_turned(&images.join(name), &picture(size[0], size[1], 90), orientation);
+    }
+    let found = read_photo_folder(folder.path()).unwrap();
+    assert_eq!(found.groups(), [0, 1, 1, 0, 2, 2]);
+    let up: Vec<[i8; 2]> = found.photos.iter().map(|photo| photo.up).collect();
+    assert_eq!(up, [[0, -1], [0, -1], [0, -1], [0, 1], [-1, 0], [1, 0]]);
+    let sparse = folder.path().join("sparse/0");
+    fs::create_dir_all(&sparse).unwrap();
+    let model = ColmapModel {
+        cameras: (1u32..)
+            .zip(&found.photos)
+            .map(|(id, photo)| ColmapCamera {
+                id,
+                model: "SIMPLE_RADIAL".into(),
+                width: photo.width.into(),
+                height: photo.height.into(),
+                params: vec![50.0, 0.5 * f64::from(photo.width), 0.5 * f64::from(photo.height), 0.0],
+            })
+            .collect(),
+        images: (1u32..)
+            .zip(&found.photos)
+            .map(|(camera_id, photo)| PosedImage {
+                image: ColmapImage {
+                    rotation: [1.0, 0.0, 0.0, 0.0],
+                    translation: [f64::from(camera_id), 0.0, 0.0],
+                    camera_id,
+                    name: photo.name.clone(),
+                    points: Vec::new(),
+                },
+                keypoints: Vec::new(),
+            })
+            .collect(),
+        points: Vec::new(),
+    };
+    write_colmap(&sparse, &model).unwrap();
+    let dataset = read_dataset(folder.path(), &DatasetOptions::default()).unwrap();
+    assert_eq!(dataset.views.len(), found.photos.len());
+    for (view, photo) in dataset.views.iter().zip(&found.photos) {
+        assert!(view.name.ends_with(&photo.name), "{} {}", view.name, photo.name);
+        let (pixels, own) = (view.photo.load().unwrap(), photo.read(1600).unwrap());
+        assert_eq!(
+            (pixels.width, pixels.height),
+            (photo.width, photo.height),
+            "{}",
+            photo.name
+        );
+        assert!(pixels.data == own.data, "{}", photo.name);
+    }
+}

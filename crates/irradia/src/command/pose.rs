@@ -1,0 +1,159 @@
+//! `irradia pose`, and poses for a training on bare photographs.
+
+use super::{by_option, thread_count, use_threads};
+use crate::Usage;
+use crate::terminal::{note, say};
+use anyhow::Result;
+use clap::builder::RangedU64ValueParser;
+use indicatif::{ProgressBar, ProgressStyle};
+use irradia_runs::formats::{DatasetFormat, has_photos};
+use irradia_runs::{PoseInput, PoseProgress, PoseReport, TrainInput, is_film, pose};
+use std::io::IsTerminal;
+use std::path::{Path, PathBuf};
+use std::sync::Mutex;
+use std::time::{Duration, Instant};
+
+/// Photographs with a pose, of all, below which a training does not begin.
+const ENOUGH: f64 = 0.8;
+/// Interval of plain lines.
+const LINE_EVERY: Duration = Duration::from_secs(5);
+
+#[derive(clap::Args)]
+pub struct Args {
+    /// Folder of photographs (JPEG, PNG), or a film, which needs ffmpeg
+    pub photos: PathBuf,
+    /// Folder for the dataset: the photographs and their poses in COLMAP's format. Features and matches are kept there too, and reused
+    #[arg(long, value_name = "DATA")]
+    pub out: PathBuf,
+    /// Maximum number of features of a photograph; 4096 when absent
+    #[arg(long, value_name = "N", value_parser = RangedU64ValueParser::<usize>::new().range(1..=65_536))]
+    pub max_features: Option<usize>,
+    /// Threads; all cores when absent. The result does not depend on it
+    #[arg(long, value_name = "N", value_parser = thread_count())]
+    pub threads: Option<usize>,
+}
+
+pub fn run(args: &Args) -> Result<()> {
+    use_threads(args.threads)?;
+    let mut input = PoseInput::new(&args.photos, &args.out);
+    input.max_features = args.max_features.unwrap_or(input.max_features);
+    let report = pose_with_progress(&input)?;
+    say(summary(&report))?;
+    say(format_args!(
+        "train on it with: irradia train {} --out RUN",
+        args.out.display()
+    ))
+}
+
+/// Whether `data` has photographs and no poses.
+pub fn is_unposed(data: &Path) -> bool {
+    is_film(data) || (data.is_dir() && DatasetFormat::recognise(data).is_none() && has_photos(data))
+}
+
+/// Poses the photographs of `input` into the folder `posed` of its run, and makes that its dataset.
+pub fn pose_first(input: &mut TrainInput, anyway: bool) -> Result<()> {
+    let posed = input.out.join("posed");
+    let data = std::mem::replace(&mut input.data, posed.clone());
+    note(format_args!(
+        "{} has no poses: they are found first, into {}",
+        data.display(),
+        posed.display()
+    ));
+    let report = pose_with_progress(&PoseInput::new(data, &posed))?;
+    note(summary(&report));
+    if report.fraction() < ENOUGH && !anyway {
+        return Err(Usage(format!(
+            "only {} of {} photographs have poses, see {}; add photographs between them and the others, or train --anyway",
+            report.registered,
+            report.photos,
+            posed.join("pose.json").display()
+        ))
+        .into());
+    }
+    Ok(())
+}
+
+fn pose_with_progress(input: &PoseInput) -> Result<PoseReport> {
+    let display = Mutex::new(Display::new());
+    let report = pose(input, &|event| {
+        // A thread that panicked while it held the display ends everything anyway.
+        if let Ok(mut display) = display.lock() {
+            display.show(event);
+        }
+    });
+    if let Ok(display) = display.into_inner() {
+        display.clear();
+    }
+    let report = report.map_err(by_option)?;
+    for left in &report.left_out {
+        note(format_args!("left out: {}: {}", left.name, left.reason));
+    }
+    Ok(report)
+}
+
+/// `48 of 50 photographs posed, ..; features 3.1 s, ..`
+fn summary(report: &PoseReport) -> String {
+    let stages: Vec<String> = report
+        .stages
+        .iter()
+        .map(|stage| format!("{} {:.1} s", stage.name, stage.seconds))
+        .collect();
+    format!(
+        "{} of {} photographs posed, {} points, mean error {:.2} px; {}; {:.1} s in all",
+        report.registered,
+        report.photos,
+        report.points,
+        report.mean_error_px,
+        stages.join(", "),
+        report.seconds
+    )
+}
+
+/// Progress of the stages: a bar, or plain lines without a terminal.
+struct Display {
+    bar: Option<ProgressBar>,
+    stage: &'static str,
+    of: usize,
+    last_line: Instant,
+}
+
+impl Display {
+    fn new() -> Self {
+        Self {
+            bar: std::io::stderr().is_terminal().then(|| {
+                let style = "{bar:16} {pos}/{len} {msg} {elapsed} eta {eta}";
+                ProgressBar::new(0).with_style(ProgressStyle::with_template(style).expect("a valid template"))
+            }),
+            stage: "",
+            of: 0,
+            last_line: Instant::now(),
+        }
+    }
+
+    fn show(&mut self, event: PoseProgress) {
+        match (event, &self.bar) {
+            (PoseProgress::Stage { name, of }, bar) => {
+                (self.stage, self.of) = (name, of);
+                if let Some(bar) = bar {
+                    bar.reset();
+                    bar.set_length(of as u64);
+                    bar.set_message(name);
+                }
+            }
+            (PoseProgress::Done(done), Some(bar)) => bar.set_position(done as u64),
+            (PoseProgress::Done(done), None) if self.last_line.elapsed() >= LINE_EVERY => {
+                note(format_args!("{} {done}/{}", self.stage, self.of));
+                self.last_line = Instant::now();
+            }
+            (PoseProgress::Done(_), None) => {}
+            (PoseProgress::Warned(line), Some(bar)) => bar.suspend(|| note(format_args!("warning: {line}"))),
+            (PoseProgress::Warned(line), None) => note(format_args!("warning: {line}")),
+        }
+    }
+
+    fn clear(&self) {
+        if let Some(bar) = &self.bar {
+            bar.finish_and_clear();
+        }
+    }
+}

@@ -1,0 +1,343 @@
+//! The frames of a film that are worth posing: the sharpest of each window, windows being equal in motion.
+
+use super::PoseProgress;
+use crate::RunError;
+use irradia_compute::Level;
+use irradia_formats::write_atomic;
+use irradia_sfm::Features;
+use irradia_sfm::features::{Extractor, GreyPhoto, Sift};
+use irradia_sfm::matching::{MatchOptions, match_features};
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+use std::fs;
+use std::io::{BufReader, Read};
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+
+/// Extensions of films.
+const FILMS: [&str; 8] = ["mp4", "mov", "m4v", "mkv", "webm", "avi", "mpg", "mpeg"];
+/// Frames chosen, unless the film has fewer.
+const FRAMES: [usize; 2] = [100, 300];
+/// Motion between chosen frames, in widths of the picture: two thirds of a picture and more stay in view for several frames.
+const SPACING: f64 = 0.05;
+/// Motion of a frame whose features match none of those before.
+const LOST: f64 = 0.1;
+/// Pixels across the frames in which motion and sharpness are measured.
+const WIDTH: u32 = 320;
+/// The longest line of a header of ffmpeg's grey pictures.
+const LONGEST_LINE: usize = 64;
+
+/// Whether `path` is a film by its extension.
+pub fn is_film(path: &Path) -> bool {
+    let extension = path.extension().and_then(|e| e.to_str()).map(str::to_ascii_lowercase);
+    extension.is_some_and(|e| FILMS.contains(&e.as_str())) && path.is_file()
+}
+
+/// Which frames were chosen, to reuse them: `frames.json`.
+#[derive(Debug, PartialEq, Serialize, Deserialize)]
+struct Chosen {
+    film: PathBuf,
+    bytes: u64,
+    modified: Option<std::time::SystemTime>,
+    frames: Vec<usize>,
+}
+
+/// Writes the chosen frames of `film` as JPEG into `images` of `out`, unless an earlier call did. Returns their folder.
+pub(super) fn frames(film: &Path, out: &Path, progress: &(dyn Fn(PoseProgress) + Sync)) -> Result<PathBuf, RunError> {
+    let images = out.join("images");
+    let record = out.join("frames.json");
+    let metadata = fs::metadata(film).map_err(RunError::io("read", film))?;
+    let mut chosen = Chosen {
+        film: std::path::absolute(film).unwrap_or_else(|_| film.to_owned()),
+        bytes: metadata.len(),
+        modified: metadata.modified().ok(),
+        frames: Vec::new(),
+    };
+    let known: Option<Chosen> = fs::read(&record)
+        .ok()
+        .and_then(|bytes| serde_json::from_slice(&bytes).ok());
+    if let Some(known) = known {
+        chosen.frames.clone_from(&known.frames);
+        if known == chosen && chosen.frames.iter().all(|frame| images.join(name(*frame)).is_file()) {
+            return Ok(images);
+        }
+    }
+    progress(PoseProgress::Stage { name: "frames", of: 0 });
+    let looked_at = look(film, progress)?;
+    if looked_at.is_empty() {
+        return Err(RunError::Refused(format!("{}: the film has no frames", film.display())));
+    }
+    chosen.frames = choose(&looked_at);
+    // Frames of an earlier choice must not be taken for photographs.
+    if images.exists() && record.exists() {
+        fs::remove_dir_all(&images).map_err(RunError::io("clear", &images))?;
+    }
+    fs::create_dir_all(&images).map_err(RunError::io("create", &images))?;
+    extract(film, &images, &chosen.frames)?;
+    write_atomic(&record, |file| file.write_all(&crate::folder::to_json(&chosen)))?;
+    Ok(images)
+}
+
+fn name(frame: usize) -> String {
+    format!("frame_{frame:06}.jpg")
+}
+
+/// What is measured of a frame.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct Frame {
+    /// Motion since the frame before, in widths of the picture.
+    motion: f64,
+    /// Mean square of the Laplacian.
+    sharpness: f64,
+}
+
+/// Measures all frames of a film, at a reduced size.
+fn look(film: &Path, progress: &(dyn Fn(PoseProgress) + Sync)) -> Result<Vec<Frame>, RunError> {
+    let mut child = Command::new("ffmpeg")
+        .args(["-loglevel", "error", "-i"])
+        .arg(film)
+        .args(["-vf", &format!("scale={WIDTH}:-2"), "-fps_mode", "passthrough"])
+        .args(["-f", "image2pipe", "-c:v", "pgm", "-pix_fmt", "gray", "-"])
+        .stdin(Stdio::null())
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .map_err(|error| no_ffmpeg(film, &error))?;
+    let mut pictures = BufReader::with_capacity(1 << 20, child.stdout.take().expect("a pipe"));
+    // Whatever ffmpeg says is read meanwhile, or it would wait.
+    let mut errors = child.stderr.take().expect("a pipe");
+    let said = std::thread::spawn(move || {
+        let mut said = String::new();
+        // Best effort: it only explains a failure.
+        let _ = errors.read_to_string(&mut said);
+        said
+    });
+    let sift = Sift {
+        max_features: 400,
+        ..Sift::default()
+    };
+    let mut frames = Vec::new();
+    let mut before: Option<Features> = None;
+    loop {
+        let batch: Vec<Picture> = std::iter::from_fn(|| read_picture(&mut pictures)).take(BATCH).collect();
+        if batch.is_empty() {
+            break;
+        }
+        let seen: Vec<(Features, f64)> = batch
+            .par_iter()
+            .map(|picture| (sift.extract(&picture.photo()), picture.sharpness()))
+            .collect();
+        let earlier: Vec<Option<&Features>> = std::iter::once(before.as_ref())
+            .chain(seen.iter().map(|(features, _)| Some(features)))
+            .collect();
+        let motions: Vec<f64> = seen
+            .par_iter()
+            .zip(&earlier)
+            .map(|((features, _), earlier)| earlier.map_or(0.0, |earlier| motion(earlier, features)))
+            .collect();
+        frames.extend(motions.iter().zip(&seen).map(|(motion, (_, sharpness))| Frame {
+            motion: *motion,
+            sharpness: *sharpness,
+        }));
+        before = seen.into_iter().next_back().map(|(features, _)| features);
+        progress(PoseProgress::Done(frames.len()));
+    }
+    let status = child.wait().map_err(RunError::io("read", film))?;
+    let said = said.join().unwrap_or_default();
+    if !status.success() {
+        return Err(unreadable(film, &said));
+    }
+    Ok(frames)
+}
+
+/// Frames that are measured in parallel.
+const BATCH: usize = 32;
+
+fn no_ffmpeg(film: &Path, error: &std::io::Error) -> RunError {
+    RunError::Refused(format!(
+        "{}: a film needs ffmpeg, which cannot be started ({error}): install it, or give a folder of photographs",
+        film.display()
+    ))
+}
+
+fn unreadable(film: &Path, said: &str) -> RunError {
+    let last = said.lines().last().unwrap_or("no reason given");
+    RunError::Refused(format!("{}: ffmpeg cannot read the film: {last}", film.display()))
+}
+
+/// A grey picture.
+struct Picture {
+    width: u32,
+    height: u32,
+    data: Vec<u8>,
+}
+
+impl Picture {
+    fn photo(&self) -> GreyPhoto<'_> {
+        GreyPhoto {
+            width: self.width,
+            height: self.height,
+            data: &self.data,
+            mask: None,
+        }
+    }
+
+    fn sharpness(&self) -> f64 {
+        let (width, height) = (self.width as usize, self.height as usize);
+        let at = |x: usize, y: usize| i64::from(self.data[y * width + x]);
+        let mut sum = 0i64;
+        for y in 1..height.saturating_sub(1) {
+            for x in 1..width - 1 {
+                let laplacian = at(x - 1, y) + at(x + 1, y) + at(x, y - 1) + at(x, y + 1) - 4 * at(x, y);
+                sum += laplacian * laplacian;
+            }
+        }
+        sum as f64 / (width * height) as f64
+    }
+}
+
+/// The next picture of a stream of binary PGM; `None` at its end, or where it is not one of ffmpeg's.
+fn read_picture(stream: &mut impl Read) -> Option<Picture> {
+    if read_line(stream)? != "P5" {
+        return None;
+    }
+    let size = read_line(stream)?;
+    let (width, height) = size.split_once(' ')?;
+    let [width, height]: [u32; 2] = [width.parse().ok()?, height.parse().ok()?];
+    if read_line(stream)? != "255" || width != WIDTH || height > 64 * WIDTH {
+        return None;
+    }
+    let mut data = vec![0; width as usize * height as usize];
+    stream.read_exact(&mut data).ok()?;
+    Some(Picture { width, height, data })
+}
+
+fn read_line(stream: &mut impl Read) -> Option<String> {
+    let mut line = Vec::new();
+    loop {
+        let mut byte = [0];
+        stream.read_exact(&mut byte).ok()?;
+        match byte[0] {
+            b'\n' => return String::from_utf8(line).ok(),
+            _ if line.len() == LONGEST_LINE => return None,
+            other => line.push(other),
+        }
+    }
+}
+
+/// The median distance between matching features, in widths of the picture.
+fn motion(before: &Features, after: &Features) -> f64 {
+    let options = MatchOptions {
+        level: Level::detect(),
+        ..MatchOptions::default()
+    };
+    let mut distances: Vec<f32> = match_features(before, after, &options)
+        .into_iter()
+        .map(|[a, b]| {
+            let (a, b) = (before.keypoints[a as usize], after.keypoints[b as usize]);
+            (a.x - b.x).hypot(a.y - b.y)
+        })
+        .collect();
+    if distances.len() < 8 {
+        return LOST;
+    }
+    distances.sort_by(f32::total_cmp);
+    f64::from(distances[distances.len() / 2]) / f64::from(WIDTH)
+}
+
+/// The sharpest frame of each of a number of windows that are equal in motion.
+fn choose(frames: &[Frame]) -> Vec<usize> {
+    let total: f64 = frames.iter().map(|frame| frame.motion).sum();
+    let wanted = ((total / SPACING) as usize).clamp(FRAMES[0], FRAMES[1]);
+    if frames.len() <= wanted {
+        return (0..frames.len()).collect();
+    }
+    let mut best: Vec<Option<usize>> = vec![None; wanted];
+    let mut moved = 0.0;
+    for (i, frame) in frames.iter().enumerate() {
+        moved += frame.motion;
+        // A camera that stands still has windows equal in time.
+        let at = if total > 0.0 {
+            moved / total
+        } else {
+            i as f64 / frames.len() as f64
+        };
+        let slot = &mut best[((at * wanted as f64) as usize).min(wanted - 1)];
+        if slot.is_none_or(|other| frames[other].sharpness < frame.sharpness) {
+            *slot = Some(i);
+        }
+    }
+    best.into_iter().flatten().collect()
+}
+
+/// Writes the frames with the numbers `frames`, ascending, under their names.
+fn extract(film: &Path, images: &Path, frames: &[usize]) -> Result<(), RunError> {
+    let chosen: Vec<String> = frames.iter().map(|frame| format!("eq(n,{frame})")).collect();
+    let output = Command::new("ffmpeg")
+        .args(["-loglevel", "error", "-y", "-i"])
+        .arg(film)
+        .args([
+            "-vf",
+            &format!("select='{}'", chosen.join("+")),
+            "-fps_mode",
+            "passthrough",
+        ])
+        .args(["-q:v", "2", "-start_number", "0"])
+        .arg(images.join("chosen_%06d.jpg"))
+        .stdin(Stdio::null())
+        .output()
+        .map_err(|error| no_ffmpeg(film, &error))?;
+    if !output.status.success() {
+        return Err(unreadable(film, &String::from_utf8_lossy(&output.stderr)));
+    }
+    for (i, frame) in frames.iter().enumerate() {
+        let (from, to) = (images.join(format!("chosen_{i:06}.jpg")), images.join(name(*frame)));
+        fs::rename(&from, &to).map_err(RunError::io("write", &to))?;
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn windows_are_equal_in_motion_and_give_their_sharpest_frame() {
+        // A still half, then a moving one; every third frame is sharp.
+        let frame = |i: usize| Frame {
+            motion: if i < 300 { 0.0 } else { 0.05 },
+            sharpness: if i % 3 == 1 { 2.0 } else { 1.0 },
+        };
+        let frames: Vec<Frame> = (0..900).map(frame).collect();
+        let chosen = choose(&frames);
+        assert!((290..=300).contains(&chosen.len()), "{}", chosen.len());
+        assert!(
+            chosen.iter().filter(|i| **i < 300).count() <= 1,
+            "one frame stands for the still half"
+        );
+        let sharp = chosen.iter().filter(|i| **i % 3 == 1).count();
+        assert!(sharp * 3 > chosen.len(), "{sharp}");
+        let still: Vec<Frame> = frames[..300].to_vec();
+        assert_eq!(choose(&still).len(), 100);
+        assert_eq!(choose(&frames[..40]).len(), 40);
+    }
+
+    #[test]
+    fn streams_that_are_not_pictures_end() {
+        let mut stream: &[u8] = b"P5\n320 2\n255\n";
+        assert!(read_picture(&mut stream).is_none());
+        let mut whole = b"P5\n320 2\n255\n".to_vec();
+        whole.extend([9; 640]);
+        assert_eq!(
+            read_picture(&mut &whole[..]).map(|picture| picture.data.len()),
+            Some(640)
+        );
+        for junk in [
+            &b"P6\n1 1\n255\nabc"[..],
+            &[b'1'; 500],
+            b"P5\n4294967295 4294967295\n255\n",
+        ] {
+            assert!(read_picture(&mut &junk[..]).is_none());
+        }
+    }
+}

@@ -1,0 +1,299 @@
+//! Photographs or a film in, a posed dataset out.
+//!
+//! ```text
+//! images/          the posed photographs: links to the originals where the file system allows, else copies; frames of a film
+//! sparse/0/*.bin   cameras, poses and points with tracks, in COLMAP's format; further models in sparse/1, ..
+//! pose.json        what happened: numbers, times, and each photograph left out with its reason
+//! features.bin     features and matches, which are reused as long as photographs do not change
+//! ```
+
+mod film;
+mod output;
+mod stages;
+mod store;
+
+use crate::RunError;
+use crate::folder::to_json;
+use irradia_formats::{PhotoFolder, read_photo_folder, write_atomic};
+use irradia_sfm::features::Sift;
+use irradia_sfm::map::{MapOptions, PhotoInfo, Progress, reconstruct};
+use irradia_sfm::matching::PairOptions;
+use serde::Serialize;
+use stages::Work;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+pub use film::is_film;
+
+/// Fewer photographs make no dataset.
+const MIN_PHOTOS: usize = 3;
+/// The report's name.
+const REPORT: &str = "pose.json";
+
+/// A request for poses.
+#[derive(Clone, Debug, PartialEq)]
+pub struct PoseInput {
+    /// A folder of photographs, or a film.
+    pub photos: PathBuf,
+    /// The folder of the dataset; created if missing.
+    pub out: PathBuf,
+    /// The most features of a photograph, at least 1.
+    pub max_features: usize,
+    /// How to verify and map.
+    pub mapping: MapOptions,
+}
+
+impl PoseInput {
+    /// With the usual options.
+    pub fn new(photos: impl Into<PathBuf>, out: impl Into<PathBuf>) -> Self {
+        Self {
+            photos: photos.into(),
+            out: out.into(),
+            max_features: Sift::default().max_features,
+            mapping: MapOptions::default(),
+        }
+    }
+}
+
+/// What [`pose`] is doing.
+#[derive(Clone, Debug, PartialEq)]
+pub enum PoseProgress {
+    /// A stage begins.
+    Stage {
+        /// `frames`, `features`, `matches` or `poses`.
+        name: &'static str,
+        /// Steps of the stage: photographs or pairs.
+        of: usize,
+    },
+    /// This many steps of the stage are done.
+    Done(usize),
+    /// Something the user should know.
+    Warned(String),
+}
+
+/// What became of the photographs; `pose.json`.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct PoseReport {
+    /// Pictures found.
+    pub photos: usize,
+    /// Photographs with a pose in the largest model.
+    pub registered: usize,
+    /// Photographs without one.
+    pub left_out: Vec<LeftOutPhoto>,
+    /// Photographs of each model, largest first; they share no world.
+    pub models: Vec<usize>,
+    /// Points of the largest model.
+    pub points: usize,
+    /// Its mean reprojection error, px.
+    pub mean_error_px: f64,
+    /// Its cameras.
+    pub cameras: Vec<CameraReport>,
+    /// Pairs of photographs that were matched.
+    pub pairs: usize,
+    /// Pairs with a common geometry.
+    pub verified_pairs: usize,
+    /// Seconds by stage, in their order.
+    pub stages: Vec<StageReport>,
+    /// Seconds in all.
+    pub seconds: f64,
+    /// What the user should know.
+    pub warnings: Vec<String>,
+}
+
+impl PoseReport {
+    /// The fraction of the pictures that have a pose.
+    pub fn fraction(&self) -> f64 {
+        self.registered as f64 / self.photos.max(1) as f64
+    }
+}
+
+/// A photograph without a pose.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+pub struct LeftOutPhoto {
+    /// File name.
+    pub name: String,
+    /// Why.
+    pub reason: String,
+}
+
+/// A camera of the largest model.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct CameraReport {
+    /// Its photographs.
+    pub photos: usize,
+    /// Width and height, px.
+    pub size: [u32; 2],
+    /// Mean of both axes, px.
+    pub focal_px: f64,
+    /// Whether the metadata of its photographs tell the focal length.
+    pub focal_known: bool,
+    /// Whether the focal length was held, because nothing in the photographs determines it.
+    pub focal_held: bool,
+}
+
+/// Time of a stage.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct StageReport {
+    /// `photographs`, `frames`, `features`, `matches`, `poses` or `writing`.
+    pub name: &'static str,
+    /// Wall time.
+    pub seconds: f64,
+}
+
+/// Finds the poses of photographs and writes them as a dataset. Features and matches of an earlier call are reused. The result
+/// depends neither on the number of threads nor on the order of the files.
+///
+/// # Errors
+/// When there are fewer than three photographs, a film cannot be read, no three photographs can be posed together, `out` holds a
+/// dataset of another origin, or a file cannot be written.
+pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Result<PoseReport, RunError> {
+    let started = Instant::now();
+    if input.max_features == 0 {
+        return Err(RunError::setting("max_features", 0, "must be 1 or more"));
+    }
+    let out = &input.out;
+    check_free(out)?;
+    fs::create_dir_all(out).map_err(RunError::io("create", out))?;
+    let mut clock = Clock::new();
+    let folder = if is_film(&input.photos) {
+        let frames = film::frames(&input.photos, out, progress)?;
+        clock.end("frames");
+        read_photo_folder(&frames)?
+    } else {
+        read_photo_folder(&input.photos)?
+    };
+    check_enough(&input.photos, &folder)?;
+    clock.end("photographs");
+
+    let mut work = Work::new(input, &folder, progress);
+    work.find_features()?;
+    clock.end("features");
+    let pair_options = PairOptions {
+        successors: if is_film(&input.photos) { FILM_SUCCESSORS } else { 0 },
+        ..PairOptions::default()
+    };
+    let pairs = work.match_pairs(&pair_options)?;
+    clock.end("matches");
+
+    progress(PoseProgress::Stage {
+        name: "poses",
+        of: work.photos().len(),
+    });
+    let infos = photo_infos(&folder, work.photos());
+    let reconstruction = reconstruct(&infos, work.features(), &pairs, &input.mapping, &mut |event| {
+        if let Progress::Registered { photos, .. } = event {
+            progress(PoseProgress::Done(photos));
+        }
+    });
+    clock.end("poses");
+    if reconstruction.models.is_empty() {
+        return Err(RunError::Refused(no_model(&input.photos, &infos, &reconstruction)));
+    }
+    output::write(out, &folder, &work, &infos, &reconstruction)?;
+    clock.end("writing");
+
+    let mut report = output::report(&folder, &work, &infos, &reconstruction);
+    report.pairs = pairs.len();
+    report.warnings = work.warnings().to_vec();
+    report.stages = clock.stages;
+    report.seconds = started.elapsed().as_secs_f64();
+    write_atomic(&out.join(REPORT), |file| file.write_all(&to_json(&report)))?;
+    Ok(report)
+}
+
+/// Frames after each frame of a film that it is matched with in any case.
+const FILM_SUCCESSORS: usize = 10;
+
+/// Refuses to replace a model that [`pose`] did not write.
+fn check_free(out: &Path) -> Result<(), RunError> {
+    let foreign = ["sparse", "transforms.json", "transforms_train.json", "poses_bounds.npy"]
+        .into_iter()
+        .find(|name| out.join(name).exists() && !out.join(REPORT).exists());
+    match foreign {
+        Some(name) => Err(RunError::Refused(format!(
+            "{} already holds {name} of another origin: choose another --out",
+            out.display()
+        ))),
+        None => Ok(()),
+    }
+}
+
+fn check_enough(path: &Path, folder: &PhotoFolder) -> Result<(), RunError> {
+    if folder.photos.len() >= MIN_PHOTOS {
+        return Ok(());
+    }
+    let reasons: String = folder
+        .left_out
+        .iter()
+        .take(3)
+        .map(|(name, reason)| format!("; {name}: {reason}"))
+        .collect();
+    Err(RunError::Refused(format!(
+        "{}: {} readable photographs, at least {MIN_PHOTOS} of different views are needed{reasons}",
+        path.display(),
+        folder.photos.len()
+    )))
+}
+
+/// What the mapper is told of the photographs `used`, indices of the folder's.
+fn photo_infos(folder: &PhotoFolder, used: &[usize]) -> Vec<PhotoInfo> {
+    let groups = folder.groups();
+    // Groups are numbered from 0 without gaps, also where photographs could not be decoded.
+    let mut numbers: Vec<usize> = Vec::new();
+    used.iter()
+        .map(|i| {
+            let photo = &folder.photos[*i];
+            let known = numbers.iter().position(|group| *group == groups[*i]);
+            let group = known.unwrap_or_else(|| {
+                numbers.push(groups[*i]);
+                numbers.len() - 1
+            });
+            let [right, down] = photo.up.map(f64::from);
+            PhotoInfo {
+                name: photo.name.clone(),
+                width: photo.width,
+                height: photo.height,
+                group,
+                focal_prior_px: photo.focal_px(),
+                up: Some(glam::DVec3::new(right, down, 0.0)),
+            }
+        })
+        .collect()
+}
+
+/// Why nothing could be posed: the most frequent kind of reason comes with its first photograph.
+fn no_model(path: &Path, photos: &[PhotoInfo], found: &irradia_sfm::map::Reconstruction) -> String {
+    let first = found.left_out.first().map_or(String::new(), |left| {
+        format!("; {}: {}", photos[left.photo].name, left.reason)
+    });
+    format!(
+        "{}: no three of {} photographs could be posed together{first}; take more photographs that overlap by two thirds, from \
+         different places",
+        path.display(),
+        photos.len()
+    )
+}
+
+/// Times stages.
+struct Clock {
+    last: Instant,
+    stages: Vec<StageReport>,
+}
+
+impl Clock {
+    fn new() -> Self {
+        Self {
+            last: Instant::now(),
+            stages: Vec::new(),
+        }
+    }
+
+    fn end(&mut self, name: &'static str) {
+        self.stages.push(StageReport {
+            name,
+            seconds: self.last.elapsed().as_secs_f64(),
+        });
+        self.last = Instant::now();
+    }
+}

@@ -1,0 +1,189 @@
+//! The dataset that was reconstructed.
+
+use super::stages::Work;
+use super::{CameraReport, LeftOutPhoto, PoseReport};
+use crate::RunError;
+use irradia_formats::{
+    ColmapCamera, ColmapImage, ColmapModel, ColmapPoint, PhotoFolder, PosedImage, TrackedPoint, write_colmap,
+};
+use irradia_sfm::geometry::camera::DCamera;
+use irradia_sfm::map::{Model, PhotoInfo, Reconstruction};
+use std::fs;
+use std::path::Path;
+
+/// Writes `images` and `sparse`.
+pub(super) fn write(
+    out: &Path,
+    folder: &PhotoFolder,
+    work: &Work,
+    infos: &[PhotoInfo],
+    found: &Reconstruction,
+) -> Result<(), RunError> {
+    let images = out.join("images");
+    fs::create_dir_all(&images).map_err(RunError::io("create", &images))?;
+    for (photo, i) in work.photos().iter().enumerate() {
+        if found.models.iter().any(|model| model.poses[photo].is_some()) {
+            let entry = &folder.photos[*i];
+            link(&entry.path, &images.join(&entry.name))?;
+        }
+    }
+    let sparse = out.join("sparse");
+    if sparse.exists() {
+        // Models of an earlier call, which may have been more.
+        fs::remove_dir_all(&sparse).map_err(RunError::io("clear", &sparse))?;
+    }
+    for (number, model) in found.models.iter().enumerate() {
+        let to = sparse.join(number.to_string());
+        fs::create_dir_all(&to).map_err(RunError::io("create", &to))?;
+        write_colmap(&to, &colmap_model(work, infos, model))?;
+    }
+    Ok(())
+}
+
+/// Makes `to` the file `from`: a hard link where the file system allows it, else a copy.
+fn link(from: &Path, to: &Path) -> Result<(), RunError> {
+    let same = |a: &Path, b: &Path| fs::canonicalize(a).is_ok_and(|a| fs::canonicalize(b).is_ok_and(|b| a == b));
+    if same(from, to) {
+        return Ok(());
+    }
+    if to.exists() {
+        fs::remove_file(to).map_err(RunError::io("replace", to))?;
+    }
+    if fs::hard_link(from, to).is_err() {
+        fs::copy(from, to).map_err(RunError::io("write", to))?;
+    }
+    Ok(())
+}
+
+fn colmap_model(work: &Work, infos: &[PhotoInfo], model: &Model) -> ColmapModel {
+    let cameras = (0u32..)
+        .zip(&model.cameras)
+        .filter_map(|(group, camera)| Some(colmap_camera(group + 1, camera.as_ref()?)))
+        .collect();
+    let posed: Vec<usize> = (0..infos.len()).filter(|photo| model.poses[*photo].is_some()).collect();
+    let mut image_of = vec![0u32; infos.len()];
+    let mut images: Vec<PosedImage> = Vec::new();
+    for &photo in &posed {
+        image_of[photo] = images.len() as u32;
+        let pose = model.poses[photo].expect("a posed photograph");
+        let camera_from_world = pose.rotation.inverse();
+        let translation = -(camera_from_world * pose.position);
+        let [x, y, z, w] = camera_from_world.to_array();
+        images.push(PosedImage {
+            image: ColmapImage {
+                rotation: [w, x, y, z],
+                translation: translation.to_array(),
+                camera_id: infos[photo].group as u32 + 1,
+                name: infos[photo].name.clone(),
+                points: Vec::new(),
+            },
+            keypoints: work.features()[photo]
+                .keypoints
+                .iter()
+                .map(|k| ([k.x.into(), k.y.into()], None))
+                .collect(),
+        });
+    }
+    let mut points = Vec::with_capacity(model.points.len());
+    for (id, point) in (1u64..).zip(&model.points) {
+        let mut sum = [0u32; 3];
+        let mut track = Vec::with_capacity(point.track.len());
+        for &(photo, keypoint) in &point.track {
+            let image = image_of[photo as usize];
+            images[image as usize].keypoints[keypoint as usize].1 = Some(id);
+            let color = work.colors()[photo as usize][keypoint as usize];
+            sum = [0, 1, 2].map(|c| sum[c] + u32::from(color[c]));
+            track.push([image, keypoint]);
+        }
+        let count = track.len().max(1) as u32;
+        points.push(TrackedPoint {
+            point: ColmapPoint {
+                id,
+                position: point.position.to_array(),
+                color: sum.map(|sum| ((sum + count / 2) / count) as u8),
+            },
+            error: point.error,
+            track,
+        });
+    }
+    ColmapModel {
+        cameras,
+        images,
+        points,
+    }
+}
+
+/// The simplest of COLMAP's models that the camera fits in.
+fn colmap_camera(id: u32, camera: &DCamera) -> ColmapCamera {
+    let [fx, fy, cx, cy, k1, k2, p1, p2] = camera.parameters;
+    let (model, params) = if fx == fy && [k2, p1, p2] == [0.0; 3] {
+        ("SIMPLE_RADIAL", vec![fx, cx, cy, k1])
+    } else {
+        ("OPENCV", camera.parameters.to_vec())
+    };
+    ColmapCamera {
+        id,
+        model: model.into(),
+        width: camera.width.into(),
+        height: camera.height.into(),
+        params,
+    }
+}
+
+/// All but the times and warnings.
+pub(super) fn report(folder: &PhotoFolder, work: &Work, infos: &[PhotoInfo], found: &Reconstruction) -> PoseReport {
+    let model = &found.models[0];
+    let mut left_out: Vec<(String, String)> = folder.left_out.iter().chain(work.undecodable()).cloned().collect();
+    left_out.extend(
+        found
+            .left_out
+            .iter()
+            .map(|left| (infos[left.photo].name.clone(), left.reason.to_string())),
+    );
+    for other in &found.models[1..] {
+        let photos = (0..infos.len()).filter(|photo| other.poses[*photo].is_some());
+        left_out.extend(photos.filter(|photo| model.poses[*photo].is_none()).map(|photo| {
+            let reason = format!(
+                "in another model of {} photographs, with too little in common with the largest",
+                other.registered()
+            );
+            (infos[photo].name.clone(), reason)
+        }));
+    }
+    left_out.sort();
+    left_out.dedup_by(|a, b| a.0 == b.0);
+    let cameras = (0..model.cameras.len())
+        .filter_map(|group| {
+            let camera = model.cameras[group]?;
+            let mut photos = infos
+                .iter()
+                .zip(&model.poses)
+                .filter(|(info, _)| info.group == group)
+                .peekable();
+            Some(CameraReport {
+                focal_known: photos.peek().is_some_and(|(info, _)| info.focal_prior_px.is_some()),
+                photos: photos.filter(|(_, pose)| pose.is_some()).count(),
+                size: [camera.width, camera.height],
+                focal_px: camera.focal(),
+                focal_held: model.focal_held[group],
+            })
+        })
+        .collect();
+    PoseReport {
+        photos: folder.photos.len() + folder.left_out.len(),
+        registered: model.registered(),
+        left_out: left_out
+            .into_iter()
+            .map(|(name, reason)| LeftOutPhoto { name, reason })
+            .collect(),
+        models: found.models.iter().map(Model::registered).collect(),
+        points: model.points.len(),
+        mean_error_px: model.mean_error(),
+        cameras,
+        pairs: 0,
+        verified_pairs: found.pairs.len(),
+        stages: Vec::new(),
+        seconds: 0.0,
+        warnings: Vec::new(),
+    }
+}

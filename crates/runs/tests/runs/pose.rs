@@ -1,0 +1,147 @@
+//! Photographs in, a dataset out: ray-traced photographs whose poses are known, and folders with which nothing can be done.
+
+use irradia_runs::formats::{DatasetFormat, DatasetOptions, read_dataset, write_png};
+use irradia_runs::scene::Camera;
+use irradia_runs::synth::{Capture, Part, SynthOptions};
+use irradia_runs::{PoseInput, PoseProgress, PoseReport, RunError, pose};
+use std::fs;
+use std::path::Path;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::time::Duration;
+
+const OPTIONS: SynthOptions = SynthOptions {
+    scene: irradia_runs::synth::SceneName::Demo,
+    views: 12,
+    width: 320,
+    height: 240,
+    seed: 3,
+};
+
+/// The training photographs of a ray-traced scene, and their true cameras by name.
+fn photographs(folder: &Path) -> Vec<(String, Camera)> {
+    let capture = Capture::new(&OPTIONS).unwrap();
+    let shots = capture.shots().iter().filter(|shot| shot.part == Part::Train);
+    shots
+        .enumerate()
+        .map(|(i, shot)| {
+            let name = format!("{i:02}.png");
+            let frame = capture.trace(shot);
+            write_png(&folder.join(&name), OPTIONS.width, OPTIONS.height, 4, &frame.rgba()).unwrap();
+            (name, shot.camera)
+        })
+        .collect()
+}
+
+fn quietly(input: &PoseInput) -> Result<PoseReport, RunError> {
+    pose(input, &|_| {})
+}
+
+#[test]
+fn ray_traced_photographs_get_their_poses_back_and_a_second_call_reuses_the_features() {
+    let folder = tempfile::tempdir().unwrap();
+    let (photos, out) = (folder.path().join("photos"), folder.path().join("data"));
+    fs::create_dir(&photos).unwrap();
+    let truth = photographs(&photos);
+    fs::write(photos.join("broken.jpg"), "no picture").unwrap();
+    let input = PoseInput::new(&photos, &out);
+    let matched = AtomicUsize::new(0);
+    let count = |event: PoseProgress| {
+        if let PoseProgress::Stage { name: "matches", of } = event {
+            matched.store(of, Ordering::Relaxed);
+        }
+    };
+    let report = pose(&input, &count).unwrap();
+    assert_eq!(matched.load(Ordering::Relaxed), truth.len() * (truth.len() - 1) / 2);
+    assert_eq!(report.photos, truth.len() + 1);
+    assert!(report.registered >= truth.len() - 1, "{report:#?}");
+    assert!(
+        report
+            .left_out
+            .iter()
+            .any(|left| left.name == "broken.jpg" && left.reason.contains("not a readable"))
+    );
+    assert_eq!(report.registered + report.left_out.len(), report.photos);
+
+    assert_eq!(DatasetFormat::recognise(&out), Some(DatasetFormat::Colmap));
+    let dataset = read_dataset(&out, &DatasetOptions::default()).unwrap();
+    assert_eq!(dataset.views.len(), report.registered);
+    assert!(dataset.points.as_ref().is_some_and(|points| points.len() > 200));
+    // Rotations between photographs are those of the truth, whatever the world is.
+    let of = |name: &str| {
+        truth
+            .iter()
+            .find(|(known, _)| name.ends_with(known.as_str()))
+            .unwrap()
+            .1
+            .pose
+            .rotation
+    };
+    let mut angles: Vec<f32> = Vec::new();
+    for (a, b) in dataset.views.iter().zip(&dataset.views[1..]) {
+        let found = a.camera.pose.rotation.inverse() * b.camera.pose.rotation;
+        let known = of(&a.name).inverse() * of(&b.name);
+        angles.push(found.angle_between(known).to_degrees());
+    }
+    angles.sort_by(f32::total_cmp);
+    assert!(angles[angles.len() / 2] < 0.5, "{angles:?}");
+
+    let before = fs::read(out.join("sparse/0/images.bin")).unwrap();
+    let points = fs::read(out.join("sparse/0/points3D.bin")).unwrap();
+    // A thread and a second call change nothing.
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
+    let again = pool.install(|| pose(&input, &count)).unwrap();
+    assert_eq!(matched.load(Ordering::Relaxed), 0, "matches are reused");
+    assert_eq!(again.registered, report.registered);
+    assert!(before == fs::read(out.join("sparse/0/images.bin")).unwrap());
+    assert!(points == fs::read(out.join("sparse/0/points3D.bin")).unwrap());
+    assert!(
+        again
+            .stages
+            .iter()
+            .all(|stage| Duration::from_secs_f64(stage.seconds) < Duration::from_secs(600))
+    );
+}
+
+#[test]
+fn folders_without_enough_photographs_have_one_clear_outcome() {
+    let folder = tempfile::tempdir().unwrap();
+    let refused = |photos: &Path, words: &[&str]| {
+        let out = folder.path().join("out");
+        let error = quietly(&PoseInput::new(photos, &out)).unwrap_err().to_string();
+        assert!(
+            !error.contains('\n') && words.iter().all(|word| error.contains(word)),
+            "{error}"
+        );
+        assert!(!out.join("sparse").exists());
+    };
+    let make = |name: &str| {
+        let path = folder.path().join(name);
+        fs::create_dir(&path).unwrap();
+        path
+    };
+    refused(&folder.path().join("none"), &["none"]);
+    refused(&make("empty"), &["0 readable photographs", "at least 3"]);
+    let one = make("one");
+    let picture = |seed: u32| -> Vec<u8> {
+        (0..64 * 48u32)
+            .map(|i| ((i ^ (i >> 3)).wrapping_mul(seed) >> 7) as u8)
+            .collect()
+    };
+    write_png(&one.join("a.png"), 64, 48, 1, &picture(977)).unwrap();
+    fs::copy(one.join("a.png"), one.join("b.png")).unwrap();
+    fs::copy(one.join("a.png"), one.join("c.png")).unwrap();
+    refused(&one, &["1 readable photographs", "b.png: a copy of a.png"]);
+    let apart = make("apart");
+    for (name, seed) in [("a.png", 977), ("b.png", 3571), ("c.png", 104_729)] {
+        write_png(&apart.join(name), 64, 48, 1, &picture(seed)).unwrap();
+    }
+    refused(&apart, &["no three of 3 photographs", "overlap"]);
+    // A dataset of another origin is not replaced.
+    let foreign = make("foreign");
+    fs::create_dir(foreign.join("sparse")).unwrap();
+    let error = quietly(&PoseInput::new(&apart, &foreign)).unwrap_err().to_string();
+    assert!(error.contains("another origin"), "{error}");
+    let film = folder.path().join("film.mp4");
+    fs::write(&film, "no film").unwrap();
+    refused(&film, &["film.mp4", "ffmpeg"]);
+}

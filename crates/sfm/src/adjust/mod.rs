@@ -1,0 +1,302 @@
+//! Bundle adjustment: poses, points and shared intrinsics that minimise the reprojection errors.
+//!
+//! Levenberg and Marquardt's method with analytic Jacobians. Points are eliminated (Schur complement); what remains is a dense
+//! symmetric system over poses and cameras, solved by Cholesky's factorisation or, beyond [`DIRECT_LIMIT`] unknowns, by
+//! conjugate gradients. Every sum has a fixed order: the result does not depend on the number of threads.
+
+mod cholesky;
+mod loss;
+mod schur;
+
+pub use cholesky::{Symmetric, conjugate_gradients};
+pub use loss::Loss;
+
+use crate::geometry::camera::{DCamera, PARAMETERS};
+use crate::geometry::pose::DPose;
+use glam::{DVec2, DVec3};
+use rayon::prelude::*;
+use schur::Linearization;
+
+/// Unknowns of poses and cameras beyond which conjugate gradients are used: 330 photographs.
+pub const DIRECT_LIMIT: usize = 2000;
+
+/// Which intrinsics of a camera are adjusted; the others are held.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Freedom {
+    /// The focal length.
+    pub focal: Focal,
+    /// The principal point.
+    pub principal: bool,
+    /// How many of k1, k2.
+    pub radial: usize,
+    /// p1 and p2.
+    pub tangential: bool,
+}
+
+/// How the focal length is adjusted.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Focal {
+    /// Not at all.
+    Held,
+    /// The ratio of fx and fy is kept.
+    Tied,
+    /// fx and fy on their own.
+    Free,
+}
+
+impl Freedom {
+    /// Nothing is adjusted.
+    pub const HELD: Self = Self {
+        focal: Focal::Held,
+        principal: false,
+        radial: 0,
+        tangential: false,
+    };
+
+    /// Which unknowns of a camera are adjusted. The first scales fx and fy together, the second moves fy alone.
+    fn columns(self) -> [bool; PARAMETERS] {
+        let focal = self.focal;
+        [
+            focal != Focal::Held,
+            focal == Focal::Free,
+            self.principal,
+            self.principal,
+            self.radial > 0,
+            self.radial > 1,
+            self.tangential,
+            self.tangential,
+        ]
+    }
+}
+
+/// A camera, what of it is adjusted, and what is believed of it.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct AdjustedCamera {
+    /// The camera.
+    pub camera: DCamera,
+    /// What is adjusted.
+    pub freedom: Freedom,
+    /// What is believed.
+    pub belief: Belief,
+}
+
+impl AdjustedCamera {
+    /// Nothing is believed.
+    pub fn new(camera: DCamera, freedom: Freedom) -> Self {
+        Self {
+            camera,
+            freedom,
+            belief: Belief::default(),
+        }
+    }
+}
+
+/// What is believed of a camera before it is adjusted: the cost has a term `weight (parameter - value)^2 / 2` for each.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Belief {
+    /// Values in the order of the parameters; that of fy is believed of `fy / fx`.
+    pub values: [f64; PARAMETERS],
+    /// Weights, px^2 per squared unit of the parameter.
+    pub weights: [f64; PARAMETERS],
+}
+
+impl Belief {
+    /// The differences from what is believed.
+    fn errors(&self, camera: &DCamera) -> [f64; PARAMETERS] {
+        let mut errors = camera.parameters;
+        errors[1] /= errors[0];
+        std::array::from_fn(|i| errors[i] - self.values[i])
+    }
+
+    fn cost(&self, camera: &DCamera) -> f64 {
+        let terms = self.errors(camera).into_iter().zip(self.weights);
+        0.5 * terms.map(|(error, weight)| weight * error * error).sum::<f64>()
+    }
+}
+
+/// A point's projection in one photograph.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Observation {
+    /// Index of the pose.
+    pub pose: u32,
+    /// Measured place, pixels.
+    pub at: DVec2,
+}
+
+/// What is adjusted. Fields are public: a caller fills them, calls [`Problem::solve`] and reads the results in the same place.
+#[derive(Clone, Debug, Default)]
+pub struct Problem {
+    /// `[C]` cameras.
+    pub cameras: Vec<AdjustedCamera>,
+    /// `[P]` poses.
+    pub poses: Vec<DPose>,
+    /// `[P]` whether a pose is held.
+    pub held_poses: Vec<bool>,
+    /// `[P]` the camera of each pose.
+    pub camera_of: Vec<u32>,
+    /// `[N]` points.
+    pub points: Vec<DVec3>,
+    /// `[N]` whether a point is held.
+    pub held_points: Vec<bool>,
+    /// Observations, sorted by point.
+    pub observations: Vec<Observation>,
+    /// `[N + 1]` where each point's observations begin.
+    pub starts: Vec<u32>,
+}
+
+/// How to adjust.
+#[derive(Clone, Copy, Debug)]
+pub struct AdjustOptions {
+    /// The loss of each observation's squared error.
+    pub loss: Loss,
+    /// Iterations at most.
+    pub iterations: usize,
+    /// Stop when an iteration lowers the cost by less than this fraction.
+    pub tolerance: f64,
+}
+
+/// What an adjustment did.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct AdjustReport {
+    /// Half the sum of losses before, px^2.
+    pub initial_cost: f64,
+    /// Half the sum of losses after, px^2.
+    pub final_cost: f64,
+    /// Linear systems solved.
+    pub iterations: usize,
+    /// Whether the last step was below the tolerance.
+    pub converged: bool,
+}
+
+impl Problem {
+    /// Half the sum of the losses at the present values, px^2. Points behind a camera count as far away.
+    pub fn cost(&self, loss: Loss) -> f64 {
+        self.cost_at(&self.state(), loss)
+    }
+
+    /// Adjusts in place.
+    pub fn solve(&mut self, options: &AdjustOptions) -> AdjustReport {
+        let mut state = self.state();
+        let mut linear = Linearization::new(self);
+        let mut cost = linear.linearize(self, &state, options.loss);
+        let mut report = AdjustReport {
+            initial_cost: cost,
+            final_cost: cost,
+            iterations: 0,
+            converged: false,
+        };
+        // Ceres' trust region: a radius of 1e4, divided by 2, 4, 8, .. after failures.
+        let (mut damping, mut failure) = (1e-4, 2.0);
+        while report.iterations < options.iterations && damping < 1e12 && cost.is_finite() {
+            report.iterations += 1;
+            let accepted = linear.step(self, damping).and_then(|step| {
+                let next = step.applied(&state);
+                let next_cost = self.cost_at(&next, options.loss);
+                let gain = (cost - next_cost) / step.predicted;
+                (gain.is_finite() && gain > 1e-3).then_some((next, next_cost, gain))
+            });
+            let Some((next, next_cost, gain)) = accepted else {
+                damping *= failure;
+                failure *= 2.0;
+                continue;
+            };
+            state = next;
+            let decrease = (cost - next_cost) / cost;
+            damping = (damping * (1.0 - (2.0 * gain - 1.0).powi(3)).max(1.0 / 3.0)).max(1e-14);
+            failure = 2.0;
+            cost = next_cost;
+            if decrease.is_nan() || decrease < options.tolerance {
+                report.converged = true;
+                break;
+            }
+            if report.iterations < options.iterations {
+                linear.linearize(self, &state, options.loss);
+            }
+        }
+        report.final_cost = cost;
+        for (camera, adjusted) in self.cameras.iter_mut().zip(state.cameras) {
+            camera.camera = adjusted;
+        }
+        (self.poses, self.points) = (state.poses, state.points);
+        report
+    }
+
+    fn state(&self) -> State {
+        State {
+            cameras: self.cameras.iter().map(|c| c.camera).collect(),
+            poses: self.poses.clone(),
+            points: self.points.clone(),
+        }
+    }
+
+    fn cost_at(&self, state: &State, loss: Loss) -> f64 {
+        let views = state.views(self);
+        let sums: Vec<f64> = self
+            .pieces()
+            .into_par_iter()
+            .map(|points| {
+                let mut sum = 0.0;
+                for i in points {
+                    for observation in &self.observations[self.starts[i] as usize..self.starts[i + 1] as usize] {
+                        let (rotation, position, camera) = &views[observation.pose as usize];
+                        let p = *rotation * (state.points[i] - *position);
+                        if p.z <= BEHIND {
+                            return f64::INFINITY;
+                        }
+                        sum += loss.evaluate((camera.pixel(p) - observation.at).length_squared()).0;
+                    }
+                }
+                sum
+            })
+            .collect();
+        0.5 * sums.iter().sum::<f64>() + self.belief_cost(state)
+    }
+
+    /// The terms of what is believed of the cameras.
+    fn belief_cost(&self, state: &State) -> f64 {
+        self.cameras
+            .iter()
+            .zip(&state.cameras)
+            .map(|(c, now)| c.belief.cost(now))
+            .sum()
+    }
+
+    /// Ranges of points of about equal numbers of observations; they depend on the problem alone.
+    fn pieces(&self) -> Vec<std::ops::Range<usize>> {
+        let goal = (self.observations.len() / 64).max(256) as u32;
+        let mut pieces = Vec::new();
+        let mut first = 0;
+        for i in 0..self.points.len() {
+            if self.starts[i + 1] - self.starts[first] >= goal || i + 1 == self.points.len() {
+                pieces.push(first..i + 1);
+                first = i + 1;
+            }
+        }
+        pieces
+    }
+}
+
+/// Depth below which a point counts as behind its camera, in world units.
+const BEHIND: f64 = 1e-9;
+
+/// The values that change during an adjustment.
+#[derive(Clone)]
+struct State {
+    cameras: Vec<DCamera>,
+    poses: Vec<DPose>,
+    points: Vec<DVec3>,
+}
+
+impl State {
+    /// Each pose as rotation from world to camera, centre, and intrinsics.
+    fn views(&self, problem: &Problem) -> Vec<(glam::DMat3, DVec3, DCamera)> {
+        self.poses
+            .iter()
+            .zip(&problem.camera_of)
+            .map(|(pose, camera)| (pose.camera_rotation(), pose.position, self.cameras[*camera as usize]))
+            .collect()
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,38 @@
+//! Features of a photograph: where they are and what they look like.
+//!
+//! [`Sift`] follows Lowe (2004) with the settings of COLMAP and VLFeat. Arithmetic is in single precision without fused operations,
+//! so that every instruction set finds the same bytes.
+
+mod descriptor;
+mod extrema;
+mod gradients;
+mod orientation;
+mod scale_space;
+mod sift;
+mod spread;
+
+use crate::Features;
+
+pub use sift::Sift;
+
+/// A photograph in grey, 8 bits a pixel.
+#[derive(Clone, Copy, Debug)]
+pub struct GreyPhoto<'a> {
+    /// Width in pixels.
+    pub width: u32,
+    /// Height in pixels.
+    pub height: u32,
+    /// `[H, W]`.
+    pub data: &'a [u8],
+    /// `[H, W]`; pixels below 128 have no features.
+    pub mask: Option<&'a [u8]>,
+}
+
+/// Finds the features of photographs. Extractors are serial: photographs are what is processed in parallel.
+pub trait Extractor: Sync {
+    /// The features of `photo`, largest scale first.
+    ///
+    /// # Panics
+    /// When the length of the pixels or of the mask is not width times height.
+    fn extract(&self, photo: &GreyPhoto) -> Features;
+}

@@ -1,0 +1,52 @@
+//! Poses in double precision.
+
+use glam::{DMat3, DQuat, DVec3};
+
+/// Position and orientation of a camera in double precision.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct DPose {
+    /// Rotation of camera axes (OpenCV: x right, y down, z forward) into the world.
+    pub rotation: DQuat,
+    /// Camera centre, world units.
+    pub position: DVec3,
+}
+
+impl DPose {
+    /// The world's own axes.
+    pub const IDENTITY: Self = Self {
+        rotation: DQuat::IDENTITY,
+        position: DVec3::ZERO,
+    };
+
+    /// From `x_camera = rotation x_world + translation`.
+    pub fn from_camera_from_world(rotation: DQuat, translation: DVec3) -> Self {
+        let world_from_camera = rotation.inverse();
+        Self {
+            rotation: world_from_camera,
+            position: -(world_from_camera * translation),
+        }
+    }
+
+    /// Transforms a point from world space to camera space.
+    pub fn camera_from_world(&self, point: DVec3) -> DVec3 {
+        self.rotation.inverse() * (point - self.position)
+    }
+
+    /// The rotation matrix from world to camera axes.
+    pub fn camera_rotation(&self) -> DMat3 {
+        DMat3::from_quat(self.rotation.inverse())
+    }
+
+    /// Moved by the small turn `turn` (camera axes, radians: `x_camera` becomes `exp(turn) x_camera`) and `shift` (world).
+    pub fn moved(&self, turn: DVec3, shift: DVec3) -> Self {
+        Self {
+            rotation: (self.rotation * DQuat::from_scaled_axis(-turn)).normalize(),
+            position: self.position + shift,
+        }
+    }
+
+    /// Whether every number is finite.
+    pub fn is_finite(&self) -> bool {
+        self.rotation.is_finite() && self.position.is_finite()
+    }
+}

@@ -1,0 +1,163 @@
+//! What is handed out: an upright, centred model, and a reason for each photograph that is in none.
+
+use super::model::Working;
+use super::types::{LeftOut, MapOptions, Model, ModelPoint, PairKind, PhotoInfo, Reason, VerifiedPair};
+use crate::geometry::align::Alignment;
+use crate::geometry::linear::symmetric_eigen;
+use crate::{Features, PairMatches};
+use glam::{DQuat, DVec3};
+
+/// The model in its final world.
+pub(super) fn finish(working: Working, photos: &[PhotoInfo]) -> Model {
+    let mut model = Model {
+        cameras: Vec::new(),
+        poses: working.poses.clone(),
+        points: Vec::new(),
+        focal_held: working.focal_held.clone(),
+    };
+    for (group, camera) in working.cameras.iter().enumerate() {
+        let present = photos
+            .iter()
+            .zip(&working.poses)
+            .any(|(photo, pose)| photo.group == group && pose.is_some());
+        model.cameras.push(present.then_some(*camera));
+    }
+    for track in working.with_points() {
+        let position = working.points[track].expect("listed");
+        let used: Vec<usize> = working.tracks.range(track).filter(|o| working.used[*o]).collect();
+        let errors = used
+            .iter()
+            .filter_map(|o| Some(working.sight(*o)?.error_squared(position).sqrt()));
+        model.points.push(ModelPoint {
+            position,
+            error: errors.sum::<f64>() / used.len() as f64,
+            track: used
+                .iter()
+                .map(|o| {
+                    let observation = working.tracks.observations[*o];
+                    (observation.photo, observation.keypoint)
+                })
+                .collect(),
+        });
+    }
+    let alignment = upright(&model, photos);
+    for pose in model.poses.iter_mut().flatten() {
+        *pose = alignment.pose(pose);
+    }
+    for point in &mut model.points {
+        point.position = alignment.point(point.position);
+    }
+    model
+}
+
+/// Up is +Z, the points' median is the origin, and the cameras' median distance from it is 1.
+fn upright(model: &Model, photos: &[PhotoInfo]) -> Alignment {
+    let up = up(model, photos);
+    let rotation = DQuat::from_rotation_arc(up, DVec3::Z);
+    let middle = |mut values: Vec<f64>| {
+        if values.is_empty() {
+            return 0.0;
+        }
+        let half = values.len() / 2;
+        *values.select_nth_unstable_by(half, f64::total_cmp).1
+    };
+    let center =
+        DVec3::from_array([0, 1, 2].map(|axis| middle(model.points.iter().map(|p| p.position[axis]).collect())));
+    let distance = middle(
+        model
+            .poses
+            .iter()
+            .flatten()
+            .map(|p| (p.position - center).length())
+            .collect(),
+    );
+    let scale = if distance > 0.0 { 1.0 / distance } else { 1.0 };
+    Alignment {
+        scale,
+        rotation,
+        translation: -scale * (rotation * center),
+    }
+}
+
+/// The direction up: photographs are held level more often than not, so that all their x axes lie in one horizontal plane.
+///
+/// Its normal is the answer if the x axes leave no doubt about it and it agrees with the mean of the photographs' own up
+/// directions; otherwise that mean.
+fn up(model: &Model, photos: &[PhotoInfo]) -> DVec3 {
+    let mut mean = DVec3::ZERO;
+    let mut scatter = [[0.0; 3]; 3];
+    for (photo, pose) in photos.iter().zip(&model.poses) {
+        let Some(pose) = pose else { continue };
+        let own = photo.up.unwrap_or(DVec3::NEG_Y);
+        mean += pose.rotation * own;
+        let right = pose.rotation * own.cross(DVec3::NEG_Z).normalize_or_zero();
+        for i in 0..3 {
+            for j in 0..3 {
+                scatter[i][j] += right[i] * right[j];
+            }
+        }
+    }
+    let mean = mean.normalize_or(DVec3::NEG_Y);
+    let (values, vectors) = symmetric_eigen(scatter);
+    let normal = DVec3::from_array(vectors[0]);
+    let normal = normal * normal.dot(mean).signum();
+    // Within 30 degrees, and the second axis at least five times as wide as what is left over.
+    if values[1] > 5.0 * values[0] && values[1] > 0.02 * values[2] && normal.dot(mean) > 0.866 {
+        normal
+    } else {
+        mean
+    }
+}
+
+/// Why photographs are in no model.
+pub(super) fn left_out(
+    photos: &[PhotoInfo],
+    features: &[Features],
+    pairs: &[PairMatches],
+    verified: &[VerifiedPair],
+    taken: &[bool],
+    tried: &[usize],
+    options: &MapOptions,
+) -> Vec<LeftOut> {
+    let reason = |photo: usize| {
+        let of = |photos: &[u32; 2]| photos.contains(&(photo as u32));
+        let count = features[photo].keypoints.len();
+        if count < options.min_inliers {
+            return Reason::FewFeatures { features: count };
+        }
+        let best = pairs
+            .iter()
+            .filter(|p| of(&p.photos))
+            .map(|p| p.matches.len())
+            .max()
+            .unwrap_or(0);
+        if best < options.min_inliers {
+            return Reason::FewMatches { best };
+        }
+        let partners: Vec<&VerifiedPair> = verified.iter().filter(|p| of(&p.photos)).collect();
+        if partners.is_empty() {
+            return Reason::NoGeometry { best };
+        }
+        let in_model = partners.iter().any(|p| p.photos.iter().any(|p| taken[*p as usize]));
+        if partners.iter().all(|p| p.kind == PairKind::Rotation) {
+            return Reason::RotationOnly {
+                partners: partners.len(),
+            };
+        }
+        if in_model || tried[photo] > 0 {
+            return Reason::NotRegistered {
+                partners: partners.len(),
+            };
+        }
+        Reason::NoModel {
+            partners: partners.len(),
+        }
+    };
+    (0..photos.len())
+        .filter(|p| !taken[*p])
+        .map(|photo| LeftOut {
+            photo,
+            reason: reason(photo),
+        })
+        .collect()
+}

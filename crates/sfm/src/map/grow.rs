@@ -1,0 +1,254 @@
+//! The growth of a model from a seed, photograph by photograph.
+
+use super::Cameras;
+use super::model::Working;
+use super::refine::Extent;
+use super::seed::seeds;
+use super::tracks::Tracks;
+use super::types::{MapOptions, PhotoInfo, Progress, VerifiedPair};
+use crate::geometry::pose::DPose;
+use crate::geometry::ransac::Limits;
+use crate::geometry::resection::Resection;
+
+/// Seeds tried for one model.
+const SEEDS: usize = 12;
+/// Times a photograph is tried before it is given up.
+const TRIES: usize = 3;
+/// Points of a pair of photographs below which it is no seed.
+const SEED_POINTS: usize = 12;
+/// Inliers among the points a photograph shows: those with fewer wait until the others are registered and all is adjusted.
+const STRICT: f64 = 0.5;
+const LENIENT: f64 = 0.25;
+/// Rounds of adjustment, filtering and triangulation at the end.
+const LAST_ROUNDS: usize = 3;
+
+/// The largest model over several seeds among photographs not yet taken; `None` if there is none.
+///
+/// A seed whose model holds half of what it could reach ends the search. `tried` counts failed registrations.
+pub(super) fn model<'a>(
+    photos: &'a [PhotoInfo],
+    cameras: &Cameras,
+    pairs: &[VerifiedPair],
+    tracks: &'a Tracks,
+    taken: &[bool],
+    tried: &mut [usize],
+    options: &'a MapOptions,
+    progress: &mut dyn FnMut(Progress),
+) -> Option<Working<'a>> {
+    let empty = Working::new(photos, cameras, tracks, options);
+    let mut best: Option<(Working, Vec<usize>)> = None;
+    for seed in seeds(pairs, taken, SEEDS) {
+        let reachable = reachable(&pairs[seed], pairs, taken);
+        if best.as_ref().is_some_and(|(best, _)| best.registered() >= reachable) {
+            continue;
+        }
+        let mut grown = empty.clone();
+        let mut failures = vec![0; photos.len()];
+        if !grown.start(&pairs[seed]) || !grown.grow(taken, &mut failures, progress) {
+            continue;
+        }
+        let registered = grown.registered();
+        if registered >= options.min_model_photos
+            && best.as_ref().is_none_or(|(best, _)| registered > best.registered())
+        {
+            best = Some((grown, failures));
+        }
+        if best.as_ref().is_some_and(|(best, _)| 2 * best.registered() > reachable) {
+            break;
+        }
+    }
+    let (best, failures) = best?;
+    for (total, failed) in tried.iter_mut().zip(failures) {
+        *total += failed;
+    }
+    Some(best)
+}
+
+/// Photographs that chains of pairs connect with the seed.
+fn reachable(seed: &VerifiedPair, pairs: &[VerifiedPair], taken: &[bool]) -> usize {
+    let mut reached = vec![false; taken.len()];
+    reached[seed.photos[0] as usize] = true;
+    loop {
+        let mut grew = false;
+        for pair in pairs {
+            let [a, b] = pair.photos.map(|p| p as usize);
+            if !taken[a] && !taken[b] && reached[a] != reached[b] {
+                (reached[a], reached[b], grew) = (true, true, true);
+            }
+        }
+        if !grew {
+            return reached.iter().filter(|r| **r).count();
+        }
+    }
+}
+
+impl Working<'_> {
+    /// Places the two photographs of a seed and their points; `false` if too few remain.
+    fn start(&mut self, pair: &VerifiedPair) -> bool {
+        let [a, b] = pair.photos.map(|p| p as usize);
+        self.poses[a] = Some(DPose::IDENTITY);
+        self.poses[b] = Some(DPose::from_camera_from_world(
+            pair.motion.rotation,
+            pair.motion.translation,
+        ));
+        let tracks = self.tracks_of(a);
+        self.triangulate(&tracks);
+        self.adjust_all(Extent::Growing);
+        let points = self.with_points();
+        self.filter(&points);
+        self.point_count() >= SEED_POINTS
+    }
+
+    /// Registers photographs as long as that succeeds, then adjusts all; `false` if the model broke.
+    fn grow(&mut self, taken: &[bool], failures: &mut [usize], progress: &mut dyn FnMut(Progress)) -> bool {
+        let (mut photos_then, mut points_then) = (self.registered(), self.point_count());
+        let mut settled = false;
+        loop {
+            let next = self.candidates(taken, failures).into_iter().find(|photo| {
+                let registered = self.register(*photo, if settled { LENIENT } else { STRICT });
+                failures[*photo] += usize::from(!registered && settled);
+                registered
+            });
+            let Some(photo) = next else {
+                if settled {
+                    break;
+                }
+                // What failed before may succeed after an adjustment of all.
+                self.settle(Extent::Growing, progress);
+                (photos_then, points_then, settled) = (self.registered(), self.point_count(), true);
+                continue;
+            };
+            settled = false;
+            let tracks = self.tracks_of(photo);
+            self.triangulate(&tracks);
+            let growth = self.options.global_growth;
+            let (photos, points) = (self.registered(), self.point_count());
+            if photos as f64 >= growth * photos_then as f64 || points as f64 >= growth * points_then as f64 {
+                self.settle(Extent::Growing, progress);
+                (photos_then, points_then) = (self.registered(), self.point_count());
+            } else {
+                self.adjust_around(photo);
+            }
+            progress(Progress::Registered {
+                photos: self.registered(),
+                of: self.photos.len(),
+                points: self.point_count(),
+            });
+        }
+        for _ in 0..LAST_ROUNDS {
+            let changed = self.settle(Extent::Full, progress);
+            let observations = self.used.iter().filter(|u| **u).count();
+            if (changed as f64) < 1e-3 * observations as f64 {
+                break;
+            }
+        }
+        self.settle(Extent::Last, progress);
+        self.registered() >= self.options.min_model_photos
+    }
+
+    /// Adjusts all, filters, triangulates again and removes photographs that lost their points. Returns the number of
+    /// observations that changed.
+    fn settle(&mut self, extent: Extent, progress: &mut dyn FnMut(Progress)) -> usize {
+        self.adjust_all(extent);
+        let points = self.with_points();
+        let mut changed = self.filter(&points);
+        if extent != Extent::Last {
+            let all: Vec<usize> = (0..self.tracks.len()).collect();
+            changed += self.triangulate(&all);
+        }
+        for photo in 0..self.poses.len() {
+            if self.poses[photo].is_some() && self.used_in(photo) < self.options.min_inliers && self.registered() > 2 {
+                self.deregister(photo);
+            }
+        }
+        progress(Progress::Adjusted {
+            photos: self.registered(),
+            points: self.point_count(),
+            error: self.mean_error(),
+        });
+        changed
+    }
+
+    /// Photographs to register, best first: those in which points of the model are many and spread out.
+    fn candidates(&self, taken: &[bool], failures: &[usize]) -> Vec<usize> {
+        let mut scored: Vec<(usize, usize)> = (0..self.poses.len())
+            .filter(|p| self.poses[*p].is_none() && !taken[*p] && failures[*p] < TRIES)
+            .filter_map(|photo| {
+                let (count, score) = self.visibility(photo);
+                (count >= self.options.min_registration_inliers).then_some((score, photo))
+            })
+            .collect();
+        scored.sort_by_key(|(score, photo)| (std::cmp::Reverse(*score), *photo));
+        scored.into_iter().map(|s| s.1).collect()
+    }
+
+    /// How many points of the model a photograph shows, and the pyramid score of Schoenberger and Frahm (2016, 4.2): on
+    /// grids of 2, 4, .. 64 cells a side, each cell with a point counts as many as the grid has.
+    fn visibility(&self, photo: usize) -> (usize, usize) {
+        const LEVELS: usize = 6;
+        const SIDE: usize = 1 << LEVELS;
+        let camera = self.camera(photo as u32);
+        let mut cells = vec![false; SIDE * SIDE];
+        let mut count = 0;
+        for o in &self.tracks.of_photo[photo] {
+            if self.points[self.track_of(*o)].is_some() {
+                let at = self.tracks.pixels[*o as usize];
+                let cell = |x: f64, size: u32| ((x / f64::from(size) * SIDE as f64) as usize).min(SIDE - 1);
+                cells[cell(at.y, camera.height) * SIDE + cell(at.x, camera.width)] = true;
+                count += 1;
+            }
+        }
+        let mut score = 0;
+        let mut side = SIDE;
+        while side > 1 {
+            score += cells.iter().filter(|c| **c).count() * side * side;
+            let half = side / 2;
+            let coarse = |i: usize| {
+                let (y, x) = (i / half * 2, i % half * 2);
+                cells[y * side + x]
+                    || cells[y * side + x + 1]
+                    || cells[(y + 1) * side + x]
+                    || cells[(y + 1) * side + x + 1]
+            };
+            cells = (0..half * half).map(coarse).collect();
+            side = half;
+        }
+        (count, score)
+    }
+
+    /// Finds the pose of a photograph from the points it shows; `false` if fewer than `ratio` of them agree.
+    fn register(&mut self, photo: usize, ratio: f64) -> bool {
+        let seen: Vec<u32> = self.tracks.of_photo[photo]
+            .iter()
+            .copied()
+            .filter(|o| self.points[self.track_of(*o)].is_some() && self.plane[*o as usize].is_finite())
+            .collect();
+        let points = seen
+            .iter()
+            .map(|o| {
+                (
+                    self.plane[*o as usize],
+                    self.points[self.track_of(*o)].expect("filtered"),
+                )
+            })
+            .collect();
+        let threshold = self.options.max_registration_error / self.camera(photo as u32).focal();
+        let problem = Resection::new(points, threshold);
+        let limits = Limits {
+            samples: 2000,
+            confidence: 0.9999,
+            seed: photo as u64,
+        };
+        let Some(found) = problem.solve(Vec::new(), limits) else {
+            return false;
+        };
+        if found.inliers < self.options.min_registration_inliers || (found.inliers as f64) < ratio * seen.len() as f64 {
+            return false;
+        }
+        self.poses[photo] = Some(found.model);
+        for (o, inlier) in seen.iter().zip(problem.inliers(&found.model)) {
+            self.used[*o as usize] = inlier;
+        }
+        true
+    }
+}

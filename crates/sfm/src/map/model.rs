@@ -1,0 +1,140 @@
+//! A model that grows: which photographs have poses, which tracks have points, which observations agree.
+
+use super::Cameras;
+use super::focal::Source;
+use super::tracks::Tracks;
+use super::types::{MapOptions, PhotoInfo};
+use crate::geometry::camera::DCamera;
+use crate::geometry::pose::DPose;
+use crate::geometry::triangulate::Sight;
+use glam::{DVec2, DVec3};
+use rayon::prelude::*;
+
+/// A growing model.
+#[derive(Clone)]
+pub(super) struct Working<'a> {
+    pub photos: &'a [PhotoInfo],
+    pub tracks: &'a Tracks,
+    pub options: &'a MapOptions,
+    /// `[groups]` cameras.
+    pub cameras: Vec<DCamera>,
+    /// `[groups]` their first focal lengths, px, and where these came from.
+    pub first_focals: Vec<f64>,
+    pub sources: Vec<Source>,
+    /// `[groups]` focal lengths that are held because no value is better than another.
+    pub focal_held: Vec<bool>,
+    /// `[observations]` on the plane z = 1, undistorted by the present cameras; NaN where the lens is not invertible.
+    pub plane: Vec<DVec2>,
+    /// `[photos]` poses of registered photographs.
+    pub poses: Vec<Option<DPose>>,
+    /// `[tracks]` points of triangulated tracks.
+    pub points: Vec<Option<DVec3>>,
+    /// `[observations]` whether an observation belongs to its track's point.
+    pub used: Vec<bool>,
+}
+
+impl<'a> Working<'a> {
+    /// A model without photographs.
+    pub fn new(photos: &'a [PhotoInfo], cameras: &Cameras, tracks: &'a Tracks, options: &'a MapOptions) -> Self {
+        let mut model = Self {
+            photos,
+            tracks,
+            options,
+            cameras: cameras.iter().map(|c| c.0).collect(),
+            first_focals: cameras.iter().map(|c| c.0.focal()).collect(),
+            sources: cameras.iter().map(|c| c.1).collect(),
+            focal_held: vec![false; cameras.len()],
+            plane: Vec::new(),
+            poses: vec![None; photos.len()],
+            points: vec![None; tracks.len()],
+            used: vec![false; tracks.observations.len()],
+        };
+        model.undistort();
+        model
+    }
+
+    /// Recomputes what depends on the cameras' intrinsics.
+    pub fn undistort(&mut self) {
+        let (tracks, cameras, photos) = (self.tracks, &self.cameras, self.photos);
+        self.plane = tracks
+            .observations
+            .par_iter()
+            .zip(&tracks.pixels)
+            .map(|(o, pixel)| {
+                cameras[photos[o.photo as usize].group]
+                    .unproject(*pixel)
+                    .unwrap_or(DVec2::NAN)
+            })
+            .collect();
+    }
+
+    /// The camera of a photograph.
+    pub fn camera(&self, photo: u32) -> &DCamera {
+        &self.cameras[self.photos[photo as usize].group]
+    }
+
+    /// The view of an observation; `None` if its photograph is not registered or its lens not invertible there.
+    pub fn sight(&self, observation: usize) -> Option<Sight> {
+        let photo = self.tracks.observations[observation].photo;
+        let pose = self.poses[photo as usize].as_ref()?;
+        let at = self.plane[observation];
+        at.is_finite().then(|| Sight::new(pose, at, self.camera(photo).focal()))
+    }
+
+    /// The track of an observation.
+    pub fn track_of(&self, observation: u32) -> usize {
+        self.tracks.track_of[observation as usize] as usize
+    }
+
+    /// Number of registered photographs.
+    pub fn registered(&self) -> usize {
+        self.poses.iter().flatten().count()
+    }
+
+    /// Number of points.
+    pub fn point_count(&self) -> usize {
+        self.points.iter().flatten().count()
+    }
+
+    /// Observations of a photograph that belong to points.
+    pub fn used_in(&self, photo: usize) -> usize {
+        self.tracks.of_photo[photo]
+            .iter()
+            .filter(|o| self.used[**o as usize])
+            .count()
+    }
+
+    /// Removes a point.
+    pub fn remove_point(&mut self, track: usize) {
+        self.points[track] = None;
+        self.used[self.tracks.range(track)].fill(false);
+    }
+
+    /// Takes a photograph's pose away, and the points that are then seen less than twice.
+    pub fn deregister(&mut self, photo: usize) {
+        self.poses[photo] = None;
+        for i in 0..self.tracks.of_photo[photo].len() {
+            let observation = self.tracks.of_photo[photo][i];
+            self.used[observation as usize] = false;
+            let track = self.track_of(observation);
+            if self.points[track].is_some() && self.tracks.range(track).filter(|o| self.used[*o]).count() < 2 {
+                self.remove_point(track);
+            }
+        }
+    }
+
+    /// Mean reprojection error, px.
+    pub fn mean_error(&self) -> f64 {
+        let (mut sum, mut count) = (0.0, 0usize);
+        for track in 0..self.tracks.len() {
+            let Some(point) = self.points[track] else { continue };
+            for o in self.tracks.range(track).filter(|o| self.used[*o]) {
+                if let Some(sight) = self.sight(o) {
+                    sum += sight.error_squared(point).sqrt();
+                    count += 1;
+                }
+            }
+        }
+        sum / count.max(1) as f64
+    }
+}

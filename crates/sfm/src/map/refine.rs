@@ -1,0 +1,280 @@
+//! Bundle adjustments of a growing model.
+
+use super::focal::Source;
+use super::model::Working;
+use crate::adjust::{AdjustOptions, AdjustReport, AdjustedCamera, Belief, Focal, Freedom, Loss, Observation, Problem};
+use crate::geometry::camera::DCamera;
+use glam::DVec2;
+
+/// Scale of the robust loss, px.
+const LOSS: Loss = Loss::SoftL1(1.0);
+/// Observations of a photograph, from long tracks, that an adjustment needs while the model grows.
+const ENOUGH: usize = 300;
+
+/// Squared error, px^2, that one deviation of an intrinsic parameter is worth: that of a hundred observations off by a pixel.
+const BELIEF: f64 = 100.0;
+
+/// How much of the model an adjustment may change.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Extent {
+    /// While growing: few points, focal length and one radial coefficient.
+    Growing,
+    /// All points, the full lens.
+    Full,
+    /// All points, the full lens and the principal point.
+    Last,
+}
+
+impl Working<'_> {
+    /// Adjusts everything; returns what the adjustment did.
+    pub fn adjust_all(&mut self, extent: Extent) -> AdjustReport {
+        let points = self.with_points();
+        let chosen = if extent == Extent::Growing {
+            self.covering(&points, ENOUGH)
+        } else {
+            points.clone()
+        };
+        let mut problem = Problem::default();
+        let mut photos = Vec::new();
+        let mut pose_of = vec![u32::MAX; self.poses.len()];
+        for (photo, pose) in self.poses.iter().enumerate() {
+            if let Some(pose) = pose {
+                pose_of[photo] = photos.len() as u32;
+                photos.push(photo);
+                problem.poses.push(*pose);
+                problem.camera_of.push(self.photos[photo].group as u32);
+            }
+        }
+        problem.held_poses = vec![false; photos.len()];
+        for group in 0..self.cameras.len() {
+            problem.cameras.push(AdjustedCamera {
+                camera: self.cameras[group],
+                freedom: self.freedom(group, extent),
+                belief: belief(&self.cameras[group], self.first_focals[group]),
+            });
+        }
+        self.add_points(&mut problem, &chosen, |_| false, |photo| Some(pose_of[photo as usize]));
+        let options = match extent {
+            Extent::Growing => AdjustOptions {
+                loss: LOSS,
+                iterations: 8,
+                tolerance: 1e-3,
+            },
+            Extent::Full => AdjustOptions {
+                loss: LOSS,
+                iterations: 15,
+                tolerance: 1e-4,
+            },
+            Extent::Last => AdjustOptions {
+                loss: LOSS,
+                iterations: 30,
+                tolerance: 1e-5,
+            },
+        };
+        let report = problem.solve(&options);
+        for (pose, photo) in problem.poses.iter().zip(photos) {
+            self.poses[photo] = Some(*pose);
+        }
+        for group in 0..self.cameras.len() {
+            self.take_camera(group, problem.cameras[group].camera);
+        }
+        for (track, point) in chosen.iter().zip(&problem.points) {
+            self.points[*track] = Some(*point);
+        }
+        self.undistort();
+        if chosen.len() < points.len() {
+            self.polish(&points);
+        }
+        report
+    }
+
+    /// Adjusts a new photograph, its neighbours and its points; all else is held.
+    pub fn adjust_around(&mut self, photo: usize) {
+        let local = self.neighbours(photo);
+        let mut variable = vec![false; self.tracks.len()];
+        for o in &self.tracks.of_photo[photo] {
+            let track = self.track_of(*o);
+            variable[track] = self.used[*o as usize] && self.points[track].is_some();
+        }
+        // Held points of neighbours anchor them.
+        let mut listed = vec![false; self.tracks.len()];
+        let mut tracks = Vec::new();
+        for neighbour in &local {
+            for o in &self.tracks.of_photo[*neighbour] {
+                let track = self.track_of(*o);
+                if self.used[*o as usize] && !listed[track] {
+                    listed[track] = true;
+                    tracks.push(track);
+                }
+            }
+        }
+        tracks.sort_unstable();
+        let mut problem = Problem::default();
+        let mut pose_of = vec![u32::MAX; self.poses.len()];
+        let mut add = |problem: &mut Problem, photo: usize, held: bool| {
+            let Some(pose) = self.poses[photo] else { return };
+            pose_of[photo] = problem.poses.len() as u32;
+            problem.poses.push(pose);
+            problem.held_poses.push(held);
+            problem.camera_of.push(self.photos[photo].group as u32);
+        };
+        for neighbour in &local {
+            add(&mut problem, *neighbour, false);
+        }
+        for other in 0..self.poses.len() {
+            if !local.contains(&other) {
+                add(&mut problem, other, true);
+            }
+        }
+        problem.cameras = self
+            .cameras
+            .iter()
+            .map(|c| AdjustedCamera::new(*c, Freedom::HELD))
+            .collect();
+        self.add_points(
+            &mut problem,
+            &tracks,
+            |track| !variable[track],
+            |photo| Some(pose_of[photo as usize]),
+        );
+        problem.solve(&AdjustOptions {
+            loss: LOSS,
+            iterations: 6,
+            tolerance: 1e-3,
+        });
+        for (pose, photo) in problem.poses.iter().zip(&local) {
+            self.poses[*photo] = Some(*pose);
+        }
+        for (track, point) in tracks.iter().zip(&problem.points) {
+            self.points[*track] = Some(*point);
+        }
+        self.filter(&tracks);
+    }
+
+    /// The photograph and those that share most points with it, [`MapOptions::local_photos`](super::MapOptions) in all.
+    fn neighbours(&self, photo: usize) -> Vec<usize> {
+        let mut shared = vec![0usize; self.poses.len()];
+        for o in &self.tracks.of_photo[photo] {
+            if self.used[*o as usize] {
+                for other in self.tracks.range(self.track_of(*o)).filter(|o| self.used[*o]) {
+                    shared[self.tracks.observations[other].photo as usize] += 1;
+                }
+            }
+        }
+        shared[photo] = usize::MAX;
+        let mut order: Vec<usize> = (0..shared.len())
+            .filter(|p| shared[*p] > 0 && self.poses[*p].is_some())
+            .collect();
+        order.sort_by_key(|p| (std::cmp::Reverse(shared[*p]), *p));
+        order.truncate(self.options.local_photos);
+        order
+    }
+
+    /// Adds the points of `tracks` with their used observations; held points only in adjusted photographs.
+    fn add_points(
+        &self,
+        problem: &mut Problem,
+        tracks: &[usize],
+        held: impl Fn(usize) -> bool,
+        pose_of: impl Fn(u32) -> Option<u32>,
+    ) {
+        problem.starts.push(0);
+        for track in tracks {
+            let held = held(*track);
+            for o in self.tracks.range(*track).filter(|o| self.used[*o]) {
+                let Some(pose) = pose_of(self.tracks.observations[o].photo) else {
+                    continue;
+                };
+                if held && problem.held_poses[pose as usize] {
+                    continue;
+                }
+                problem.observations.push(Observation {
+                    pose,
+                    at: self.tracks.pixels[o],
+                });
+            }
+            problem
+                .points
+                .push(self.points[*track].expect("listed tracks have points"));
+            problem.held_points.push(held);
+            problem.starts.push(problem.observations.len() as u32);
+        }
+    }
+
+    /// Tracks, long ones first, that give each photograph `enough` observations, in their order.
+    fn covering(&self, tracks: &[usize], enough: usize) -> Vec<usize> {
+        let length = |track: usize| self.tracks.range(track).filter(|o| self.used[*o]).count();
+        let mut order: Vec<(usize, usize)> = tracks.iter().map(|t| (length(*t), *t)).collect();
+        order.sort_by_key(|(length, track)| (std::cmp::Reverse(*length), *track));
+        let mut seen = vec![0usize; self.poses.len()];
+        let mut chosen = Vec::new();
+        for (_, track) in order {
+            let photos = || {
+                let observations = self.tracks.range(track).filter(|o| self.used[*o]);
+                observations.map(|o| self.tracks.observations[o].photo as usize)
+            };
+            if photos().any(|p| seen[p] < enough) {
+                photos().for_each(|p| seen[p] += 1);
+                chosen.push(track);
+            }
+        }
+        chosen.sort_unstable();
+        chosen
+    }
+
+    /// What of a group's intrinsics is adjusted, by the number of its photographs.
+    fn freedom(&self, group: usize, extent: Extent) -> Freedom {
+        let count = (0..self.poses.len())
+            .filter(|p| self.poses[*p].is_some() && self.photos[*p].group == group)
+            .count();
+        let full = extent != Extent::Growing && count >= self.options.full_lens_photos;
+        let least = if self.sources[group] == Source::Prior { 4 } else { 3 };
+        Freedom {
+            focal: match (self.focal_held[group] || count < least, full) {
+                (true, _) => Focal::Held,
+                (false, false) => Focal::Tied,
+                (false, true) => Focal::Free,
+            },
+            principal: full && extent == Extent::Last && self.options.principal_point,
+            radial: match count {
+                _ if full => 2,
+                0..=3 => 0,
+                _ => 1,
+            },
+            tangential: full,
+        }
+    }
+
+    /// Takes an adjusted camera, unless its values are not those of a camera.
+    fn take_camera(&mut self, group: usize, camera: DCamera) {
+        let long_side = f64::from(camera.width.max(camera.height));
+        let focal = camera.focal() / long_side;
+        let lens = camera.parameters[4..].iter().all(|k| k.abs() < 1.0);
+        if (0.2..10.0).contains(&focal) && lens {
+            self.cameras[group] = camera;
+        } else {
+            self.focal_held[group] = true;
+        }
+    }
+}
+
+/// What is known of cameras in general, so that what a set of photographs does not determine stays where it usually is:
+/// square pixels, a principal point near the centre, a weak lens, a focal length near the first one.
+fn belief(camera: &DCamera, first_focal: f64) -> Belief {
+    let long_side = f64::from(camera.width.max(camera.height));
+    let deviations = [
+        0.5 * first_focal,
+        0.002,
+        0.01 * long_side,
+        0.01 * long_side,
+        0.1,
+        0.1,
+        0.002,
+        0.002,
+    ];
+    let center = 0.5 * DVec2::new(f64::from(camera.width), f64::from(camera.height));
+    Belief {
+        values: [first_focal, 1.0, center.x, center.y, 0.0, 0.0, 0.0, 0.0],
+        weights: deviations.map(|d| BELIEF / (d * d)),
+    }
+}

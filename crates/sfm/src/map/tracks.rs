@@ -1,0 +1,247 @@
+//! Tracks: keypoints of different photographs that show the same point, joined from verified matches.
+
+use super::types::{PairKind, VerifiedPair};
+use crate::Features;
+use glam::DVec2;
+
+/// A keypoint of a track.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Observation {
+    /// The photograph.
+    pub photo: u32,
+    /// Its keypoint.
+    pub keypoint: u32,
+}
+
+/// All tracks, at most one observation a photograph each.
+#[derive(Clone, Debug, Default)]
+pub struct Tracks {
+    /// `[T + 1]` where the observations of each track begin.
+    pub starts: Vec<u32>,
+    /// Observations by track, within a track by photograph.
+    pub observations: Vec<Observation>,
+    /// The track of each observation.
+    pub track_of: Vec<u32>,
+    /// Pixels of each observation.
+    pub pixels: Vec<DVec2>,
+    /// `[photos]` the observations in each photograph, ascending.
+    pub of_photo: Vec<Vec<u32>>,
+}
+
+impl Tracks {
+    /// Joins matches, those of pairs with most matches first; a match that would bring two places of one photograph into
+    /// a track is dropped: it, or one before, is wrong.
+    pub fn new(features: &[Features], pairs: &[VerifiedPair]) -> Self {
+        // Keypoints at one place (a blob with two orientations) are one.
+        let mut first_node = vec![0u32];
+        let mut node_of: Vec<Vec<u32>> = Vec::new();
+        for features in features {
+            let mut order: Vec<u32> = (0..features.keypoints.len() as u32).collect();
+            let place = |i: u32| {
+                let k = &features.keypoints[i as usize];
+                (k.x.to_bits(), k.y.to_bits())
+            };
+            order.sort_by_key(|i| (place(*i), *i));
+            let mut canonical: Vec<u32> = (0..features.keypoints.len() as u32).collect();
+            for pair in order.windows(2) {
+                if place(pair[0]) == place(pair[1]) {
+                    canonical[pair[1] as usize] = canonical[pair[0] as usize];
+                }
+            }
+            let base = *first_node.last().expect("starts with zero");
+            first_node.push(base + canonical.len() as u32);
+            node_of.push(canonical.into_iter().map(|c| base + c).collect());
+        }
+        let nodes = *first_node.last().expect("starts with zero") as usize;
+        let mut sets = Sets::new(nodes);
+        let mut order: Vec<usize> = (0..pairs.len()).collect();
+        // Rotation-only pairs last: their wrong matches are the hardest to notice.
+        order.sort_by_key(|i| {
+            let pair = &pairs[*i];
+            (
+                pair.kind == PairKind::Rotation,
+                std::cmp::Reverse(pair.matches.len()),
+                pair.photos,
+            )
+        });
+        for pair in order.into_iter().map(|i| &pairs[i]) {
+            let [a, b] = pair.photos;
+            for [i, j] in &pair.matches {
+                let (i, j) = (node_of[a as usize][*i as usize], node_of[b as usize][*j as usize]);
+                sets.join((i, a), (j, b));
+            }
+        }
+        Self::from_sets(features, &first_node, sets)
+    }
+
+    fn from_sets(features: &[Features], first_node: &[u32], mut sets: Sets) -> Self {
+        let mut tracks = Self {
+            starts: vec![0],
+            of_photo: vec![Vec::new(); features.len()],
+            ..Self::default()
+        };
+        // Tracks in the order of their first node: members are visited by photograph.
+        let nodes = *first_node.last().expect("starts with zero");
+        let mut track_of_root = vec![u32::MAX; nodes as usize];
+        let mut members: Vec<Vec<Observation>> = Vec::new();
+        for (photo, bounds) in first_node.windows(2).enumerate() {
+            for node in bounds[0]..bounds[1] {
+                let root = sets.find(node);
+                if sets.photos[root as usize].len() < 2 {
+                    continue;
+                }
+                let track = &mut track_of_root[root as usize];
+                if *track == u32::MAX {
+                    *track = members.len() as u32;
+                    members.push(Vec::new());
+                }
+                members[*track as usize].push(Observation {
+                    photo: photo as u32,
+                    keypoint: node - bounds[0],
+                });
+            }
+        }
+        for (track, members) in members.into_iter().enumerate() {
+            for member in members {
+                let keypoint = &features[member.photo as usize].keypoints[member.keypoint as usize];
+                tracks.of_photo[member.photo as usize].push(tracks.observations.len() as u32);
+                tracks.observations.push(member);
+                tracks.track_of.push(track as u32);
+                tracks
+                    .pixels
+                    .push(DVec2::new(f64::from(keypoint.x), f64::from(keypoint.y)));
+            }
+            tracks.starts.push(tracks.observations.len() as u32);
+        }
+        tracks
+    }
+
+    /// Number of tracks.
+    pub fn len(&self) -> usize {
+        self.starts.len() - 1
+    }
+
+    /// Indices of the observations of `track`.
+    pub fn range(&self, track: usize) -> std::ops::Range<usize> {
+        self.starts[track] as usize..self.starts[track + 1] as usize
+    }
+}
+
+/// Disjoint sets of nodes that know their photographs.
+struct Sets {
+    parent: Vec<u32>,
+    /// Per root: photographs, ascending; empty for a single node.
+    photos: Vec<Vec<u32>>,
+}
+
+impl Sets {
+    fn new(nodes: usize) -> Self {
+        Self {
+            parent: (0..nodes as u32).collect(),
+            photos: vec![Vec::new(); nodes],
+        }
+    }
+
+    fn find(&mut self, mut node: u32) -> u32 {
+        while self.parent[node as usize] != node {
+            let up = self.parent[self.parent[node as usize] as usize];
+            self.parent[node as usize] = up;
+            node = up;
+        }
+        node
+    }
+
+    fn join(&mut self, (a, photo_a): (u32, u32), (b, photo_b): (u32, u32)) {
+        let (root_a, root_b) = (self.find(a), self.find(b));
+        if root_a == root_b {
+            return;
+        }
+        for (root, photo) in [(root_a, photo_a), (root_b, photo_b)] {
+            if self.photos[root as usize].is_empty() {
+                self.photos[root as usize].push(photo);
+            }
+        }
+        let (larger, smaller) = if self.photos[root_a as usize].len() >= self.photos[root_b as usize].len() {
+            (root_a as usize, root_b as usize)
+        } else {
+            (root_b as usize, root_a as usize)
+        };
+        if self.photos[smaller]
+            .iter()
+            .any(|p| self.photos[larger].binary_search(p).is_ok())
+        {
+            return;
+        }
+        for photo in std::mem::take(&mut self.photos[smaller]) {
+            let at = self.photos[larger].partition_point(|p| *p < photo);
+            self.photos[larger].insert(at, photo);
+        }
+        self.parent[smaller] = larger as u32;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::Keypoint;
+    use crate::geometry::essential::Motion;
+    use glam::{DQuat, DVec3};
+
+    fn features(places: &[f32]) -> Features {
+        let keypoints = places
+            .iter()
+            .map(|x| Keypoint {
+                x: *x,
+                y: 0.0,
+                scale: 1.0,
+                angle: 0.0,
+            })
+            .collect();
+        Features {
+            keypoints,
+            descriptors: Vec::new(),
+        }
+    }
+
+    fn pair(photos: [u32; 2], matches: &[[u32; 2]]) -> VerifiedPair {
+        VerifiedPair {
+            photos,
+            matches: matches.to_vec(),
+            kind: PairKind::General,
+            motion: Motion {
+                rotation: DQuat::IDENTITY,
+                translation: DVec3::X,
+            },
+            angle: 0.1,
+        }
+    }
+
+    #[test]
+    fn matches_join_over_photographs_and_conflicts_are_refused() {
+        let all = [
+            features(&[1.0, 2.0, 3.0]),
+            features(&[4.0, 5.0]),
+            features(&[6.0, 7.0, 6.0]),
+        ];
+        let pairs = [
+            pair([0, 1], &[[0, 0], [1, 1]]),
+            // Keypoint 2 of the last photograph is its keypoint 0 in another orientation.
+            pair([1, 2], &[[0, 2], [1, 1]]),
+            // Would join keypoints 0 and 1 of the first photograph.
+            pair([0, 2], &[[1, 0]]),
+        ];
+        let tracks = Tracks::new(&all, &pairs);
+        assert_eq!(tracks.len(), 2);
+        let members = |track| {
+            tracks.observations[tracks.range(track)]
+                .iter()
+                .map(|o| (o.photo, o.keypoint))
+                .collect::<Vec<_>>()
+        };
+        assert_eq!(members(0), [(0, 0), (1, 0), (2, 0)]);
+        assert_eq!(members(1), [(0, 1), (1, 1), (2, 1)]);
+        assert_eq!(tracks.of_photo[1], [1, 4]);
+        assert_eq!(tracks.pixels[2], DVec2::new(6.0, 0.0));
+        assert_eq!(tracks.track_of, [0, 0, 0, 1, 1, 1]);
+    }
+}

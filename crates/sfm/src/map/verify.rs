@@ -1,0 +1,272 @@
+//! Which matches of a pair agree with one geometry, and what kind of geometry that is.
+
+use super::Cameras;
+use super::focal::{self, Source};
+use super::types::{MapOptions, PairKind, PhotoInfo, Progress, VerifiedPair};
+use crate::geometry::camera::DCamera;
+use crate::geometry::correspondences::{Correspondences, sampson_squared};
+use crate::geometry::essential::{Essential, Motion, closest_essential, motion_in_front, refine_motion};
+use crate::geometry::fundamental::Fundamental;
+use crate::geometry::homography::{Homography, rotation_between};
+use crate::geometry::ransac::{Limits, estimate};
+use crate::{Features, PairMatches};
+use glam::{DMat3, DVec2, DVec3};
+use rayon::prelude::*;
+
+/// Samples at most. With 40 % inliers, five points are all inliers once in 100 samples.
+const SAMPLES: usize = 600;
+const CONFIDENCE: f64 = 0.9999;
+/// Inliers of a homography, or of a rotation, by those of the essential matrix, from which on it explains the pair.
+const EXPLAINS: f64 = 0.8;
+
+/// A pair's fundamental matrix between pixels that are centred and divided by each photograph's long side.
+#[derive(Clone, Debug)]
+pub(super) struct Uncalibrated {
+    /// Index into the pairs.
+    pub pair: usize,
+    pub matrix: DMat3,
+    /// Inliers.
+    pub inliers: Vec<bool>,
+    pub count: usize,
+}
+
+/// Cameras with known or guessed focal lengths, and the pairs that agree with them.
+pub fn verify(
+    photos: &[PhotoInfo],
+    features: &[Features],
+    pairs: &[PairMatches],
+    options: &MapOptions,
+    progress: &mut dyn FnMut(Progress),
+) -> (Cameras, Vec<VerifiedPair>) {
+    // With metadata for all, a few pairs suffice to check them.
+    let known = photos.iter().all(|p| p.focal_prior_px.is_some());
+    let mut voters: Vec<usize> = (0..pairs.len()).collect();
+    voters.sort_by_key(|i| (std::cmp::Reverse(pairs[*i].matches.len()), *i));
+    let mut votes = vec![!known; pairs.len()];
+    voters.iter().take(focal::ENOUGH).for_each(|i| votes[*i] = true);
+    let uncalibrated: Vec<Option<Uncalibrated>> = pairs
+        .par_iter()
+        .enumerate()
+        .map(|(i, pair)| {
+            if !votes[i] || pair.matches.len() < options.min_inliers {
+                return None;
+            }
+            fundamental(i, photos, features, pair, options)
+        })
+        .collect();
+    let found: Vec<&Uncalibrated> = uncalibrated.iter().flatten().collect();
+    let cameras = focal::cameras(photos, features, pairs, &found, options);
+    let verified: Vec<VerifiedPair> = pairs
+        .par_iter()
+        .zip(&uncalibrated)
+        .filter_map(|(pair, uncalibrated)| {
+            // Without a common epipolar geometry there is no common calibrated one.
+            if pair.matches.len() < options.min_inliers || (!known && uncalibrated.is_none()) {
+                return None;
+            }
+            calibrated(photos, features, pair, uncalibrated.as_ref(), &cameras, options)
+        })
+        .collect();
+    progress(Progress::Verified {
+        pairs: verified.len(),
+        of: pairs.len(),
+    });
+    (cameras, verified)
+}
+
+pub(super) fn seed_of(pair: &PairMatches) -> u64 {
+    u64::from(pair.photos[0]) << 32 | u64::from(pair.photos[1])
+}
+
+pub(super) fn pixel(features: &Features, keypoint: u32) -> DVec2 {
+    let k = &features.keypoints[keypoint as usize];
+    DVec2::new(f64::from(k.x), f64::from(k.y))
+}
+
+fn long_side(photo: &PhotoInfo) -> f64 {
+    f64::from(photo.width.max(photo.height))
+}
+
+/// Points of a pair, centred and divided by each photograph's long side.
+pub(super) fn centered_points(photos: &[PhotoInfo], features: &[Features], pair: &PairMatches) -> Vec<[DVec2; 2]> {
+    let place = |side: usize, keypoint: u32| {
+        let photo = &photos[pair.photos[side] as usize];
+        let center = 0.5 * DVec2::new(f64::from(photo.width), f64::from(photo.height));
+        (pixel(&features[pair.photos[side] as usize], keypoint) - center) / long_side(photo)
+    };
+    pair.matches.iter().map(|[i, j]| [place(0, *i), place(1, *j)]).collect()
+}
+
+fn fundamental(
+    index: usize,
+    photos: &[PhotoInfo],
+    features: &[Features],
+    pair: &PairMatches,
+    options: &MapOptions,
+) -> Option<Uncalibrated> {
+    let points = Correspondences::new(centered_points(photos, features, pair));
+    let [a, b] = pair.photos.map(|p| long_side(&photos[p as usize]));
+    let threshold = options.max_epipolar_error * 0.5 * (1.0 / a + 1.0 / b);
+    let limits = Limits {
+        samples: SAMPLES,
+        confidence: CONFIDENCE,
+        seed: seed_of(pair),
+    };
+    let best = estimate(
+        &Fundamental {
+            points: &points,
+            threshold,
+        },
+        Vec::new(),
+        limits,
+    )?;
+    if best.inliers < options.min_inliers {
+        return None;
+    }
+    let inliers: Vec<bool> = points
+        .points
+        .iter()
+        .map(|p| sampson_squared(&best.model, *p) < threshold * threshold)
+        .collect();
+    Some(Uncalibrated {
+        pair: index,
+        matrix: best.model,
+        count: best.inliers,
+        inliers,
+    })
+}
+
+/// `k_b^T f k_a` for a fundamental matrix between centred pixels by the long side, with focal lengths in long sides.
+pub(super) fn essential_from(fundamental: DMat3, focal_a: f64, focal_b: f64) -> DMat3 {
+    let scale = |f: f64| DMat3::from_diagonal(DVec3::new(f, f, 1.0));
+    closest_essential(scale(focal_b) * fundamental * scale(focal_a))
+}
+
+fn calibrated(
+    photos: &[PhotoInfo],
+    features: &[Features],
+    pair: &PairMatches,
+    uncalibrated: Option<&Uncalibrated>,
+    cameras: &Cameras,
+    options: &MapOptions,
+) -> Option<VerifiedPair> {
+    let group = pair.photos.map(|p| &cameras[photos[p as usize].group]);
+    let [camera_a, camera_b]: [&DCamera; 2] = group.map(|g| &g.0);
+    let plane = |camera: &DCamera, at: DVec2| {
+        let [fx, fy, cx, cy, ..] = camera.parameters;
+        DVec2::new((at.x - cx) / fx, (at.y - cy) / fy)
+    };
+    let [features_a, features_b] = pair.photos.map(|p| &features[p as usize]);
+    let points: Vec<[DVec2; 2]> = pair
+        .matches
+        .iter()
+        .map(|[i, j]| {
+            [
+                plane(camera_a, pixel(features_a, *i)),
+                plane(camera_b, pixel(features_b, *j)),
+            ]
+        })
+        .collect();
+    let all = Correspondences::new(points);
+    let threshold = options.max_epipolar_error * 0.5 * (1.0 / camera_a.focal() + 1.0 / camera_b.focal());
+    let problem = Essential {
+        points: &all,
+        threshold,
+    };
+    let limits = Limits {
+        samples: SAMPLES,
+        confidence: CONFIDENCE,
+        seed: seed_of(pair),
+    };
+    let first = uncalibrated.map(|u| {
+        let [a, b] = pair.photos.map(|p| long_side(&photos[p as usize]));
+        essential_from(u.matrix, camera_a.focal() / a, camera_b.focal() / b)
+    });
+    let best = estimate(&problem, first.into_iter().collect(), limits)?;
+    let mut inliers = problem.inliers(&best.model);
+    let mut count = inliers.iter().filter(|i| **i).count();
+    if let Some(uncalibrated) = uncalibrated
+        && group.iter().any(|g| g.1 != Source::Prior)
+        && uncalibrated.count as f64 > 1.2 * count as f64
+    {
+        // The guessed focal length is off: the matches are those of the fundamental matrix.
+        inliers.clone_from(&uncalibrated.inliers);
+        count = uncalibrated.count;
+    }
+    if count < options.min_inliers {
+        return None;
+    }
+    let kept: Vec<[DVec2; 2]> = select(&all.points, &inliers);
+    let (start, _) = motion_in_front(best.model, kept.iter());
+    let motion = refine_motion(start, &kept, threshold, 3)
+        .map_or(start, |refined| motion_in_front(refined.essential(), kept.iter()).0);
+    let kind = kind(&kept, threshold, pair);
+    let angle = median_angle(&motion, &kept);
+    Some(VerifiedPair {
+        photos: pair.photos,
+        matches: select(&pair.matches, &inliers),
+        kind,
+        motion,
+        angle: if kind == PairKind::Rotation { 0.0 } else { angle },
+    })
+}
+
+pub(super) fn select<T: Clone>(items: &[T], keep: &[bool]) -> Vec<T> {
+    items
+        .iter()
+        .zip(keep)
+        .filter(|(_, keep)| **keep)
+        .map(|(item, _)| item.clone())
+        .collect()
+}
+
+/// The kind of a pair from the inliers of its essential matrix.
+fn kind(points: &[[DVec2; 2]], threshold: f64, pair: &PairMatches) -> PairKind {
+    let explained = EXPLAINS * points.len() as f64;
+    let all = Correspondences::new(points.to_vec());
+    let limits = Limits {
+        samples: 50,
+        confidence: 0.99,
+        seed: seed_of(pair),
+    };
+    let Some(plane) = estimate(
+        &Homography {
+            points: &all,
+            threshold,
+        },
+        Vec::new(),
+        limits,
+    ) else {
+        return PairKind::General;
+    };
+    if (plane.inliers as f64) < explained {
+        return PairKind::General;
+    }
+    // Twice: the second time without what does not turn along.
+    let mut rotation = rotation_between(points.iter().copied());
+    let close = |rotation: &DMat3, [a, b]: &[DVec2; 2]| {
+        let turned = *rotation * a.extend(1.0);
+        turned.z > 0.0 && (turned.truncate() / turned.z - *b).length() < threshold
+    };
+    rotation = rotation_between(points.iter().copied().filter(|p| close(&rotation, p)));
+    let turned = points.iter().filter(|p| close(&rotation, p)).count();
+    if turned as f64 >= explained {
+        PairKind::Rotation
+    } else {
+        PairKind::Planar
+    }
+}
+
+/// The median angle between both rays of the points in front of both cameras.
+fn median_angle(motion: &Motion, points: &[[DVec2; 2]]) -> f64 {
+    let mut angles: Vec<f64> = points
+        .iter()
+        .filter(|p| motion.depths(**p).iter().all(|z| *z > 0.0))
+        .map(|[a, b]| (motion.rotation * a.extend(1.0)).angle_between(b.extend(1.0)))
+        .collect();
+    if angles.is_empty() {
+        return 0.0;
+    }
+    let middle = angles.len() / 2;
+    *angles.select_nth_unstable_by(middle, f64::total_cmp).1
+}

@@ -1,0 +1,202 @@
+use super::{MatchOptions, mutual};
+use crate::{DESCRIPTOR_BYTES, Features};
+use glam::{DMat3, DVec3};
+use irradia_compute::nearest::Nearest;
+use irradia_compute::simd::{Kernel, Lanes, Mask, Simd};
+
+/// The known geometry of a pair, in pixels at full size.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum TwoView {
+    /// `x2^T F x1 = 0`.
+    Fundamental(DMat3),
+    /// `x2 ~ H x1`.
+    Homography(DMat3),
+}
+
+/// As [`super::match_features`], but only among features that agree with `geometry`: a Sampson distance (Hartley and Zisserman,
+/// eq. 11.9), or for homographies a distance in the second photograph, of at most `threshold` pixels. Both the nearest and the second
+/// nearest are sought there, so that repeated structures elsewhere do not make a match ambiguous.
+pub fn match_guided(
+    a: &Features,
+    b: &Features,
+    geometry: &TwoView,
+    threshold: f64,
+    options: &MatchOptions,
+) -> Vec<[u32; 2]> {
+    let search = Search::new(b, geometry, threshold);
+    let mut of_a = vec![Nearest::NONE; a.keypoints.len()];
+    let mut of_b = vec![Nearest::NONE; b.keypoints.len()];
+    let mut near: Vec<u32> = Vec::new();
+    for (i, (keypoint, descriptor)) in a.keypoints.iter().zip(&a.descriptors).enumerate() {
+        let x1 = DVec3::new(keypoint.x.into(), keypoint.y.into(), 1.0);
+        near.clear();
+        options.level.run(Along {
+            search: &search,
+            x1,
+            near: &mut near,
+        });
+        for &j in &near {
+            let product = product(descriptor, &b.descriptors[j as usize]);
+            of_a[i].merge(j, product, 0);
+            of_b[j as usize].merge(i as u32, product, 0);
+        }
+    }
+    mutual(&of_a, &of_b, options)
+}
+
+fn product(a: &[u8; DESCRIPTOR_BYTES], b: &[u8; DESCRIPTOR_BYTES]) -> u32 {
+    a.iter().zip(b).map(|(a, b)| u32::from(*a) * u32::from(*b)).sum()
+}
+
+/// The second photograph's keypoints, in columns padded to whole vectors.
+struct Search {
+    geometry: TwoView,
+    /// Squared pixels.
+    threshold2: f32,
+    x: Vec<f32>,
+    y: Vec<f32>,
+    /// The squared length of the gradient of `x2^T F x1` by `x1`; 0 for homographies.
+    gradient2: Vec<f32>,
+    count: usize,
+}
+
+impl Search {
+    fn new(b: &Features, geometry: &TwoView, threshold: f64) -> Self {
+        let count = b.keypoints.len();
+        let padded = |value: &dyn Fn(usize) -> f32| -> Vec<f32> {
+            let mut column: Vec<f32> = (0..count).map(value).collect();
+            column.resize(count.next_multiple_of(16), 0.0);
+            column
+        };
+        // The scale of F is free.
+        let geometry = match *geometry {
+            TwoView::Fundamental(f) => {
+                let largest = f.to_cols_array().iter().fold(0.0f64, |a, b| a.max(b.abs()));
+                TwoView::Fundamental(f * (1.0 / largest.max(f64::MIN_POSITIVE)))
+            }
+            other => other,
+        };
+        let gradient2 = |j: usize| match geometry {
+            TwoView::Fundamental(f) => {
+                let keypoint = b.keypoints[j];
+                let line = f.transpose() * DVec3::new(keypoint.x.into(), keypoint.y.into(), 1.0);
+                line.truncate().length_squared() as f32
+            }
+            TwoView::Homography(_) => 0.0,
+        };
+        Self {
+            geometry,
+            threshold2: (threshold * threshold) as f32,
+            x: padded(&|j| b.keypoints[j].x),
+            y: padded(&|j| b.keypoints[j].y),
+            gradient2: padded(&gradient2),
+            count,
+        }
+    }
+}
+
+/// Finds the keypoints that agree with `x1`, ascending.
+struct Along<'a> {
+    search: &'a Search,
+    /// Homogeneous, pixels.
+    x1: DVec3,
+    near: &'a mut Vec<u32>,
+}
+
+impl Kernel for Along<'_> {
+    type Output = ();
+    #[inline(always)]
+    fn run<S: Simd>(self, simd: S)
+    where
+        S::F: Lanes<Scalar = f32>,
+    {
+        let Self { search, x1, near } = self;
+        let set = |value: f64| simd.set(value as f32);
+        let limit = simd.set(search.threshold2);
+        for at in (0..search.count).step_by(S::LANES) {
+            let (x, y) = (simd.load(&search.x[at..]), simd.load(&search.y[at..]));
+            let agree = match search.geometry {
+                TwoView::Fundamental(f) => {
+                    // The epipolar line, of unit normal: its distances are then small numbers.
+                    let line = f * x1;
+                    let length2 = line.truncate().length_squared().max(f64::MIN_POSITIVE);
+                    let unit = line / length2.sqrt();
+                    let distance = x * set(unit.x) + y * set(unit.y) + set(unit.z);
+                    let weight = simd.load(&search.gradient2[at..]) * set(1.0 / length2) + simd.splat(1.0);
+                    (distance * distance).le(weight * limit)
+                }
+                TwoView::Homography(h) => {
+                    let mapped = h * x1;
+                    let (dx, dy) = (x - set(mapped.x / mapped.z), y - set(mapped.y / mapped.z));
+                    (dx * dx + dy * dy).le(limit)
+                }
+            };
+            let valid = (search.count - at).min(S::LANES);
+            let mut bits = agree.bits() & ((1u32 << valid) - 1);
+            while bits != 0 {
+                near.push(at as u32 + bits.trailing_zeros());
+                bits &= bits - 1;
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::Keypoint;
+
+    /// Features at `places`, all of the same two looks in turn: only geometry can tell them apart.
+    fn repeated(places: &[[f32; 2]]) -> Features {
+        let looks =
+            [0usize, 64].map(|from| std::array::from_fn(|i| if (from..from + 64).contains(&i) { 64 } else { 1 }));
+        let keypoint = |&[x, y]: &[f32; 2]| Keypoint {
+            x,
+            y,
+            scale: 2.0,
+            angle: 0.0,
+        };
+        Features {
+            keypoints: places.iter().map(keypoint).collect(),
+            descriptors: (0..places.len()).map(|i| looks[i % 2]).collect(),
+        }
+    }
+
+    #[test]
+    fn repeated_structures_match_along_their_epipolar_lines_only() {
+        let places: Vec<[f32; 2]> = (0..40)
+            .map(|i| [100.0 + 13.0 * i as f32, 50.0 + 20.0 * i as f32])
+            .collect();
+        let a = repeated(&places);
+        // A sideways motion: epipolar lines are rows.
+        let moved: Vec<[f32; 2]> = places.iter().map(|[x, y]| [x - 30.0, y + 1.0]).collect();
+        let b = repeated(&moved);
+        let sideways = DMat3::from_cols(DVec3::ZERO, DVec3::new(0.0, 0.0, -1.0), DVec3::new(0.0, 1.0, 0.0));
+        let options = MatchOptions::default();
+        let expected: Vec<[u32; 2]> = (0..40).map(|i| [i, i]).collect();
+        assert!(super::super::match_features(&a, &b, &options).is_empty());
+        for geometry in [
+            TwoView::Fundamental(sideways * 1e-4),
+            TwoView::Homography(DMat3::from_translation(glam::DVec2::new(-30.0, 0.0))),
+        ] {
+            for level in irradia_compute::Level::all() {
+                let options = MatchOptions { level, ..options };
+                assert_eq!(match_guided(&a, &b, &geometry, 2.0, &options), expected);
+            }
+            assert!(match_guided(&a, &b, &geometry, 0.6, &options).is_empty());
+        }
+    }
+
+    #[test]
+    fn degenerate_geometry_matches_nothing_and_does_not_panic() {
+        let a = repeated(&[[1.0, 2.0], [30.0, 4.0]]);
+        let nan = DMat3::from_diagonal(DVec3::splat(f64::NAN));
+        for geometry in [
+            TwoView::Homography(DMat3::ZERO),
+            TwoView::Homography(nan),
+            TwoView::Fundamental(nan),
+        ] {
+            assert!(match_guided(&a, &a, &geometry, 4.0, &MatchOptions::default()).is_empty());
+        }
+    }
+}

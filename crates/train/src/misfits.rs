@@ -1,0 +1,111 @@
+//! Photographs that do not fit what the others agree on: wrong poses, or another scene.
+//!
+//! After the first fifth of a run the splats show what most photographs have in common, and have not yet bent themselves to the
+//! others. A photograph whose error is far beyond the usual spread of errors is then left out: what splats would do to please it, in
+//! its place or in another, harms every other view. Natural differences of errors (texture, depth of field, views at the border of the
+//! scene) stay below a factor of two, or widen the spread.
+
+use crate::event::Event;
+use crate::schedule::plan;
+use crate::trainer::{TrainError, Trainer};
+
+/// Fraction of a run after which the decision is made.
+pub(crate) const AT: f64 = 0.2;
+/// Training views below which nothing is decided.
+const MIN_VIEWS: usize = 8;
+/// Standard deviations of the ln errors, from their median, beyond which a photograph is a misfit: five wrong poses of fifty were at 7
+/// to 9 (of the ln squared errors), the oddest photographs of seven captures at 1.2 to 4.
+const DEVIATIONS: f64 = 5.0;
+/// Factor over the median error that a misfit has at least.
+const FACTOR: f64 = 2.0;
+/// Largest share of misfits: with more of them it is not clear who is wrong.
+const MOST: f64 = 0.2;
+/// Steps of a run for each training view below which nothing is decided: the renders would cost more than a twentieth of it.
+const STEPS_PER_VIEW: usize = 8;
+
+/// Those of `errors` that are far beyond the others' spread, worst first.
+fn outliers(errors: &[(usize, f64)]) -> Vec<(usize, f64)> {
+    let median = |values: &mut Vec<f64>| {
+        values.sort_by(f64::total_cmp);
+        values[values.len() / 2]
+    };
+    let mut logs: Vec<f64> = errors.iter().map(|(_, error)| error.max(1e-9).ln()).collect();
+    if logs.len() < MIN_VIEWS {
+        return Vec::new();
+    }
+    let middle = median(&mut logs);
+    let mut deviations = logs.iter().map(|log| (log - middle).abs()).collect();
+    // The standard deviation of a normal distribution with this median deviation.
+    let spread = 1.4826 * median(&mut deviations);
+    let least = (DEVIATIONS * spread).max(FACTOR.ln());
+    let excess = errors
+        .iter()
+        .map(|(view, error)| (*view, error.max(1e-9).ln() - middle));
+    let mut found: Vec<(usize, f64)> = excess.filter(|(_, excess)| *excess > least).collect();
+    found.sort_by(|a, b| b.1.total_cmp(&a.1).then(a.0.cmp(&b.0)));
+    found.iter().map(|(view, excess)| (*view, excess.exp())).collect()
+}
+
+impl Trainer {
+    /// Leaves out the photographs that do not fit the others, and says which.
+    pub(crate) fn leave_out_misfits(&mut self) -> Result<Option<Event>, TrainError> {
+        let count = self.trained.len();
+        if self.total_steps() < (STEPS_PER_VIEW * count) as u64 {
+            return Ok(None);
+        }
+        let plan = plan(&self.recipe, &self.clock);
+        let mut errors = Vec::with_capacity(count);
+        self.show_training_views(count, &plan, |trainer, view, photo| {
+            errors.push((view, trainer.error_of_frame(photo)));
+        })?;
+        let found = outliers(&errors);
+        if found.is_empty() {
+            return Ok(None);
+        }
+        let names: Vec<String> = found
+            .iter()
+            .map(|(view, factor)| format!("{} ({factor:.1} times the usual error)", self.dataset.views[*view].name))
+            .collect();
+        let (names, n) = (names.join(", "), found.len());
+        let message = if n as f64 > MOST * count as f64 {
+            format!(
+                "{n} of {count} photographs do not fit the others, too many to leave out; are their poses right? {names}"
+            )
+        } else {
+            self.trained
+                .retain(|view| found.iter().all(|(misfit, _)| misfit != view));
+            format!(
+                "{n} of {count} photographs do not fit the others and are left out from here on (--set drop_misfits=false keeps them); are their poses right? {names}"
+            )
+        };
+        Ok(Some(Event::Warned { message }))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use irradia_scene::Rng;
+
+    #[test]
+    fn wrong_photographs_are_found_and_odd_ones_are_not() {
+        let mut rng = Rng::new(5, 1);
+        let mut errors: Vec<(usize, f64)> = (0..50)
+            .map(|i| (i, 0.05 * f64::from(0.2 * rng.normal()).exp()))
+            .collect();
+        assert_eq!(outliers(&errors), []);
+        // A view of much detail.
+        errors[9].1 = 0.09;
+        assert_eq!(outliers(&errors), []);
+        for view in [3, 17, 40] {
+            errors[view].1 *= 4.0;
+        }
+        let mut found: Vec<usize> = outliers(&errors).iter().map(|(view, _)| *view).collect();
+        found.sort_unstable();
+        assert_eq!(found, [3, 17, 40]);
+        // Photographs that all disagree have a wide spread.
+        let wide: Vec<(usize, f64)> = (0..50).map(|i| (i, 0.05 * f64::from(rng.normal()).exp())).collect();
+        assert_eq!(outliers(&wide), []);
+        assert_eq!(outliers(&errors[..7]), []);
+    }
+}

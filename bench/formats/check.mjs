@@ -116,6 +116,24 @@ function readGlb(path) {
   );
 }
 
+/** Covariances of splats, each divided by the square of its largest size. @param {Float32Array} q x, y, z, w @param {Float32Array} s */
+function covariances(q, s) {
+  const all = [];
+  for (let i = 0; i < s.length / 3; i += 1) {
+    const length = Math.hypot(...q.subarray(4 * i, 4 * i + 4)) || 1;
+    const [x, y, z, w] = Array.from(q.subarray(4 * i, 4 * i + 4), (v) => v / length);
+    const rows = [
+      [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+      [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+      [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ];
+    const sizes = s.subarray(3 * i, 3 * i + 3);
+    const largest = Math.max(...sizes) || 1;
+    for (let a = 0; a < 3; a += 1) for (let b = a; b < 3; b += 1) all.push([0, 1, 2].reduce((sum, k) => sum + rows[a][k] * rows[b][k] * (sizes[k] / largest) ** 2, 0));
+  }
+  return all;
+}
+
 let failed = 0;
 const check = (title, run) => {
   try {
@@ -156,13 +174,17 @@ check("glb, beside splat-transform's", () => {
   theirs(plain, b);
   const [mine, other] = [readGlb(a), readGlb(b)];
   const names = Object.keys(mine);
-  const worst = names.map((name) => {
-    const floats = (buffer) => new Float32Array(buffer.buffer.slice(buffer.byteOffset, buffer.byteOffset + buffer.byteLength));
+  const floats = (buffer) => new Float32Array(buffer.buffer.slice(buffer.byteOffset, buffer.byteOffset + buffer.byteLength));
+  const [rotation, size] = ["ROTATION", "SCALE"].map((name) => `KHR_gaussian_splatting:${name}`);
+  const worst = names.filter((name) => name !== rotation).map((name) => {
     const [p, q] = [floats(mine[name]), floats(other[name])];
     if (p.length !== q.length) throw new Error(`${name} has ${p.length} numbers instead of ${q.length}`);
     return p.reduce((most, v, i) => Math.max(most, Math.abs(v - q[i])), 0);
   });
-  return `${names.length} attributes, the largest difference ${Math.max(...worst).toExponential(1)}`;
+  // A Gaussian has several rotations: what must agree is its covariance.
+  const shapes = [mine, other].map((file) => covariances(floats(file[rotation]), floats(file[size])));
+  const shape = shapes[0].reduce((most, v, i) => Math.max(most, Math.abs(v - shapes[1][i])), 0);
+  return `${names.length} attributes, the largest difference ${Math.max(...worst).toExponential(1)}, of covariances by the largest size squared ${shape.toExponential(1)}`;
 });
 console.log("written by splat-transform, read by irradia");
 for (const name of ["t.compressed.ply", "t.spz", "t.sog", "t.glb"]) {

@@ -58,18 +58,31 @@ fn peak() -> u64 {
         * 1024
 }
 
-/// Seconds of the best of three runs, and the memory beyond that before the first.
-fn best<T>(mut run: impl FnMut() -> T) -> (f64, u64) {
+/// Processor seconds of all threads so far, in steps of 0.01; 0 where the system does not tell.
+fn processor_seconds() -> f64 {
+    let status = std::fs::read_to_string("/proc/self/stat").unwrap_or_default();
+    // The fields after the name, which may contain anything but this.
+    let fields = status.rsplit(')').next().unwrap_or_default();
+    let ticks = |field: usize| fields.split_whitespace().nth(field).and_then(|v| v.parse::<f64>().ok());
+    (ticks(11).unwrap_or(0.0) + ticks(12).unwrap_or(0.0)) / 100.0
+}
+
+/// Seconds of the best of three runs, their mean processor seconds, and the memory beyond that before the first.
+fn best<T>(mut run: impl FnMut() -> T) -> (f64, f64, u64) {
     // Writing 5 resets the peak (proc(5)).
     let _ = std::fs::write("/proc/self/clear_refs", "5");
-    let before = peak();
+    let (before, worked) = (peak(), processor_seconds());
     let seconds = (0..3).map(|_| {
         let started = Instant::now();
         std::hint::black_box(run());
         started.elapsed().as_secs_f64()
     });
     let seconds = seconds.fold(f64::INFINITY, f64::min);
-    (seconds, peak().saturating_sub(before))
+    (
+        seconds,
+        (processor_seconds() - worked) / 3.0,
+        peak().saturating_sub(before),
+    )
 }
 
 fn main() {
@@ -86,7 +99,7 @@ fn main() {
         rayon::current_num_threads()
     );
     println!(
-        "format              size MB   write Msplat/s (MB/s)   read Msplat/s (MB/s)   extra memory, scenes: write read"
+        "format              size MB   write Msplat/s (MB/s)   read Msplat/s (MB/s)   CPU s/Msplat: write read   extra memory, scenes: write read"
     );
     let folder = tempfile::tempdir().expect("a temporary folder");
     let normal = WriteOptions::default();
@@ -125,11 +138,11 @@ fn main() {
     for (name, options) in cases {
         let path = folder.path().join(name);
         let format = SplatFormat::of(&path).expect("known");
-        let (write, write_memory) = best(|| write_splats_with(&path, &cloud, &options).expect("written"));
+        let (write, write_work, write_memory) = best(|| write_splats_with(&path, &cloud, &options).expect("written"));
         let size = splat_file_size(&path).expect("written");
-        let (read, read_memory) = match format.is_readable() {
+        let (read, read_work, read_memory) = match format.is_readable() {
             true => best(|| read_splats(&path).expect("read")),
-            false => (f64::NAN, 0),
+            false => (f64::NAN, f64::NAN, 0),
         };
         let rate = |seconds: f64| {
             format!(
@@ -139,7 +152,7 @@ fn main() {
             )
         };
         println!(
-            "{:<18} {:>8.1}   {:>20}   {:>20}   {:>6.2} {:>6.2}   {:?}",
+            "{:<18} {:>8.1}   {:>20}   {:>20}   {:>6.2} {:>6.2}   {:>6.2} {:>6.2}   {:?}",
             format!(
                 "{} {}",
                 &name[1..],
@@ -152,6 +165,8 @@ fn main() {
             size as f64 / 1e6,
             rate(write),
             rate(read),
+            write_work / count as f64 * 1e6,
+            read_work / count as f64 * 1e6,
             write_memory as f64 / bytes,
             read_memory as f64 / bytes,
             options.quality

@@ -7,6 +7,7 @@ use crate::unpack::inflate;
 use flate2::Crc;
 use std::borrow::Cow;
 use std::collections::HashMap;
+use std::io::{self, Write};
 
 /// Signature and fixed part of the end-of-archive record, and its maximum comment length.
 const END: &[u8] = b"PK\x05\x06";
@@ -102,26 +103,37 @@ pub(crate) fn shown(name: &str) -> String {
     name.chars().filter(|c| !c.is_control()).take(60).collect()
 }
 
-/// An archive of `files`, stored. The time is zip's earliest, so that the same content gives the same bytes.
-///
-/// # Errors
-/// When files or archive exceed the 4 GiB of the format's classic layout.
-pub(crate) fn archive(files: &[(&str, Vec<u8>)]) -> std::io::Result<Vec<u8>> {
-    let total: usize = files
-        .iter()
-        .map(|(name, content)| 2 * name.len() + content.len() + 76)
-        .sum();
-    if total + END_LENGTH > u32::MAX as usize {
-        return Err(std::io::Error::other(
-            "a zip archive holds at most 4 GiB; choose another format",
-        ));
+/// Writes an archive, file after file, stored. The time is zip's earliest, so that the same content gives the same bytes.
+pub(crate) struct Writer<'a> {
+    out: &'a mut dyn Write,
+    at: u64,
+    directory: Vec<u8>,
+    files: u16,
+}
+
+impl<'a> Writer<'a> {
+    pub fn new(out: &'a mut dyn Write) -> Self {
+        Self {
+            out,
+            at: 0,
+            directory: Vec::new(),
+            files: 0,
+        }
     }
-    let mut bytes = Vec::with_capacity(total + END_LENGTH);
-    let mut directory = Vec::new();
-    // 1980-01-01, midnight.
-    const TIME: [u8; 4] = [0, 0, 0x21, 0];
-    for (name, content) in files {
-        let at = bytes.len() as u32;
+
+    /// Adds a file.
+    ///
+    /// # Errors
+    /// When it cannot be written, or the archive exceeds the 4 GiB of the format's classic layout.
+    pub fn file(&mut self, name: &str, content: &[u8]) -> io::Result<()> {
+        // 1980-01-01, midnight.
+        const TIME: [u8; 4] = [0, 0, 0x21, 0];
+        let end = self.at + (2 * name.len() + content.len() + 76 + END_LENGTH) as u64;
+        if end + self.directory.len() as u64 > u64::from(u32::MAX) {
+            return Err(io::Error::other(
+                "a zip archive holds at most 4 GiB; choose another format",
+            ));
+        }
         let mut crc = Crc::new();
         crc.update(content);
         // Version 2.0, no flags, stored.
@@ -131,26 +143,32 @@ pub(crate) fn archive(files: &[(&str, Vec<u8>)]) -> std::io::Result<Vec<u8>> {
         common.extend([content.len() as u32; 2].map(u32::to_le_bytes).as_flattened());
         common.extend((name.len() as u16).to_le_bytes());
         common.extend([0, 0]);
-        bytes.extend_from_slice(b"PK\x03\x04");
-        bytes.extend_from_slice(&common);
-        bytes.extend_from_slice(name.as_bytes());
-        bytes.extend_from_slice(content);
-        directory.extend_from_slice(b"PK\x01\x02\x14\x00");
-        directory.extend_from_slice(&common);
+        let head = [&b"PK\x03\x04"[..], &common, name.as_bytes()].concat();
+        self.out.write_all(&head)?;
+        self.out.write_all(content)?;
+        self.directory.extend_from_slice(b"PK\x01\x02\x14\x00");
+        self.directory.extend_from_slice(&common);
         // Comment, disk, attributes.
-        directory.extend([0; 10]);
-        directory.extend(at.to_le_bytes());
-        directory.extend_from_slice(name.as_bytes());
+        self.directory.extend([0; 10]);
+        self.directory.extend((self.at as u32).to_le_bytes());
+        self.directory.extend_from_slice(name.as_bytes());
+        self.at += (head.len() + content.len()) as u64;
+        self.files += 1;
+        Ok(())
     }
-    let (at, count) = (bytes.len() as u32, files.len() as u16);
-    bytes.extend_from_slice(&directory);
-    bytes.extend_from_slice(END);
-    bytes.extend([0; 4]);
-    bytes.extend([count; 2].map(u16::to_le_bytes).as_flattened());
-    bytes.extend((directory.len() as u32).to_le_bytes());
-    bytes.extend(at.to_le_bytes());
-    bytes.extend([0; 2]);
-    Ok(bytes)
+
+    /// Writes the directory.
+    pub fn finish(mut self) -> io::Result<()> {
+        let size = self.directory.len() as u32;
+        self.directory.extend_from_slice(END);
+        self.directory.extend([0; 4]);
+        self.directory
+            .extend([self.files; 2].map(u16::to_le_bytes).as_flattened());
+        self.directory.extend(size.to_le_bytes());
+        self.directory.extend((self.at as u32).to_le_bytes());
+        self.directory.extend([0; 2]);
+        self.out.write_all(&self.directory)
+    }
 }
 
 #[cfg(test)]
@@ -159,7 +177,11 @@ mod tests {
 
     #[test]
     fn stored_files_come_back() {
-        let bytes = archive(&[("a.txt", b"hello".to_vec()), ("dir/b", vec![7; 1000])]).unwrap();
+        let mut bytes = Vec::new();
+        let mut archive = Writer::new(&mut bytes);
+        archive.file("a.txt", b"hello").unwrap();
+        archive.file("dir/b", &[7; 1000]).unwrap();
+        archive.finish().unwrap();
         let files = files(&bytes).unwrap();
         assert_eq!(files.len(), 2);
         assert_eq!(files["a.txt"].content(10).unwrap().as_ref(), b"hello");

@@ -24,8 +24,8 @@ pub fn half(value: f32) -> u16 {
 pub fn from_half(bits: u16) -> f32 {
     let (sign, magnitude) = (f32::from(1 - 2 * (bits >> 15) as i16), u32::from(bits & 0x7fff));
     let value = match magnitude {
-        ..0x0400 => magnitude as f32 * 2f32.powi(-24),
-        ..0x7c00 => f32::from_bits((magnitude << 13) + (112 << 23)),
+        0..0x0400 => magnitude as f32 * 2f32.powi(-24),
+        0x0400..0x7c00 => f32::from_bits((magnitude << 13) + (112 << 23)),
         0x7c00 => f32::INFINITY,
         _ => f32::NAN,
     };

@@ -9,7 +9,7 @@ export const view = JSON.parse(text("view"));
 /** @param {string} name */
 export const shader = async (name) => text(name);
 
-export const orderWorker = () => new Worker(URL.createObjectURL(new Blob([text("order.js")], { type: "text/javascript" })), { type: "module" });
+export const orderWorker = () => new Worker(URL.createObjectURL(new Blob([text("order.js")], { type: "text/javascript" })));
 
 /** The scene in compact form. @param {AbortSignal} signal */
 export async function openSplats(signal) {

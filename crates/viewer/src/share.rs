@@ -153,7 +153,12 @@ fn page(scene: &Scene, options: &ShareOptions, packed: Option<&[u8]>) -> String 
             file(&format!("shaders/{name}")).expect("a shader").1,
         );
     }
-    text("text/plain", "order.js", &module("js/local/order.js"));
+    // A worker of a page from the disk can be no module: what it exports is for tests.
+    text(
+        "text/plain",
+        "order.js",
+        &module("js/local/order.js").replace("\nexport ", "\n"),
+    );
     text(
         "application/json",
         "view",

@@ -264,15 +264,14 @@ mod tests {
     use irradia_scene::Rng;
 
     fn random_cloud(count: usize, degree: u32) -> GaussianCloud {
-        let cloud = decode_splats(count, degree, |i, splat| {
+        decode_splats(count, degree, |i, splat| {
             let mut rng = Rng::new(9, i as u64);
             let mut f = || rng.range(-1.0, 1.0);
             *splat.mean = [f(), f(), f()];
             *splat.quat = [f(), f(), f(), f()];
             *splat.log_scale = [f(), f(), f()];
             splat.sh.iter_mut().for_each(|v| *v = f());
-        });
-        cloud
+        })
     }
 
     /// Covariance, and the colour seen along a direction.

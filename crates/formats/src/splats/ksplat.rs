@@ -38,8 +38,8 @@ fn sizes(level: u16) -> (usize, usize) {
 /// Where the three channels of coefficient `k` above DC are, in units of coefficients.
 fn places(k: usize) -> [usize; 3] {
     let (first, length) = match k {
-        ..3 => (0, 3),
-        ..8 => (3, 5),
+        0..3 => (0, 3),
+        3..8 => (3, 5),
         _ => (8, 7),
     };
     [0, 1, 2].map(|channel| 3 * first + channel * length + k - first)

@@ -356,7 +356,7 @@ pub fn write_splats_with(
             SplatFormat::Spz => spz::write(out, &cloud, quality, options.spz_version),
             SplatFormat::Splat => antimatter::write(out, &cloud),
             SplatFormat::Ksplat => ksplat::write(out, &cloud, quality),
-            SplatFormat::Sog => out.write_all(&crate::zip::archive(&sog::encode(&cloud, quality)?)?),
+            SplatFormat::Sog => sog::write(out, &cloud, quality),
             SplatFormat::SogFolder => unreachable!("written above"),
             SplatFormat::Glb => gltf::write_glb(out, &cloud),
             SplatFormat::GlbSpz => gltf::write_glb_spz(out, &cloud, quality),

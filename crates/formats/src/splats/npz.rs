@@ -1,20 +1,20 @@
 //! NumPy's `.npz`: the columns of a scene as arrays, for programs. <https://numpy.org/doc/stable/reference/generated/numpy.lib.format.html>
 
-use crate::zip;
+use crate::zip::Writer;
 use irradia_scene::GaussianCloud;
 use std::io::{self, Write};
 
 /// Writes `means`, `quats` (w, x, y, z), `log_scales`, `opacity_logits` and `sh` (splat, coefficient, channel), 32-bit floats.
 pub(crate) fn write(out: &mut dyn Write, cloud: &GaussianCloud) -> io::Result<()> {
     let n = cloud.len();
-    let arrays = [
-        ("means.npy", npy(&[n, 3], cloud.means.as_flattened())),
-        ("quats.npy", npy(&[n, 4], cloud.quats.as_flattened())),
-        ("log_scales.npy", npy(&[n, 3], cloud.log_scales.as_flattened())),
-        ("opacity_logits.npy", npy(&[n], &cloud.opacity_logits)),
-        ("sh.npy", npy(&[n, cloud.sh_coefficients(), 3], &cloud.sh)),
-    ];
-    out.write_all(&zip::archive(&arrays)?)
+    let mut archive = Writer::new(out);
+    // One array at a time: they are as large as the scene.
+    archive.file("means.npy", &npy(&[n, 3], cloud.means.as_flattened()))?;
+    archive.file("quats.npy", &npy(&[n, 4], cloud.quats.as_flattened()))?;
+    archive.file("log_scales.npy", &npy(&[n, 3], cloud.log_scales.as_flattened()))?;
+    archive.file("opacity_logits.npy", &npy(&[n], &cloud.opacity_logits))?;
+    archive.file("sh.npy", &npy(&[n, cloud.sh_coefficients(), 3], &cloud.sh))?;
+    archive.finish()
 }
 
 /// An array file of version 1.

@@ -63,7 +63,9 @@ fn lines(conversion: &Conversion) -> String {
     let percent = 100.0 * after / before.max(1e-9);
     let mut text = format!("\n  size           {before:.3} MB {from} -> {after:.3} MB {to} ({percent:.1} %)");
     if let Some(psnr) = &conversion.psnr {
-        let mean = psnr.iter().sum::<f64>() / psnr.len() as f64;
+        // Of all pixels together: views that are equal must not hide the others.
+        let error = psnr.iter().map(|db| 10f64.powf(-0.1 * db)).sum::<f64>() / psnr.len() as f64;
+        let mean = -10.0 * error.log10();
         let worst = psnr.iter().copied().fold(f64::INFINITY, f64::min);
         text += &match worst.is_finite() {
             true => format!(

@@ -21,7 +21,7 @@ fn data_refused(folder: &Path, words: &[&str]) {
 #[test]
 fn command_line_mistakes_exit_with_2_and_change_nothing() {
     let folder = with_run();
-    let cases: [(&str, &[&str]); 23] = [
+    let cases: [(&str, &[&str]); 24] = [
         ("train", &["<DATA>"]),
         ("train data", &["--out"]),
         (

@@ -12,12 +12,15 @@ use std::io::{self, Write};
 const FLOAT: u32 = 5126;
 const ARRAY_BUFFER: u32 = 34962;
 
+/// Writes the numbers of a splat.
+type Values<'a> = Box<dyn Fn(usize, &mut [f32]) + Sync + 'a>;
+
 /// An attribute: name, type, numbers a splat, and the values of one.
 struct Attribute<'a> {
     name: String,
     kind: &'static str,
     width: usize,
-    values: Box<dyn Fn(usize, &mut [f32]) + Sync + 'a>,
+    values: Values<'a>,
 }
 
 /// The attributes in glTF's axes and activations.
@@ -38,7 +41,7 @@ fn attributes(cloud: &GaussianCloud) -> Vec<Attribute<'_>> {
             3,
             Box::new(move |i, to: &mut [f32]| {
                 to.copy_from_slice(&signs.position(cloud.means[i]));
-            }) as Box<dyn Fn(usize, &mut [f32]) + Sync>,
+            }) as Values,
         ),
         attribute(
             own("ROTATION"),

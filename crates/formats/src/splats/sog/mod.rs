@@ -13,7 +13,7 @@ mod write;
 
 pub use read::parse_zip as parse;
 pub(crate) use read::read_folder;
-pub(crate) use write::encode;
+pub(crate) use write::{encode, write};
 
 /// The file that describes the others.
 pub(crate) const META: &str = "meta.json";

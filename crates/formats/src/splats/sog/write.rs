@@ -3,17 +3,27 @@ use super::{LARGEST_W, META, ROW};
 use crate::splats::Quality;
 use crate::splats::quantize::{byte, opacity_byte, smallest_three};
 use crate::splats::rows::{bounds, encode_rows, morton_order};
+use crate::zip::Writer;
 use image_webp::{ColorType, EncoderParams, WebPEncoder};
 use irradia_scene::{GaussianCloud, sh};
 use rayon::prelude::*;
 use serde_json::json;
-use std::io;
+use std::io::{self, Write};
 
 /// Names and contents of a scene's files.
 type Files = Vec<(&'static str, Vec<u8>)>;
 
 /// An image to be encoded: name, width, height, channels (3 or 4), pixels.
 type Image = (&'static str, usize, usize, usize, Vec<u8>);
+
+/// Writes `cloud` as one archive.
+pub(crate) fn write(out: &mut dyn Write, cloud: &GaussianCloud, quality: Quality) -> io::Result<()> {
+    let mut archive = Writer::new(out);
+    for (name, content) in encode(cloud, quality)? {
+        archive.file(name, &content)?;
+    }
+    archive.finish()
+}
 
 /// The files of `cloud` in version 2; the quality limits the palette of the harmonics.
 ///

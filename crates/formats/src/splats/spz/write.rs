@@ -9,7 +9,8 @@ use rayon::prelude::*;
 use ruzstd::encoding::{CompressionLevel, compress_to_vec};
 use std::io::{self, Write};
 
-/// Positions have 24 bits, of which at least this many before the point are never needed.
+/// Fractional bits of positions: those that the format's own writer uses, and the most.
+const OWN_FRACTION_BITS: i32 = 12;
 const MAX_FRACTION_BITS: i32 = 20;
 
 /// Writes `cloud`; the quality chooses the bits of the coefficients above DC.
@@ -33,7 +34,7 @@ pub(crate) fn encode(cloud: &GaussianCloud, quality: Quality, version: SpzVersio
         count: u32::try_from(cloud.len()).expect("fewer than 2^32 splats"),
         // Readers of version 2 know no more.
         degree: cloud.sh_degree.min(if version == SpzVersion::V2 { 3 } else { 4 }) as u8,
-        fraction_bits: fraction_bits(&cloud.means),
+        fraction_bits: fraction_bits(&cloud.means, quality),
         flags: if cloud.antialiased { ANTIALIASED } else { 0 },
     };
     let arrays = arrays(cloud, &header, quality);
@@ -58,15 +59,22 @@ pub(crate) fn encode(cloud: &GaussianCloud, quality: Quality, version: SpzVersio
         return bytes;
     }
     bytes.push(0);
-    arrays.iter().for_each(|array| bytes.extend_from_slice(array));
+    // Each array is given back as soon as it is copied.
+    arrays.into_iter().for_each(|array| bytes.extend(array));
     gzip(&bytes)
 }
 
-/// As many bits after the point as the farthest coordinate leaves: a small scene is stored finely, a large one whole.
-fn fraction_bits(means: &[[f32; 3]]) -> u8 {
+/// Bits after the point: at least the format's own 12, as far as the farthest coordinate fits, and otherwise so many that it has 16 bits
+/// in all, or with the best quality 23: finer steps than that are noise, which does not compress.
+fn fraction_bits(means: &[[f32; 3]], quality: Quality) -> u8 {
     let farthest = means.as_flattened().iter().fold(0f32, |most, v| most.max(v.abs()));
-    let before = (farthest.max(f32::MIN_POSITIVE)).log2().floor() as i32 + 1;
-    (23 - before).clamp(0, MAX_FRACTION_BITS) as u8
+    let before = farthest.max(f32::MIN_POSITIVE).log2().floor() as i32 + 1;
+    let wanted = match quality {
+        Quality::Low => OWN_FRACTION_BITS,
+        Quality::Normal => (16 - before).max(OWN_FRACTION_BITS),
+        Quality::High => MAX_FRACTION_BITS,
+    };
+    wanted.min(23 - before).clamp(0, MAX_FRACTION_BITS) as u8
 }
 
 /// The six arrays, along a Morton curve, which compresses better.
@@ -152,12 +160,18 @@ mod tests {
     use super::*;
 
     #[test]
-    fn small_scenes_are_stored_finely() {
-        assert_eq!(fraction_bits(&[[0.0; 3]]), 20);
-        assert_eq!(fraction_bits(&[[0.9, -7.9, 0.0]]), 20);
-        assert_eq!(fraction_bits(&[[0.9, -8.1, 0.0]]), 19);
-        assert_eq!(fraction_bits(&[[2047.9, 0.0, 0.0]]), 12);
-        assert_eq!(fraction_bits(&[[1e9, 0.0, 0.0]]), 0);
+    fn small_scenes_are_stored_finely_and_large_ones_whole() {
+        for (farthest, low, normal, high) in [
+            (7.9, 12, 13, 20),
+            (8.1, 12, 12, 19),
+            (2047.9, 12, 12, 12),
+            (2048.1, 11, 11, 11),
+            (1e9, 0, 0, 0),
+        ] {
+            let bits =
+                [Quality::Low, Quality::Normal, Quality::High].map(|q| fraction_bits(&[[0.5, -farthest, 0.0]], q));
+            assert_eq!(bits, [low, normal, high], "{farthest}");
+        }
     }
 
     #[test]

@@ -1,0 +1,115 @@
+// Shared pages: opened from a file without a network, and as a folder from a web server.
+
+import assert from "node:assert/strict";
+import { mkdirSync, readdirSync, readFileSync, statSync, writeFileSync } from "node:fs";
+import { createServer } from "node:http";
+import { join } from "node:path";
+import { pathToFileURL } from "node:url";
+import { after, before, test } from "node:test";
+import { PNG } from "pngjs";
+import { browse, OUT, psnr, readPng, run, scratch } from "./harness.js";
+import { random, trained } from "./scenes.js";
+
+/** @type {import("playwright-core").Browser} */
+let browser;
+before(async () => (browser = await browse({ webgl: true })));
+after(() => browser.close());
+
+const SIZE = { width: 640, height: 360 };
+
+/** Opens a shared page and waits for its final picture. */
+async function open(address, options = {}) {
+  const context = await browser.newContext({ viewport: SIZE, ...options });
+  const page = await context.newPage();
+  const problems = [];
+  page.on("pageerror", (error) => problems.push(String(error)));
+  page.on("console", (message) => message.type() === "error" && problems.push(message.text()));
+  const asked = [];
+  page.on("request", (request) => /^(data|blob):/.test(request.url()) || asked.push(request.url()));
+  await page.goto(address);
+  await settled(page, problems);
+  return { page, problems, asked };
+}
+
+async function settled(page, problems) {
+  const holds = () => {
+    const renderer = /** @type {any} */ (window).irradia?.renderer;
+    return renderer && renderer.total > 0 && renderer.loaded === renderer.total && renderer.sharp && !renderer.busy && renderer.drawn > 0;
+  };
+  await page.waitForTimeout(200);
+  await page.waitForFunction(holds, null, { timeout: 120000 }).catch((error) => {
+    throw new Error(`${error.message}; ${problems.join("; ")}`);
+  });
+}
+
+const shown = async (page) => {
+  const address = await page.evaluate(() => document.querySelector("canvas").toDataURL("image/png"));
+  return PNG.sync.read(Buffer.from(address.split(",")[1], "base64"));
+};
+
+let frames = 0;
+
+/** The program's picture of the page's camera. */
+async function rendered(page, scene) {
+  const camera = await page.evaluate(() => /** @type {any} */ (window).irradia.camera());
+  const file = join(scratch, "shared_camera.json");
+  writeFileSync(file, JSON.stringify({ irradia_path: 1, fps: 30, loop: false, ease: false, closing: 0, keys: [{ time: 0, ...camera }] }));
+  const out = join(scratch, `shared_${(frames += 1)}`);
+  mkdirSync(out);
+  run("render", scene, "--path", file, "--size", `${SIZE.width}x${SIZE.height}`, "--out", out);
+  return readPng(join(out, readdirSync(out)[0]));
+}
+
+for (const [name, make] of [["a trained scene", trained], ["random splats", () => random(4000)]]) {
+  test(`${name} opens from a file without a network and looks as the program draws it`, async () => {
+    const scene = make();
+    const html = join(scratch, `${name.replaceAll(" ", "_")}.html`);
+    const said = run("share", scene, "-o", html, "--title", "Shared <scene>", "--credits", "somebody");
+    assert.match(said, /splats of degree \d, [\d.]+ MB/);
+    const { page, problems, asked } = await open(pathToFileURL(html).href, { offline: true });
+    const first = await shown(page);
+    const db = psnr(first, await rendered(page, scene));
+    console.log(`${name}: ${db.toFixed(2)} dB, ${(statSync(html).size / 1e6).toFixed(2)} MB`);
+    assert.ok(db >= 35, `${db} dB`);
+    await page.screenshot({ path: join(OUT, `shared_${name.replaceAll(" ", "_")}.png`) });
+    assert.equal(await page.title(), "Shared <scene>");
+    await page.mouse.move(300, 180);
+    await page.mouse.down();
+    await page.mouse.move(420, 200, { steps: 5 });
+    await page.mouse.up();
+    await page.mouse.wheel(0, -200);
+    await settled(page, problems);
+    const second = await shown(page);
+    assert.ok(psnr(first, second) < 30, "the drag did not change the picture");
+    const turned = psnr(second, await rendered(page, scene));
+    assert.ok(turned >= 35, `${turned} dB after the drag`);
+    assert.deepEqual(problems, []);
+    assert.deepEqual(asked, [pathToFileURL(html).href]);
+  });
+}
+
+test("a page that is too large loses harmonics, then splats, and says so", async () => {
+  const html = join(scratch, "small.html");
+  const said = run("share", random(4000), "-o", html, "--max", "150kB");
+  assert.match(said, /degree 3 became degree 0/);
+  assert.ok(statSync(html).size <= 150000);
+});
+
+test("a folder is served with a start picture and its scene beside it", async () => {
+  const folder = join(scratch, "site");
+  const scene = random(4000);
+  run("share", scene, "-o", folder, "--folder");
+  assert.deepEqual(readdirSync(folder).sort(), ["index.html", "poster.png", "scene.irs.gz"]);
+  const types = { html: "text/html", png: "image/png", gz: "application/octet-stream" };
+  const server = createServer((request, response) => {
+    const name = request.url === "/" ? "index.html" : request.url.slice(1);
+    if (!readdirSync(folder).includes(name)) return response.writeHead(404).end();
+    response.writeHead(200, { "content-type": types[name.split(".").pop()] }).end(readFileSync(join(folder, name)));
+  });
+  await new Promise((resolve) => server.listen(0, "127.0.0.1", resolve));
+  const { page } = await open(`http://127.0.0.1:${server.address().port}/`);
+  const db = psnr(await shown(page), await rendered(page, scene));
+  assert.ok(db >= 35, `${db} dB`);
+  assert.equal(await page.locator(".poster").count(), 0);
+  server.close();
+});

@@ -91,7 +91,7 @@ mod tests {
     fn wrong_photographs_are_found_and_odd_ones_are_not() {
         let mut rng = Rng::new(5, 1);
         let mut errors: Vec<(usize, f64)> = (0..50)
-            .map(|i| (i, 0.05 * f64::from(0.2 * rng.normal()).exp()))
+            .map(|i| (i, 0.05 * f64::from(0.15 * rng.normal()).exp()))
             .collect();
         assert_eq!(outliers(&errors), []);
         // A view of much detail.

@@ -255,7 +255,10 @@ mod tests {
             (shared.bytes, shared.splats, shared.degree),
             (text.len() as u64, [2000, 2000], [2, 2])
         );
-        assert!(text.contains("A &lt;b&gt;bold") && text.contains("me &amp; you") && !text.contains("{{"));
+        assert!(text.contains("A &lt;b&gt;bold") && text.contains("me &amp; you"));
+        for place in ["title", "credits", "poster", "style", "main", "imports", "texts"] {
+            assert!(!text.contains(&format!("{{{{{place}}}}}")), "{place} is not filled in");
+        }
         for place in ["src=", "href=", "http:", "https:", "\"./", "\"../"] {
             assert!(!text.contains(place), "{place}");
         }

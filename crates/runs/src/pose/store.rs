@@ -57,11 +57,14 @@ fn header(settings: [u32; 4]) -> Vec<u8> {
         .collect()
 }
 
-/// Writes the features and colours of the photographs with these `hashes`, and their matches.
+/// Photographs by their hashes, with their features and the colours of these.
+pub(super) type Photos<'a> = (&'a [u64], &'a [Features], &'a [Vec<[u8; 3]>]);
+
+/// Writes photographs and the matches between them.
 pub(super) fn write(
     path: &Path,
     settings: [u32; 4],
-    (hashes, features, colors): (&[u64], &[Features], &[Vec<[u8; 3]>]),
+    (hashes, features, colors): Photos,
     matches: &HashMap<[u64; 2], Vec<[u32; 2]>>,
 ) -> Result<(), FormatError> {
     write_atomic(path, |out| {

@@ -347,7 +347,7 @@ impl Estimator for Essential<'_> {
     type Model = DMat3;
     const SAMPLE: usize = 5;
 
-    fn len(&self) -> usize {
+    fn observations(&self) -> usize {
         self.points.points.len()
     }
 

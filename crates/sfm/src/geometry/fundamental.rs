@@ -84,7 +84,7 @@ impl Estimator for Fundamental<'_> {
     type Model = DMat3;
     const SAMPLE: usize = 7;
 
-    fn len(&self) -> usize {
+    fn observations(&self) -> usize {
         self.points.points.len()
     }
 

@@ -65,7 +65,7 @@ impl Estimator for Homography<'_> {
     type Model = DMat3;
     const SAMPLE: usize = 4;
 
-    fn len(&self) -> usize {
+    fn observations(&self) -> usize {
         self.points.points.len()
     }
 

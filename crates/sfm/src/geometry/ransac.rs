@@ -9,7 +9,7 @@ pub trait Estimator {
     /// Size of a minimal sample.
     const SAMPLE: usize;
     /// Number of observations.
-    fn len(&self) -> usize;
+    fn observations(&self) -> usize;
     /// Adds the models through the observations `sample`.
     fn fit(&self, sample: &[usize], models: &mut Vec<Self::Model>);
     /// The MSAC cost, a sum of squared residuals in units of the squared threshold, each at most 1, and the number of inliers.
@@ -42,7 +42,7 @@ pub struct Estimate<M> {
 
 /// The best model over random minimal samples, starting from the candidates `first`; `None` if there is none.
 pub fn estimate<E: Estimator>(problem: &E, first: Vec<E::Model>, limits: Limits) -> Option<Estimate<E::Model>> {
-    let n = problem.len();
+    let n = problem.observations();
     let mut best: Option<Estimate<E::Model>> = None;
     for model in first {
         consider(problem, model, &mut best);
@@ -121,7 +121,7 @@ mod tests {
     impl Estimator for Mean {
         type Model = f64;
         const SAMPLE: usize = 1;
-        fn len(&self) -> usize {
+        fn observations(&self) -> usize {
             self.0.len()
         }
         fn fit(&self, sample: &[usize], models: &mut Vec<f64>) {

@@ -200,7 +200,7 @@ impl Estimator for Resection {
     type Model = DPose;
     const SAMPLE: usize = 3;
 
-    fn len(&self) -> usize {
+    fn observations(&self) -> usize {
         self.points.len()
     }
 

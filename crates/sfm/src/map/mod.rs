@@ -1,7 +1,7 @@
 //! From verified matches to cameras and points: the incremental mapper.
 //!
-//! [`reconstruct`] verifies pairs ([`verify`]), guesses focal lengths ([`focal`]), joins matches to tracks ([`tracks`]) and grows
-//! models from seed pairs ([`grow`]), adjusting as they grow ([`refine`]). It depends on nothing but its input: no clock, no
+//! [`reconstruct`] verifies pairs (`verify`), guesses focal lengths (`focal`), joins matches to tracks (`tracks`) and grows
+//! models from seed pairs (`grow`), adjusting as they grow (`refine`). It depends on nothing but its input: no clock, no
 //! threads, no order of hashing.
 
 mod finish;

@@ -1,5 +1,5 @@
-// Virtual reality where the browser offers it, drawn by this page. Tested without a headset only: that the button appears where a
-// session is offered, and that one begins.
+// Virtual reality where the browser offers it, drawn by this page. Tested without a headset only, with a session made up: that the button appears where one
+// is offered, and that both eyes see the scene (page-tests/tests/xr.test.js).
 
 import { axes, fromAxes } from "./math.js";
 import { state } from "./state.js";

@@ -12,6 +12,7 @@ mod splats;
 mod state;
 
 pub use engine::{Engine, Noise, Placement, Update};
+pub use nearest::{Nearest, Neighbour};
 pub use render::{
     CameraGradient, FramePlanes, Gather, OutputGradient, RenderOptions, Renderer, SplatGradients, ViewParams,
 };

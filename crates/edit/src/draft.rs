@@ -1,5 +1,5 @@
 use crate::Selection;
-use glam::DVec3;
+use glam::{DVec3, Vec3};
 use irradia_scene::{Camera, GaussianCloud, Similarity, sh};
 use rayon::prelude::*;
 
@@ -52,10 +52,26 @@ impl Draft {
         gather(&self.cloud, &shown.indices())
     }
 
+    /// Median distance of the splats from their median, world units; 0 for a point.
+    pub(crate) fn extent(&self) -> f64 {
+        let means = &self.cloud.means;
+        let center = Vec3::from_array([0, 1, 2].map(|c| median(means.iter().map(|mean| mean[c]).collect())));
+        f64::from(median(means.iter().map(|mean| center.distance(Vec3::from(*mean))).collect()))
+    }
+
     /// Centre of splat `i` in the coordinates of the dataset.
     pub(crate) fn position(&self, i: usize) -> DVec3 {
         let mean = DVec3::from(self.cloud.means[i].map(f64::from));
         self.cloud.world_from_dataset.invert(mean)
+    }
+}
+
+/// The upper median; 0 of nothing.
+pub(crate) fn median(mut values: Vec<f32>) -> f32 {
+    let middle = values.len() / 2;
+    match values.is_empty() {
+        true => 0.0,
+        false => *values.select_nth_unstable_by(middle, f32::total_cmp).1,
     }
 }
 

@@ -22,9 +22,10 @@
 #![forbid(unsafe_code)]
 
 mod color;
-mod contributions;
 mod draft;
 mod error;
+mod floaters;
+mod ground;
 mod harmonics;
 mod history;
 mod list;
@@ -32,15 +33,20 @@ mod plan;
 mod select;
 mod selection;
 mod shape;
+mod sight;
+mod subject;
 mod text;
 mod transform;
 
 pub use draft::Draft;
 pub use error::EditError;
+pub use floaters::{FloaterScores, floater_scores};
+pub use ground::{Ground, ground};
 pub use history::History;
 pub use list::{Edit, EditList, Operation, UpAxis};
 pub use plan::{Applied, Open, Provenance, apply, open_nothing};
 pub use select::select;
 pub use selection::Selection;
 pub use shape::{Mode, SelectStep, Shape, Viewpoint};
+pub use subject::subject;
 pub use transform::Transform;

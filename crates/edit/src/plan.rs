@@ -2,6 +2,7 @@
 
 use crate::color::ColorMap;
 use crate::draft::{append, bring_to_world, gather, set_degree};
+use crate::ground::ground;
 use crate::select::{select, select_among};
 use crate::transform::{transform_scene, transform_splats};
 use crate::{Draft, Edit, EditError, Operation, Selection, Transform, UpAxis};
@@ -165,11 +166,17 @@ impl Plan {
                 };
                 transformed(transform, selection)
             }
-            Operation::Upright { up, ground, axis } => {
-                let Some(found) = *up else {
-                    return Err(EditError::NoCameras("upright without up"));
-                };
-                transformed(upright(found, *ground, *axis), selection)
+            Operation::Upright {
+                up,
+                ground: point,
+                axis,
+            } => {
+                if up.is_none() {
+                    let found = ground(draft).ok_or(EditError::NoCameras("upright without up"))?;
+                    *up = Some(found.up);
+                    *point = point.or(found.point);
+                }
+                transformed(upright(up.unwrap_or_default(), *point, *axis), selection)
             }
             Operation::SetLength { from, to, length } => {
                 let factor = *length / DVec3::from(*from).distance(DVec3::from(*to));

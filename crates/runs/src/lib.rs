@@ -30,6 +30,7 @@
 //! | read and render a scene | [`Scene`] |
 //! | evaluate a scene against photographs | [`evaluate`] |
 //! | convert a scene to another format | [`convert`] |
+//! | edit a scene | [`Editing`] |
 //! | describe a file or folder | [`describe`] |
 //!
 //! Nothing here prints: warnings are returned, or passed to observers. Random numbers come from the request's seed alone, and
@@ -42,6 +43,7 @@
 mod background;
 mod convert;
 mod describe;
+mod edit;
 mod error;
 mod evaluate;
 mod folder;
@@ -63,6 +65,7 @@ mod synth_files;
 pub use background::Background;
 pub use convert::{COMPARED_VIEWS, Conversion, convert};
 pub use describe::describe;
+pub use edit::{EDITS, Editing, Made, keeps_place};
 pub use error::RunError;
 pub use evaluate::{distinct, evaluate, file_stem, file_stems, unmeasured};
 pub use folder::{FIELD, RESIDUAL, RunFolder, RunRecord, SCENE};

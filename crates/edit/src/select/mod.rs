@@ -4,6 +4,9 @@ mod region;
 mod screen;
 mod space;
 
+use crate::floaters::floater_scores;
+use crate::sight::views_that_see;
+use crate::subject::subject;
 use crate::{Draft, EditError, Mode, SelectStep, Selection, Shape};
 
 /// The splats that `steps` select, none of them hidden or locked; no steps select nothing.
@@ -68,9 +71,24 @@ fn evaluate(draft: &Draft, shape: &Shape) -> Result<Selection, EditError> {
             visible,
         } => screen::visible_only(draft, camera, *visible, screen::brush(draft, camera, points, *radius)),
         Shape::Clusters { min, max, gap } => space::clusters(draft, *min, *max, *gap),
-        Shape::Views { .. } => return Err(EditError::NoCameras("views")),
-        Shape::Floaters { .. } => return Err(EditError::NoCameras("floaters")),
-        Shape::Subject { .. } => return Err(EditError::NoCameras("subject")),
+        Shape::Views { min, max } => {
+            if draft.cameras.is_empty() {
+                return Err(EditError::NoCameras("views"));
+            }
+            let range = min.unwrap_or(0)..=max.unwrap_or(u32::MAX);
+            let views = views_that_see(draft);
+            Selection::of(draft.len(), |i| range.contains(&views[i]))
+        }
+        Shape::Floaters { score } => {
+            let least = score.unwrap_or(1.0) as f32;
+            let scores = floater_scores(draft);
+            Selection::of(draft.len(), |i| scores[i].score() >= least)
+        }
+        Shape::Subject { margin } => {
+            let (center, radius) = subject(draft).ok_or(EditError::NoCameras("subject"))?;
+            let radius = radius * margin.unwrap_or(1.0);
+            region::inside(draft, &Shape::Sphere { center, radius })
+        }
         Shape::Invert {} | Shape::Grow { .. } | Shape::Connected { .. } => {
             unreachable!("they change what is selected so far")
         }

@@ -1,6 +1,6 @@
 //! What was drawn over a picture: polygons and strokes.
 
-use crate::contributions::weights_in;
+use crate::sight::{Observer, SEEN};
 use crate::{Draft, Selection, Viewpoint};
 use glam::DVec2;
 
@@ -58,8 +58,10 @@ pub(super) fn brush(draft: &Draft, camera: &Viewpoint, points: &[[f64; 2]], radi
 pub(super) fn visible_only(draft: &Draft, camera: &Viewpoint, visible: bool, mut selection: Selection) -> Selection {
     if visible {
         let camera = camera.camera(&draft.cloud.world_from_dataset);
-        let weights = weights_in(draft, &camera);
-        selection.intersect(&Selection::of(draft.len(), |i| weights[i].is_seen()));
+        let mut shown = draft.hidden.clone();
+        shown.invert();
+        let weights = Observer::new(draft, &shown).weights(&camera);
+        selection.intersect(&Selection::of(draft.len(), |i| weights[i] >= SEEN));
     }
     selection
 }

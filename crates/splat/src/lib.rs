@@ -1,6 +1,7 @@
 //! 3D Gaussian splatting (Kerbl et al. 2023): rendering, its gradients, initialisation and density control.
 #![forbid(unsafe_code)]
 
+pub mod contribution;
 pub mod densify;
 mod engine;
 pub mod filter;

@@ -7,6 +7,7 @@
 
 use crate::event::Event;
 use crate::photos::Prepared;
+use crate::robust::spread;
 use crate::schedule::plan;
 use crate::socket::Exposure;
 use crate::trainer::{TrainError, Trainer};
@@ -64,10 +65,8 @@ fn unpredicted(views: &[(Camera, f64)], unit: f32) -> Option<f64> {
         let predicted = near[..NEIGHBOURS].iter().map(|(_, log)| log).sum::<f64>() / NEIGHBOURS as f64;
         own - predicted
     };
-    let mut residuals: Vec<f64> = views.iter().enumerate().map(|view| residual(view).abs()).collect();
-    residuals.sort_by(f64::total_cmp);
-    // From the median, for a few odd photographs are no reason; a mean of k independent values adds 1/k to the variance.
-    let spread = 1.4826 * residuals[residuals.len() / 2];
+    // A few odd photographs are no reason; a mean of k independent values adds 1/k to the variance.
+    let spread = spread(views.iter().enumerate().map(residual));
     Some(spread / (1.0 + 1.0 / NEIGHBOURS as f64).sqrt())
 }
 

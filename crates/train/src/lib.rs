@@ -22,6 +22,7 @@ pub mod paces;
 mod photos;
 pub mod recipe;
 pub mod report;
+mod robust;
 mod run;
 pub mod schedule;
 pub mod socket;

@@ -6,6 +6,7 @@
 //! scene) stay below [`FACTOR`], or widen the spread.
 
 use crate::event::Event;
+use crate::robust::{median, spread};
 use crate::schedule::plan;
 use crate::trainer::{TrainError, Trainer};
 
@@ -25,19 +26,12 @@ const STEPS_PER_VIEW: usize = 8;
 
 /// Those of `errors` that are far beyond the others' spread, worst first.
 fn outliers(errors: &[(usize, f64)]) -> Vec<(usize, f64)> {
-    let median = |values: &mut Vec<f64>| {
-        values.sort_by(f64::total_cmp);
-        values[values.len() / 2]
-    };
-    let mut logs: Vec<f64> = errors.iter().map(|(_, error)| error.max(1e-9).ln()).collect();
+    let logs: Vec<f64> = errors.iter().map(|(_, error)| error.max(1e-9).ln()).collect();
     if logs.len() < MIN_VIEWS {
         return Vec::new();
     }
-    let middle = median(&mut logs);
-    let mut deviations = logs.iter().map(|log| (log - middle).abs()).collect();
-    // The standard deviation of a normal distribution with this median deviation.
-    let spread = 1.4826 * median(&mut deviations);
-    let least = (DEVIATIONS * spread).max(FACTOR.ln());
+    let middle = median(logs.clone());
+    let least = (DEVIATIONS * spread(logs.iter().map(|log| log - middle))).max(FACTOR.ln());
     let excess = errors
         .iter()
         .map(|(view, error)| (*view, error.max(1e-9).ln() - middle));

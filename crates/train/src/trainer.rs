@@ -45,6 +45,9 @@ pub enum TrainError {
         "no initial points: the dataset has none, and the unmasked camera frusta do not overlap; check poses and masks"
     )]
     NoPoints,
+    /// There are no splats to begin with.
+    #[error("the scene to begin with has no splats")]
+    NoSplats,
     /// The cameras determine no space for a field.
     #[error("the cameras determine no space for a field: they do not look at a common region; check poses")]
     NoSpace,
@@ -167,6 +170,26 @@ impl Trainer {
             let splats = trainer.first_splats()?;
             *trainer.engine.state_mut() = SplatState::new(splats);
         }
+        trainer.sockets = trainer.first_sockets()?;
+        Ok(trainer)
+    }
+
+    /// Begins with `splats`, in the world of `dataset`, instead of the dataset's points or a field. Bands that they do not have are not
+    /// trained. The recipe's `render.antialias` must be that of the splats.
+    ///
+    /// # Errors
+    /// When there are no training views, no splats, or too little memory for them.
+    pub fn from_splats(
+        dataset: Arc<Dataset>,
+        recipe: Recipe,
+        options: TrainOptions,
+        splats: Splats,
+    ) -> Result<Self, TrainError> {
+        if splats.is_empty() {
+            return Err(TrainError::NoSplats);
+        }
+        let mut trainer = Self::unfilled(dataset, recipe, options, splats.len())?;
+        *trainer.engine.state_mut() = SplatState::new(splats);
         trainer.sockets = trainer.first_sockets()?;
         Ok(trainer)
     }

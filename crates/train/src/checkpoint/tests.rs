@@ -94,6 +94,19 @@ fn a_checkpoint_round_trips() {
 }
 
 #[test]
+fn photographs_that_were_left_out_stay_left_out() {
+    let mut trainer = trainer();
+    assert_eq!(trainer.trained, [0, 1]);
+    trainer.trained = vec![1];
+    assert_eq!(read(&to_bytes(&trainer)).unwrap().trained, [1]);
+    // Files from before photographs could be left out train on all.
+    let older = rewritten(&to_bytes(&trainer), FORMAT, |tensors| {
+        tensors.retain(|(name, ..)| name != TRAINED)
+    });
+    assert_eq!(read(&older).unwrap().trained, [0, 1]);
+}
+
+#[test]
 fn a_streamed_checkpoint_has_the_bytes_of_the_format_and_a_copy_is_that_of_its_moment() {
     let mut trainer = trainer();
     let bytes = to_bytes(&trainer);

@@ -160,7 +160,10 @@ impl Editing {
             }
             folder.write(EDITS, self.list.to_toml().as_bytes())?;
             if self.path.with_file_name(crate::RESIDUAL).is_file() {
-                notes.push(format!("{} is left out: it belongs to the scene as it was", crate::RESIDUAL));
+                notes.push(format!(
+                    "{} is left out: it belongs to the scene as it was",
+                    crate::RESIDUAL
+                ));
             }
         }
         notes.extend(write_splats_with(&file, &self.draft.shown(), options)?);

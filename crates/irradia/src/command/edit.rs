@@ -19,7 +19,7 @@ pub struct Args {
     #[arg(value_name = "OP")]
     pub ops: Vec<Edit>,
     /// The file to write, its name selects the format; or a folder, which also gets the cameras and the edits
-    #[arg(long, short, value_name = "FILE|FOLDER", required_unless_present = "preview")]
+    #[arg(long, short, value_name = "FILE|FOLDER", required_unless_present_any = ["preview", "in_place"])]
     pub out: Option<PathBuf>,
     /// Make the edits of this list first
     #[arg(long, value_name = "FILE")]
@@ -33,6 +33,9 @@ pub struct Args {
     /// Write before.png and after.png, seen from beside the scene, to this folder
     #[arg(long, value_name = "FOLDER")]
     pub pictures: Option<PathBuf>,
+    /// Edit the run itself: its scene, and its latest checkpoint, from which it can be resumed
+    #[arg(long, conflicts_with_all = ["out", "preview"])]
+    pub in_place: bool,
     /// How much a lossy format may lose, where it leaves the choice (.spz, .sog, .ksplat)
     #[arg(long, value_enum, default_value_t = QualityArg::Normal)]
     pub quality: QualityArg,
@@ -82,15 +85,19 @@ pub fn run(args: &Args) -> Result<()> {
         };
         notes = editing.write(out, &options)?;
     }
+    if let Some(folder) = &args.pictures {
+        editing.write_pictures(folder)?;
+    }
+    if args.in_place {
+        notes = editing.write_in_place()?;
+    }
     if let Some(path) = &args.save_edits {
         let text = editing.list().to_toml();
         write_atomic(path, |file| file.write_all(text.as_bytes()))?;
     }
-    if let Some(folder) = &args.pictures {
-        editing.write_pictures(folder)?;
-    }
     let title = match &args.out {
         Some(out) => out.display().to_string(),
+        None if args.in_place => args.input.display().to_string(),
         None => "preview".to_owned(),
     };
     let shown = editing.draft().len() - editing.draft().hidden.count();

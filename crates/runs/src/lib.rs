@@ -40,6 +40,7 @@
 #![forbid(unsafe_code)]
 
 mod background;
+mod compact;
 mod convert;
 mod describe;
 mod error;
@@ -61,6 +62,7 @@ mod snapshot;
 mod synth_files;
 
 pub use background::Background;
+pub use compact::{CompactEvent, CompactInput, CompactTarget, Compacted, compact};
 pub use convert::{COMPARED_VIEWS, Conversion, convert};
 pub use describe::describe;
 pub use error::RunError;

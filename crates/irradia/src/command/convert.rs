@@ -35,17 +35,24 @@ pub enum QualityArg {
     High,
 }
 
-pub fn convert(args: &ConvertArgs) -> Result<()> {
-    let options = WriteOptions {
-        quality: match args.quality {
+impl From<QualityArg> for Quality {
+    fn from(quality: QualityArg) -> Self {
+        match quality {
             QualityArg::Low => Quality::Low,
             QualityArg::Normal => Quality::Normal,
             QualityArg::High => Quality::High,
-        },
+        }
+    }
+}
+
+pub fn convert(args: &ConvertArgs) -> Result<()> {
+    let options = WriteOptions {
+        quality: args.quality.into(),
         spz_version: match args.spz_version {
             4 => SpzVersion::V4,
             _ => SpzVersion::V3,
         },
+        palette: None,
     };
     let conversion = convert_scene(&args.input, &args.output, &options, !args.no_compare)?;
     say(format_args!(

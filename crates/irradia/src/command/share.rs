@@ -29,7 +29,7 @@ pub struct Args {
 }
 
 /// Bytes of `10MB`, `800kB`, `1.5GB` or `4096`.
-fn parse_size(text: &str) -> Result<u64, String> {
+pub(super) fn parse_size(text: &str) -> Result<u64, String> {
     let end = text
         .find(|c: char| !(c.is_ascii_digit() || c == '.'))
         .unwrap_or(text.len());

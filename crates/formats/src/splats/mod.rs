@@ -89,12 +89,12 @@ impl SplatFormat {
         }
     }
 
-    /// The format for the end of `path`'s name, ignoring case; a folder with a `meta.json` is [`Self::SogFolder`].
+    /// The format for the end of `path`'s name, ignoring case; a folder of SOG images is [`Self::SogFolder`].
     ///
     /// # Errors
     /// [`FormatError::UnknownSplatFormat`], which lists the known ones.
     pub fn of(path: &Path) -> Result<Self, FormatError> {
-        if path.join(sog::META).is_file() {
+        if is_sog_folder(path) {
             return Ok(Self::SogFolder);
         }
         let name = path
@@ -298,6 +298,13 @@ pub fn through_format(
     })?;
     rows::leave_out_invalid(&mut read);
     Ok((read, bytes.len()))
+}
+
+/// Whether the folder `path` is a scene in images: other programs, too, call a file `meta.json`.
+pub fn is_sog_folder(path: &Path) -> bool {
+    let meta = path.join(sog::META);
+    let is_short = fs::metadata(&meta).is_ok_and(|file| file.is_file() && file.len() <= sog::MAX_META as u64);
+    is_short && fs::read(&meta).is_ok_and(|text| sog::is_meta(&text))
 }
 
 /// The `meta.json` that `path` is or contains.

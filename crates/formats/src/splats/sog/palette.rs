@@ -105,6 +105,13 @@ impl Codebook {
         numbers
     }
 
+    /// The number nearest to zero replaced by zero.
+    pub fn with_zero(mut self) -> Self {
+        let nearest = self.index(0.0);
+        self.0[usize::from(nearest)] = 0.0;
+        self
+    }
+
     /// The index of the number nearest to `value`.
     pub fn index(&self, value: f32) -> u8 {
         let above = self.0.partition_point(|number| *number < value).clamp(1, 255);
@@ -350,6 +357,34 @@ mod tests {
         );
         assert_eq!(Codebook::of(&[f32::NAN]).0, [0.0; 256]);
         assert_eq!(Codebook::of(&[2.0, f32::INFINITY]).0, [2.0; 256]);
+    }
+
+    #[test]
+    fn what_fits_is_kept_and_vectors_of_zeros_share_an_entry() {
+        let mut rng = Rng::new(6, 1);
+        let few: Vec<f32> = (0..300).map(|_| rng.range(-1.0, 1.0)).collect();
+        // Each of 100 vectors of three numbers, many times.
+        let many: Vec<f32> = (0..5000)
+            .flat_map(|i| few[i * 7 % 100 * 3..][..3].iter().copied())
+            .collect();
+        let palette = Palette::of(&many, 3, 128);
+        assert_eq!(palette.entries.len(), 300);
+        for (vector, label) in many.chunks_exact(3).zip(&palette.labels) {
+            assert_eq!(vector, &palette.entries[usize::from(*label) * 3..][..3]);
+        }
+        let half: Vec<f32> = (0..5000)
+            .flat_map(|i| [0.0; 3].map(|_: f32| if i % 2 == 0 { 0.0 } else { rng.range(1.0, 2.0) }))
+            .collect();
+        let palette = Palette::of(&half, 3, 64);
+        assert!(palette.entries.len() <= 64 * 3);
+        let zeros = |i: usize| palette.entries[i * 3..][..3].iter().all(|v| *v == 0.0);
+        assert_eq!((0..palette.entries.len() / 3).filter(|i| zeros(*i)).count(), 1);
+        assert!((0..5000).all(|i| zeros(palette.labels[i].into()) == (i % 2 == 0)));
+        // Numbers nearer to each other than the bins of the histogram.
+        let near: Vec<f32> = (0..200).map(|i| 1.0 + i as f32 * 1e-6).chain([1000.0]).collect();
+        let codebook = Codebook::of(&near);
+        assert!(near.iter().all(|v| codebook.0[usize::from(codebook.index(*v))] == *v));
+        assert_eq!(Codebook::of(&[-1.0, 0.01, 2.0]).with_zero().0[..3], [-1.0, 0.0, 2.0]);
     }
 
     #[test]

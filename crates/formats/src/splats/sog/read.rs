@@ -12,7 +12,7 @@ use std::io::Cursor;
 use std::path::Path;
 
 /// `meta.json` holds a few codebooks of 256 numbers.
-const MAX_META: usize = 1 << 20;
+pub(crate) const MAX_META: usize = 1 << 20;
 /// Pixels that an image may have beyond one a splat: writers round its sides up.
 const SPARE_PIXELS: usize = 65_536;
 /// Entries of a palette: labels have 16 bits.
@@ -132,6 +132,11 @@ fn parse_meta(text: &[u8]) -> Result<Meta, Malformed> {
             "SOG version {version} is not known; expected 1 or 2"
         ))),
     }
+}
+
+/// Whether `text` is a `meta.json` of a scene, of whatever version.
+pub(crate) fn is_meta(text: &[u8]) -> bool {
+    serde_json::from_slice::<Meta>(text).is_ok()
 }
 
 fn names(meta: &Meta) -> impl Iterator<Item = &String> {

@@ -104,6 +104,15 @@ pub(crate) fn encode(cloud: &GaussianCloud, options: &WriteOptions) -> io::Resul
             .map_or_else(|| palette_size(count, options.quality), |most| most.clamp(2, 65_536));
         let palette = Palette::of(&vectors, rest, most);
         let codebook = Codebook::of(&palette.entries);
+        let codebook = match palette
+            .entries
+            .chunks_exact(rest)
+            .any(|entry| entry.iter().all(|v| *v == 0.0))
+        {
+            // No harmonics stay none.
+            true => codebook.with_zero(),
+            false => codebook,
+        };
         let entries = palette.entries.len() / rest;
         let mut pixels: Vec<u8> = palette.entries.iter().map(|v| codebook.index(*v)).collect();
         let rows = entries.div_ceil(ROW);

@@ -7,7 +7,9 @@ use irradia_runs::formats::{WriteOptions, read_splats, write_splats};
 use irradia_runs::prelude::*;
 use irradia_runs::scene::{GaussianCloud, Rng, sh};
 use irradia_runs::synth::{SceneName, dataset as traced};
+use irradia_runs::train::eval::{EvalOptions, Metrics};
 use irradia_runs::train::event::{Event, Observer, Signal};
+use irradia_runs::train::half_fit::HalfFit;
 use irradia_runs::{EDITS, Editing};
 use irradia_splat::logit;
 use std::fs;
@@ -224,15 +226,13 @@ fn floaters_planted_in_a_trained_scene_are_removed() {
     let psnr = |cloud: &GaussianCloud| {
         write_splats(&path, cloud).unwrap();
         let scene = Scene::read(&path).unwrap();
-        let squares = data.test.iter().map(|view| {
-            let view = &data.views[*view];
-            let photo = view.photo.load().expect("in memory");
-            let picture = scene.render(&view.camera).color.rounded_to_8_bits();
-            let square = |(a, b): (&f32, &u8)| (f64::from(*a) - f64::from(*b) / 255.0).powi(2);
-            picture.data.iter().zip(&photo.data).map(square).sum::<f64>() / picture.data.len() as f64
-        });
-        let each: Vec<f64> = squares.map(|square| -10.0 * square.log10()).collect();
-        each.iter().sum::<f64>() / each.len() as f64
+        let options = EvalOptions {
+            render: scene.options,
+            metrics: Metrics::Psnr,
+            half_fit: HalfFit::default(),
+        };
+        let mean = evaluate(&scene.model, &data, &data.test, &options, |_| Ok::<(), RunError>(()));
+        mean.expect("photographs").psnr
     };
     let (as_trained, with, after) = (psnr(&clean), psnr(&planted), psnr(left));
     assert!(

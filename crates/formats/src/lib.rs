@@ -6,7 +6,6 @@
 #![forbid(unsafe_code)]
 
 mod atomic;
-pub mod base64;
 mod bytes;
 mod complete;
 mod dataset;

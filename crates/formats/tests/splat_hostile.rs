@@ -229,7 +229,7 @@ fn documents_that_refer_to_what_is_not_there() {
     let encoded = text[start..end].split(',').nth(1).unwrap();
     std::fs::write(
         folder.path().join("a.bin"),
-        irradia_formats::base64::decode(encoded).unwrap(),
+        irradia_scene::base64::decode(encoded).unwrap(),
     )
     .unwrap();
     std::fs::write(&path, format!("{}a.bin{}", &text[..start], &text[end..])).unwrap();

@@ -1,7 +1,8 @@
 //! A scene from one splat format to another, and what it cost: bytes, splats and, for lossy formats, PSNR.
 
 use crate::folder::cameras_beside;
-use crate::{RunError, Scene, scene_of};
+use crate::orbit::orbit;
+use crate::{RunError, scene_of};
 use irradia_formats::{SplatFormat, WriteOptions, read_splat_file, read_splats, splat_file_size, write_splats_with};
 use irradia_measure::psnr;
 use irradia_scene::{GaussianCloud, Similarity};
@@ -76,22 +77,17 @@ fn compare(input: &Path, before: &GaussianCloud, output: &Path) -> Result<Vec<f6
         antialias: before.antialiased,
         ..RenderOptions::default()
     };
-    let scene = |cloud: &GaussianCloud, world_from_dataset: Similarity| Scene {
-        model: Model::Splats {
-            splats: Cow::Owned(Splats::from_cloud(cloud)),
-            residual: None,
-        },
-        options,
-        cameras: cameras_beside(input, &world_from_dataset).map(Into::into),
-        world_from_dataset,
-    };
-    let (before, after) = (scene(before, world), scene(&after, world));
+    let [before, after] = [before, &after].map(|cloud| Model::Splats {
+        splats: Cow::Owned(Splats::from_cloud(cloud)),
+        residual: None,
+    });
+    let cameras = cameras_beside(input, &world);
+    let cameras = orbit(before.splats(), cameras.as_deref(), COMPARED_VIEWS, Some(COMPARED_SIZE));
     let mut renderer = Renderer::new();
-    let mut picture = |scene: &Scene, camera| {
-        let frame = scene.model.render(&mut renderer, camera, &scene.options);
+    let mut picture = |model: &Model, camera| {
+        let frame = model.render(&mut renderer, camera, &options);
         frame.color.rounded_to_8_bits()
     };
-    let cameras = before.orbit(COMPARED_VIEWS, Some(COMPARED_SIZE));
     Ok(cameras
         .iter()
         .map(|camera| psnr(&picture(&after, camera), &picture(&before, camera)))

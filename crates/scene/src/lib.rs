@@ -8,6 +8,7 @@
 //! - Quaternions are `w, x, y, z`, normalised when used. Scales are stored as ln, opacities as logit.
 #![forbid(unsafe_code)]
 
+pub mod base64;
 mod camera;
 mod cloud;
 mod dataset;

@@ -7,6 +7,7 @@
 
 use crate::event::Event;
 use crate::photos::Prepared;
+use crate::robust::spread;
 use crate::schedule::plan;
 use crate::socket::Exposure;
 use crate::trainer::{TrainError, Trainer};
@@ -54,20 +55,16 @@ fn unpredicted(views: &[(Camera, f64)], unit: f32) -> Option<f64> {
         return None;
     }
     let residual = |(i, (camera, own)): (usize, &(Camera, f64))| {
-        let distance = |other: &Camera| {
-            let moved = camera.pose.position.distance(other.pose.position) / unit;
-            moved + camera.pose.rotation.angle_between(other.pose.rotation)
-        };
         let others = views.iter().enumerate().filter(|(k, _)| *k != i);
-        let mut near: Vec<(f32, f64)> = others.map(|(_, (other, log))| (distance(other), *log)).collect();
+        let mut near: Vec<(f32, f64)> = others
+            .map(|(_, (other, log))| (camera.pose.distance(&other.pose, unit), *log))
+            .collect();
         near.sort_by(|a, b| a.0.total_cmp(&b.0));
         let predicted = near[..NEIGHBOURS].iter().map(|(_, log)| log).sum::<f64>() / NEIGHBOURS as f64;
         own - predicted
     };
-    let mut residuals: Vec<f64> = views.iter().enumerate().map(|view| residual(view).abs()).collect();
-    residuals.sort_by(f64::total_cmp);
-    // From the median, for a few odd photographs are no reason; a mean of k independent values adds 1/k to the variance.
-    let spread = 1.4826 * residuals[residuals.len() / 2];
+    // A few odd photographs are no reason; a mean of k independent values adds 1/k to the variance.
+    let spread = spread(views.iter().enumerate().map(residual));
     Some(spread / (1.0 + 1.0 / NEIGHBOURS as f64).sqrt())
 }
 
@@ -76,7 +73,7 @@ impl Trainer {
     pub(crate) fn decide_exposure(&mut self) -> Result<Option<Event>, TrainError> {
         let plan = plan(&self.recipe, &self.clock);
         let mut measured = Vec::new();
-        self.show_training_views(VIEWS, &plan, |trainer, view, photo| {
+        self.show_training_views(VIEWS, &plan, false, |trainer, view, photo| {
             let color = trainer.sockets.frame_color(&trainer.engine);
             measured.extend(log_exposure(color, photo).map(|log| (view, log)));
         })?;

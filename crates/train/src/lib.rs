@@ -1,6 +1,7 @@
 //! Training: recipes, the schedule, the loop, checkpoints and reports. Start at [`Trainer::step`].
 #![forbid(unsafe_code)]
 
+mod audit;
 pub mod checkpoint;
 pub mod compare;
 mod edges;
@@ -22,12 +23,14 @@ pub mod paces;
 mod photos;
 pub mod recipe;
 pub mod report;
+mod robust;
 mod run;
 pub mod schedule;
 pub mod socket;
 pub mod tensor_file;
 pub mod times;
 mod trainer;
+mod transients;
 
 pub use recipe::{Recipe, RecipeError};
 pub use run::{RunLimits, run};

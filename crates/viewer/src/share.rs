@@ -6,7 +6,8 @@
 use crate::ViewerError;
 use crate::compact::compact;
 use crate::page::file;
-use irradia_runs::formats::{base64, gzip, write_atomic};
+use irradia_runs::formats::{gzip, write_atomic};
+use irradia_runs::scene::base64;
 use irradia_runs::{Film, Scene};
 use irradia_splat::Splats;
 use irradia_splat::levels::merged;
@@ -63,10 +64,14 @@ pub fn share(scene: &Scene, output: &Path, options: &ShareOptions) -> Result<Sha
         true => around + packed.len() as u64,
         false => around + (packed.len() as u64).div_ceil(3) * 4,
     };
-    let (packed, count, degree) = fitting(splats, scene.options.sh_degree, options.max_bytes, &cost)?;
+    let Fitted {
+        packed,
+        splats: counts,
+        degree,
+    } = fitting(splats, scene.options.sh_degree, options.max_bytes, &cost)?;
     let shared = |bytes| Shared {
         bytes,
-        splats: [count, seen(&compact(splats, 0, usize::MAX))],
+        splats: counts,
         degree: [degree, splats.sh_degree().min(scene.options.sh_degree)],
     };
     if !options.folder {
@@ -88,14 +93,23 @@ pub fn share(scene: &Scene, output: &Path, options: &ShareOptions) -> Result<Sha
     Ok(shared(poster + packed.len() as u64 + text.len() as u64))
 }
 
-/// The gzipped compact form that costs at most `most`, its splats and its degree: harmonics are left out first, then splats
-/// are merged.
+/// A scene's compact form.
+struct Fitted {
+    /// Gzipped.
+    packed: Vec<u8>,
+    /// Splats in it, and of the whole scene.
+    splats: [usize; 2],
+    /// Degree of its harmonics.
+    degree: u32,
+}
+
+/// The compact form that costs at most `most`: harmonics are left out first, then splats are merged.
 fn fitting(
     splats: &Splats,
     degree: u32,
     most: Option<u64>,
     cost: &dyn Fn(&[u8]) -> u64,
-) -> Result<(Vec<u8>, usize, u32), ViewerError> {
+) -> Result<Fitted, ViewerError> {
     let most = most.unwrap_or(u64::MAX);
     let highest = degree.min(splats.sh_degree());
     let mut last = (Vec::new(), 0);
@@ -103,9 +117,14 @@ fn fitting(
         let bytes = compact(splats, degree, usize::MAX);
         last = (gzip(&bytes), seen(&bytes));
         if cost(&last.0) <= most {
-            return Ok((last.0, last.1, degree));
+            return Ok(Fitted {
+                packed: last.0,
+                splats: [last.1; 2],
+                degree,
+            });
         }
     }
+    let all = last.1;
     let around = cost(&[]);
     let mut fewer = Cow::Borrowed(splats);
     for _ in 0..TRIES {
@@ -119,7 +138,11 @@ fn fitting(
         let bytes = compact(&fewer, 0, usize::MAX);
         last = (gzip(&bytes), seen(&bytes));
         if cost(&last.0) <= most {
-            return Ok((last.0, last.1, 0));
+            return Ok(Fitted {
+                packed: last.0,
+                splats: [last.1, all],
+                degree: 0,
+            });
         }
     }
     Err(ViewerError::TooSmall { bytes: most, around })

@@ -39,22 +39,27 @@ pub(crate) fn is_image_name(path: &Path) -> bool {
 
 /// The images directly in a folder, sorted by name.
 pub(super) fn list_images(folder: &Path) -> Result<Vec<PathBuf>, FormatError> {
+    list_files(folder, is_image_name)
+}
+
+/// The files directly in a folder that are not hidden and that `keep` accepts by their names, sorted.
+pub(crate) fn list_files(folder: &Path, keep: impl Fn(&Path) -> bool) -> Result<Vec<PathBuf>, FormatError> {
     let read_error = |source| FormatError::Read {
         path: folder.to_owned(),
         source,
     };
-    let mut images = Vec::new();
+    let mut files = Vec::new();
     for entry in std::fs::read_dir(folder).map_err(read_error)? {
         let path = entry.map_err(read_error)?.path();
         let hidden = path
             .file_name()
             .is_some_and(|name| name.to_string_lossy().starts_with('.'));
-        if is_image_name(&path) && !hidden && path.is_file() {
-            images.push(path);
+        if keep(&path) && !hidden && path.is_file() {
+            files.push(path);
         }
     }
-    images.sort();
-    Ok(images)
+    files.sort();
+    Ok(files)
 }
 
 /// The folder of the photographs.

@@ -20,7 +20,7 @@ use crate::FormatError;
 pub(crate) use assemble::{oriented_size, turned_as_stored};
 use declared::Declared;
 pub(crate) use declared::DeclaredPoints;
-pub(crate) use files::is_image_name;
+pub(crate) use files::{is_image_name, list_files};
 use irradia_scene::Dataset;
 pub use split::Holdout;
 use std::fmt;

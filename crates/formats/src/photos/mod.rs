@@ -2,7 +2,7 @@
 
 mod exif;
 
-use crate::dataset::{is_image_name, oriented_size, turned_as_stored};
+use crate::dataset::{is_image_name, list_files, oriented_size, turned_as_stored};
 use crate::error::read_file;
 use crate::image_file::{Colour, decode, decode_jpeg_at, read_exif, read_header};
 use crate::{FormatError, Pixels};
@@ -134,22 +134,7 @@ pub fn has_photos(path: &Path) -> bool {
 
 /// Pictures by their extension, sorted.
 fn list_pictures(folder: &Path) -> Result<Vec<PathBuf>, FormatError> {
-    let read_error = |source| FormatError::Read {
-        path: folder.to_owned(),
-        source,
-    };
-    let mut files = Vec::new();
-    for entry in std::fs::read_dir(folder).map_err(read_error)? {
-        let path = entry.map_err(read_error)?.path();
-        let is_hidden = path
-            .file_name()
-            .is_some_and(|name| name.to_string_lossy().starts_with('.'));
-        if (is_image_name(&path) || is_unread(&path).is_some()) && !is_hidden && path.is_file() {
-            files.push(path);
-        }
-    }
-    files.sort();
-    Ok(files)
+    list_files(folder, |path| is_image_name(path) || is_unread(path).is_some())
 }
 
 /// The extension of a kind of picture that is not read.

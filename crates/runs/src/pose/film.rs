@@ -2,7 +2,6 @@
 
 use super::PoseProgress;
 use crate::RunError;
-use irradia_compute::Level;
 use irradia_formats::write_atomic;
 use irradia_sfm::Features;
 use irradia_sfm::features::{Extractor, GreyPhoto, Sift};
@@ -226,11 +225,7 @@ fn read_line(stream: &mut impl Read) -> Option<String> {
 
 /// The median distance between matching features, in widths of the picture.
 fn motion(before: &Features, after: &Features) -> f64 {
-    let options = MatchOptions {
-        level: Level::detect(),
-        ..MatchOptions::default()
-    };
-    let mut distances: Vec<f32> = match_features(before, after, &options)
+    let mut distances: Vec<f32> = match_features(before, after, &MatchOptions::default())
         .into_iter()
         .map(|[a, b]| {
             let (a, b) = (before.keypoints[a as usize], after.keypoints[b as usize]);

@@ -93,13 +93,11 @@ impl DCamera {
     /// Pixels of a point in camera axes, in front of the camera, with derivatives.
     #[inline(always)]
     pub fn project(&self, p: DVec3) -> Projection {
-        let [fx, fy, cx, cy, k1, k2, p1, p2] = self.parameters;
+        let [fx, fy, cx, cy, ..] = self.parameters;
         let inverse = 1.0 / p.z;
         let (x, y) = (p.x * inverse, p.y * inverse);
         let r2 = x * x + y * y;
-        let radial = 1.0 + r2 * (k1 + r2 * k2);
-        let dx = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x);
-        let dy = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y;
+        let DVec2 { x: dx, y: dy } = self.distort(x, y);
         let [xx, xy, yy] = self.distort_derivative(x, y);
         let row = |f: f64, a: f64, b: f64| DVec3::new(f * a, f * b, -f * (a * x + b * y)) * inverse;
         Projection {

@@ -94,6 +94,29 @@ fn a_checkpoint_round_trips() {
 }
 
 #[test]
+fn photographs_that_were_left_out_and_what_was_hidden_stay_so() {
+    let mut trainer = trainer();
+    assert_eq!(trainer.trained, [0, 1]);
+    trainer.trained = vec![1];
+    assert_eq!(read(&to_bytes(&trainer)).unwrap().trained, [1]);
+    // Files from before photographs could be left out train on all.
+    let older = rewritten(&to_bytes(&trainer), FORMAT, |tensors| {
+        tensors.retain(|(name, ..)| name != TRAINED)
+    });
+    assert_eq!(read(&older).unwrap().trained, [0, 1]);
+
+    let cameras = trainer.dataset.clone();
+    trainer.hidden = Hidden::from_pairs(&[0, 5, 1, 7], |view| Some(&cameras.views[view].camera)).unwrap();
+    let bytes = to_bytes(&trainer);
+    assert_eq!(read(&bytes).unwrap().hidden, trainer.hidden);
+    let elsewhere = rewritten(&bytes, FORMAT, |tensors| {
+        let (.., pairs) = tensors.iter_mut().find(|(name, ..)| name == HIDDEN).unwrap();
+        pairs[0] = 9;
+    });
+    assert!(read(&elsewhere).err().unwrap().contains("hidden_blocks"));
+}
+
+#[test]
 fn a_streamed_checkpoint_has_the_bytes_of_the_format_and_a_copy_is_that_of_its_moment() {
     let mut trainer = trainer();
     let bytes = to_bytes(&trainer);

@@ -6,8 +6,8 @@ use crate::splats::axes::{Affine, Signs};
 use crate::splats::quantize::logit;
 use crate::splats::rows::{decode_splats, plausible_count};
 use crate::splats::spz;
-use crate::{Malformed, base64, zip};
-use irradia_scene::{GaussianCloud, sh};
+use crate::{Malformed, zip};
+use irradia_scene::{GaussianCloud, base64, sh};
 use rayon::prelude::*;
 use std::borrow::Cow;
 

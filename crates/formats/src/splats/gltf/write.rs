@@ -1,10 +1,9 @@
 use super::{BIN_CHUNK, EXTENSION, GLB, JSON_CHUNK, SPZ_EXTENSIONS, harmonic};
-use crate::base64;
 use crate::splats::axes::Signs;
 use crate::splats::quantize::{normalized, sigmoid};
 use crate::splats::rows::{CHUNK, bounds, encode_rows};
 use crate::splats::{Quality, SpzVersion, spz};
-use irradia_scene::{GaussianCloud, sh};
+use irradia_scene::{GaussianCloud, base64, sh};
 use serde_json::{Map, Value, json};
 use std::io::{self, Write};
 

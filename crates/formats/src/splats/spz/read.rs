@@ -42,18 +42,23 @@ pub fn parse(bytes: &[u8]) -> Result<GaussianCloud, Malformed> {
     Ok(decode(&header, split(arrays, count, widths), Signs::HALF_TURN_X))
 }
 
-fn legacy_header(bytes: &[u8]) -> Result<Header, Malformed> {
-    let mut rest = Bytes::new(bytes);
-    if rest.take(4)? != MAGIC {
-        return Err(Malformed("not an SPZ file: its stream does not begin with NGSP".into()));
-    }
-    let header = Header {
+/// The fields that every version has, in this order.
+fn header_fields(rest: &mut Bytes) -> Result<Header, Malformed> {
+    Ok(Header {
         version: rest.u32()?,
         count: rest.u32()?,
         degree: rest.u8()?,
         fraction_bits: rest.u8()?,
         flags: rest.u8()?,
-    };
+    })
+}
+
+fn legacy_header(bytes: &[u8]) -> Result<Header, Malformed> {
+    let mut rest = Bytes::new(bytes);
+    if rest.take(4)? != MAGIC {
+        return Err(Malformed("not an SPZ file: its stream does not begin with NGSP".into()));
+    }
+    let header = header_fields(&mut rest)?;
     match header.version {
         1..=3 => checked(header),
         version => Err(Malformed(format!(
@@ -81,13 +86,7 @@ fn checked(header: Header) -> Result<Header, Malformed> {
 /// Version 4.
 fn parse_streams(bytes: &[u8]) -> Result<GaussianCloud, Malformed> {
     let mut rest = Bytes::new(&bytes[4..]);
-    let header = Header {
-        version: rest.u32()?,
-        count: rest.u32()?,
-        degree: rest.u8()?,
-        fraction_bits: rest.u8()?,
-        flags: rest.u8()?,
-    };
+    let header = header_fields(&mut rest)?;
     let (streams, table) = (usize::from(rest.u8()?), rest.u32()? as usize);
     if header.version != 4 {
         return Err(Malformed(format!(

@@ -48,10 +48,10 @@ enum Command {
     Info(command::files::InfoArgs),
     /// Convert a scene to another file format, by the end of its name, and say what it costs
     Convert(command::convert::ConvertArgs),
-    /// Edit a scene: select, delete, move, recolour, remove floaters, merge, ..
-    Edit(command::edit::Args),
     /// Make a scene small: fewer splats, trained to take the place of the others and to suit the file
     Compact(command::compact::Args),
+    /// Edit a scene: select, delete, move, recolour, remove floaters, merge, ..
+    Edit(command::edit::Args),
     /// Write a ray-traced scene as a dataset: images, depth, normals, points, cameras
     Synth(command::demo::SynthArgs),
 }
@@ -82,8 +82,8 @@ fn main() -> ExitCode {
         Command::Share(args) => command::share::run(&args),
         Command::Info(args) => command::files::info(&args),
         Command::Convert(args) => command::convert::convert(&args),
-        Command::Edit(args) => command::edit::run(&args),
         Command::Compact(args) => command::compact::run(&args),
+        Command::Edit(args) => command::edit::run(&args),
         Command::Synth(args) => command::demo::synth(&args),
     };
     match result {

@@ -29,9 +29,9 @@
 //! | view a training run from another thread | [`Run::snapshots`] |
 //! | read and render a scene | [`Scene`] |
 //! | evaluate a scene against photographs | [`evaluate`] |
-//! | edit a scene | [`Editing`] |
 //! | convert a scene to another format | [`convert`], [`write_levels`] |
 //! | make a scene small | [`CompactInput`], [`compact`] |
+//! | edit a scene | [`Editing`] |
 //! | describe a file or folder | [`describe`] |
 //!
 //! Nothing here prints: warnings are returned, or passed to observers. Random numbers come from the request's seed alone, and

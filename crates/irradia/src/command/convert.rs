@@ -44,9 +44,9 @@ pub enum QualityArg {
 impl From<QualityArg> for Quality {
     fn from(quality: QualityArg) -> Self {
         match quality {
-            QualityArg::Low => Quality::Low,
-            QualityArg::Normal => Quality::Normal,
-            QualityArg::High => Quality::High,
+            QualityArg::Low => Self::Low,
+            QualityArg::Normal => Self::Normal,
+            QualityArg::High => Self::High,
         }
     }
 }
@@ -69,7 +69,7 @@ pub fn convert(args: &ConvertArgs) -> Result<()> {
             4 => SpzVersion::V4,
             _ => SpzVersion::V3,
         },
-        palette: None,
+        sog: None,
     };
     let conversion = convert_scene(&args.input, &args.output, &options, !args.no_compare)?;
     say(format_args!(

@@ -50,6 +50,8 @@ enum Command {
     Convert(command::convert::ConvertArgs),
     /// Make a scene small: fewer splats, trained to take the place of the others and to suit the file
     Compact(command::compact::Args),
+    /// Edit a scene: select, delete, move, recolour, remove floaters, merge, ..
+    Edit(command::edit::Args),
     /// Write a ray-traced scene as a dataset: images, depth, normals, points, cameras
     Synth(command::demo::SynthArgs),
 }
@@ -81,6 +83,7 @@ fn main() -> ExitCode {
         Command::Info(args) => command::files::info(&args),
         Command::Convert(args) => command::convert::convert(&args),
         Command::Compact(args) => command::compact::run(&args),
+        Command::Edit(args) => command::edit::run(&args),
         Command::Synth(args) => command::demo::synth(&args),
     };
     match result {

@@ -1,3 +1,4 @@
+use irradia_edit::EditError;
 use irradia_formats::FormatError;
 use irradia_measure::LpipsError;
 use irradia_synth::SynthError;
@@ -24,6 +25,9 @@ pub enum RunError {
     /// The request conflicts with the content of the folder.
     #[error("{0}")]
     Refused(String),
+    /// An edit is invalid, or not possible on this scene.
+    #[error(transparent)]
+    Edit(#[from] EditError),
     /// A dataset or a scene could not be read or written.
     #[error(transparent)]
     Format(#[from] FormatError),
@@ -114,7 +118,7 @@ impl RunError {
     /// Whether the request must be changed, rather than files or the machine.
     pub fn is_request(&self) -> bool {
         match self {
-            Self::Setting { .. } | Self::Recipe(_) | Self::Refused(_) | Self::Synth(_) => true,
+            Self::Setting { .. } | Self::Recipe(_) | Self::Refused(_) | Self::Synth(_) | Self::Edit(_) => true,
             Self::Format(error) => matches!(error, FormatError::Option(_) | FormatError::UnknownSplatFormat { .. }),
             _ => false,
         }

@@ -4,6 +4,7 @@ use crate::lock::FolderLock;
 use crate::provenance::ViewList;
 use crate::{RunError, TrainInput};
 use glam::{DVec3, Quat};
+use irradia_edit::Transform;
 use irradia_formats::write_atomic;
 use irradia_scene::{Camera, Dataset, Intrinsics, Pose, Similarity};
 use irradia_train::checkpoint::Checkpoint;
@@ -188,6 +189,11 @@ impl RunFolder {
             reason: error.to_string(),
         })?;
         Ok((Self(path.to_owned()), record))
+    }
+
+    /// A folder, whether it contains a run or not.
+    pub(crate) fn at(path: &Path) -> Self {
+        Self(path.to_owned())
     }
 
     /// The folder of the run that contains the scene `path`, a file or the folder itself, whether it is complete or not.
@@ -425,4 +431,20 @@ pub(crate) fn cameras_beside(scene: &Path, world_from_dataset: &Similarity) -> O
         )
     };
     Some(records.iter().map(camera).collect())
+}
+
+/// The content of `cameras.json` beside the file `scene`, if there is one, after a move of the whole scene in the dataset's coordinates.
+pub(crate) fn cameras_moved(scene: &Path, moved: &Transform) -> Option<Vec<u8>> {
+    let text = fs::read(scene.with_file_name("cameras.json")).ok()?;
+    if moved.is_identity() {
+        return Some(text);
+    }
+    let mut records: Vec<CameraRecord> = serde_json::from_slice(&text).ok()?;
+    for record in &mut records {
+        record.position = moved.apply(DVec3::from(record.position)).to_array();
+        let [w, x, y, z] = record.rotation;
+        let turned = (moved.rotation.as_quat() * Quat::from_xyzw(x, y, z, w)).normalize();
+        record.rotation = [turned.w, turned.x, turned.y, turned.z];
+    }
+    Some(to_json(&records))
 }

@@ -31,6 +31,7 @@
 //! | evaluate a scene against photographs | [`evaluate`] |
 //! | convert a scene to another format | [`convert`], [`write_levels`] |
 //! | make a scene small | [`CompactInput`], [`compact`] |
+//! | edit a scene | [`Editing`] |
 //! | describe a file or folder | [`describe`] |
 //!
 //! Nothing here prints: warnings are returned, or passed to observers. Random numbers come from the request's seed alone, and
@@ -44,6 +45,7 @@ mod background;
 mod compact;
 mod convert;
 mod describe;
+mod edit;
 mod error;
 mod evaluate;
 mod folder;
@@ -67,6 +69,7 @@ pub use background::Background;
 pub use compact::{CompactEvent, CompactInput, CompactTarget, Compacted, compact};
 pub use convert::{COMPARED_VIEWS, Conversion, convert};
 pub use describe::describe;
+pub use edit::{EDITS, Editing, Made};
 pub use error::RunError;
 pub use evaluate::{distinct, evaluate, file_stem, file_stems, unmeasured};
 pub use folder::{FIELD, RESIDUAL, RunFolder, RunRecord, SCENE};

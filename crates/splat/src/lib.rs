@@ -17,6 +17,7 @@ mod state;
 pub(crate) use principal::eigen;
 
 pub use engine::{Engine, Noise, Placement, Update};
+pub use nearest::{Nearest, Neighbour};
 pub use render::{
     CameraGradient, FramePlanes, Gather, OutputGradient, RenderOptions, Renderer, SplatGradients, ViewParams,
 };

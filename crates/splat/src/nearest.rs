@@ -4,15 +4,16 @@
 const LEAF: usize = 12;
 
 /// Points `[N, 3]`, all finite, in the order of a balanced k-d tree: the median of each subtree splits the rest along one axis.
-pub(crate) struct Nearest {
+pub struct Nearest {
     points: Vec<([f32; 3], u32)>,
 }
 
 /// A neighbour: its squared distance and its index.
-pub(crate) type Neighbour = (f32, u32);
+pub type Neighbour = (f32, u32);
 
 impl Nearest {
-    pub(crate) fn new(positions: &[[f32; 3]]) -> Self {
+    /// The tree of `positions`.
+    pub fn new(positions: &[[f32; 3]]) -> Self {
         let mut points: Vec<_> = positions.iter().copied().zip(0..).collect();
         arrange(&mut points, 0);
         Self { points }
@@ -20,7 +21,7 @@ impl Nearest {
 
     /// The K points nearest to `at`, which may be one of them, by distance; ties are broken arbitrarily. If there are fewer than
     /// K points, the rest are at an infinite distance.
-    pub(crate) fn of<const K: usize>(&self, at: [f32; 3]) -> [Neighbour; K] {
+    pub fn of<const K: usize>(&self, at: [f32; 3]) -> [Neighbour; K] {
         let mut best = [(f32::INFINITY, u32::MAX); K];
         search(&self.points, 0, at, &mut best);
         best

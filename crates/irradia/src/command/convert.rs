@@ -44,9 +44,9 @@ pub enum QualityArg {
 impl From<QualityArg> for Quality {
     fn from(quality: QualityArg) -> Self {
         match quality {
-            QualityArg::Low => Quality::Low,
-            QualityArg::Normal => Quality::Normal,
-            QualityArg::High => Quality::High,
+            QualityArg::Low => Self::Low,
+            QualityArg::Normal => Self::Normal,
+            QualityArg::High => Self::High,
         }
     }
 }

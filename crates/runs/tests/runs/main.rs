@@ -1,6 +1,7 @@
 //! The library as a program uses it: requests, runs, observers, and scenes.
 
 mod compact;
+mod edits;
 mod every_recipe;
 mod pose;
 mod requests;

@@ -1,0 +1,146 @@
+use crate::Selection;
+use glam::{DVec3, Vec3};
+use irradia_scene::{Camera, GaussianCloud};
+use rayon::prelude::*;
+
+/// A scene that is being edited.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Draft {
+    /// The splats, hidden ones included.
+    pub cloud: GaussianCloud,
+    /// The training cameras, in the world of `cloud`; empty if they are not known. They follow the whole scene.
+    pub cameras: Vec<Camera>,
+    /// Splats that are neither drawn nor written nor selected.
+    pub hidden: Selection,
+    /// Splats that are not selected.
+    pub locked: Selection,
+}
+
+impl Draft {
+    /// A scene with nothing hidden or locked; no `cameras` if they are not known.
+    ///
+    /// # Panics
+    /// When the cloud's columns have unequal lengths.
+    pub fn new(cloud: GaussianCloud, cameras: Vec<Camera>) -> Self {
+        assert!(cloud.is_consistent(), "the columns of the cloud have unequal lengths");
+        let n = cloud.len();
+        Self {
+            cloud,
+            cameras,
+            hidden: Selection::none(n),
+            locked: Selection::none(n),
+        }
+    }
+
+    /// Number of splats, hidden ones included.
+    pub fn len(&self) -> usize {
+        self.cloud.len()
+    }
+
+    /// Whether there are no splats.
+    pub fn is_empty(&self) -> bool {
+        self.cloud.is_empty()
+    }
+
+    /// The splats without the hidden ones, as they are drawn and written.
+    pub fn shown(&self) -> GaussianCloud {
+        if self.hidden.is_empty() {
+            return self.cloud.clone();
+        }
+        let mut shown = self.hidden.clone();
+        shown.invert();
+        gather(&self.cloud, &shown.indices())
+    }
+
+    /// Median distance of the splats from their median, world units; 0 for a point.
+    pub(crate) fn extent(&self) -> f64 {
+        let means = &self.cloud.means;
+        let center = Vec3::from_array([0, 1, 2].map(|c| median(means.iter().map(|mean| mean[c]).collect())));
+        f64::from(median(
+            means.iter().map(|mean| center.distance(Vec3::from(*mean))).collect(),
+        ))
+    }
+
+    /// Centre of splat `i` in the coordinates of the dataset.
+    pub(crate) fn position(&self, i: usize) -> DVec3 {
+        let mean = DVec3::from(self.cloud.means[i].map(f64::from));
+        self.cloud.world_from_dataset.invert(mean)
+    }
+}
+
+/// The upper median; 0 of nothing.
+pub(crate) fn median(mut values: Vec<f32>) -> f32 {
+    let middle = values.len() / 2;
+    match values.is_empty() {
+        true => 0.0,
+        false => *values.select_nth_unstable_by(middle, f32::total_cmp).1,
+    }
+}
+
+/// The splats `indices`, in that order.
+pub(crate) fn gather(cloud: &GaussianCloud, indices: &[u32]) -> GaussianCloud {
+    fn rows<T: Copy + Send + Sync>(column: &[T], indices: &[u32]) -> Vec<T> {
+        indices
+            .par_iter()
+            .with_min_len(1024)
+            .map(|i| column[*i as usize])
+            .collect()
+    }
+    let width = 3 * cloud.sh_coefficients();
+    let mut harmonics = vec![0.0; indices.len() * width];
+    harmonics
+        .par_chunks_mut(width)
+        .with_min_len(1024)
+        .zip(indices)
+        .for_each(|(to, i)| to.copy_from_slice(&cloud.sh[*i as usize * width..][..width]));
+    GaussianCloud {
+        means: rows(&cloud.means, indices),
+        quats: rows(&cloud.quats, indices),
+        log_scales: rows(&cloud.log_scales, indices),
+        opacity_logits: rows(&cloud.opacity_logits, indices),
+        sh: harmonics,
+        ..empty_like(cloud)
+    }
+}
+
+/// No splats, in the world of `cloud` and with its degree.
+pub(crate) fn empty_like(cloud: &GaussianCloud) -> GaussianCloud {
+    GaussianCloud {
+        sh_degree: cloud.sh_degree,
+        antialiased: cloud.antialiased,
+        world_from_dataset: cloud.world_from_dataset,
+        ..GaussianCloud::default()
+    }
+}
+
+/// Appends the splats of `other`, which has the same world and degree.
+pub(crate) fn append(cloud: &mut GaussianCloud, other: &GaussianCloud) {
+    assert_eq!(cloud.sh_degree, other.sh_degree, "clouds of the same degree");
+    cloud.means.extend_from_slice(&other.means);
+    cloud.quats.extend_from_slice(&other.quats);
+    cloud.log_scales.extend_from_slice(&other.log_scales);
+    cloud.opacity_logits.extend_from_slice(&other.opacity_logits);
+    cloud.sh.extend_from_slice(&other.sh);
+}
+
+/// Leaves the first `n` splats.
+pub(crate) fn truncate(cloud: &mut GaussianCloud, n: usize) {
+    let width = 3 * cloud.sh_coefficients();
+    cloud.means.truncate(n);
+    cloud.quats.truncate(n);
+    cloud.log_scales.truncate(n);
+    cloud.opacity_logits.truncate(n);
+    cloud.sh.truncate(n * width);
+}
+
+/// Writes the rows of `from` over the splats `indices`.
+pub(crate) fn scatter(cloud: &mut GaussianCloud, indices: &[u32], from: &GaussianCloud) {
+    let width = 3 * cloud.sh_coefficients();
+    for (row, i) in indices.iter().map(|i| *i as usize).enumerate() {
+        cloud.means[i] = from.means[row];
+        cloud.quats[i] = from.quats[row];
+        cloud.log_scales[i] = from.log_scales[row];
+        cloud.opacity_logits[i] = from.opacity_logits[row];
+        cloud.sh[i * width..][..width].copy_from_slice(&from.sh[row * width..][..width]);
+    }
+}

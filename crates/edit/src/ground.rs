@@ -1,0 +1,141 @@
+//! The ground: the densest plane below the cameras.
+
+use crate::Draft;
+use glam::{DMat3, DVec3};
+use irradia_scene::Rng;
+use irradia_splat::sigmoid;
+use rayon::prelude::*;
+
+/// Planes that are tried, among those through three points that can be the ground.
+const TRIALS: usize = 2000;
+/// Three points that are drawn: few of them lie on a plane below all cameras.
+const DRAWS: usize = 200_000;
+/// Splats that count, chosen at random in proportion to what they cover: opacity times area.
+const SAMPLES: usize = 20_000;
+/// Half the thickness of the plane, as a fraction of the median distance of splats from their centre.
+const THICKNESS: f64 = 0.02;
+/// Cosine of the largest angle between the ground's normal and the cameras' mean up: people tilt their cameras.
+const MOST_TILT: f64 = 0.7;
+/// Largest size that counts, as a fraction of the scene's: the background's splats are huge.
+const LARGEST: f64 = 0.05;
+/// The share of splats that a ground has at least.
+const LEAST: f64 = 0.05;
+
+/// A plane.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Ground {
+    /// Unit vector that points up.
+    pub up: [f64; 3],
+    /// A point of the ground, if there is a plane.
+    pub point: Option<[f64; 3]>,
+}
+
+/// Finds up and the ground in the coordinates of the dataset: up is near the cameras' mean up, the ground the plane that contains most
+/// opacity and has the cameras above it. Without such a plane, up is that of the cameras. `None` without cameras.
+pub fn ground(draft: &Draft) -> Option<Ground> {
+    if draft.cameras.is_empty() {
+        return None;
+    }
+    let cameras = draft.cameras.iter().map(|c| c.pose);
+    let up = cameras
+        .clone()
+        .map(|pose| (pose.rotation * glam::Vec3::NEG_Y).as_dvec3());
+    let up = up.sum::<DVec3>().normalize_or(DVec3::NEG_Y);
+    let eyes: Vec<DVec3> = cameras.map(|pose| pose.position.as_dvec3()).collect();
+    let points = sample(draft);
+    let plane = densest(&points, &eyes, up);
+    let world = draft.cloud.world_from_dataset;
+    Some(Ground {
+        up: plane.map_or(up, |(normal, _)| normal).to_array(),
+        point: plane.map(|(_, point)| world.invert(point).to_array()),
+    })
+}
+
+/// Centres of splats that are not hidden, world, drawn with replacement in proportion to opacity and area.
+fn sample(draft: &Draft) -> Vec<DVec3> {
+    let cloud = &draft.cloud;
+    let mut sums = Vec::with_capacity(draft.len());
+    let mut sum = 0.0f64;
+    let largest = LARGEST * draft.extent();
+    for (i, opacity_logit) in cloud.opacity_logits.iter().enumerate() {
+        let mut sizes = cloud.log_scales[i].map(|scale| f64::from(scale).exp().min(largest));
+        sizes.sort_unstable_by(f64::total_cmp);
+        sum += match draft.hidden.contains(i) {
+            true => 0.0,
+            false => f64::from(sigmoid(*opacity_logit)) * sizes[1] * sizes[2],
+        };
+        sums.push(sum);
+    }
+    if sum <= 0.0 {
+        return Vec::new();
+    }
+    let mut rng = Rng::new(1, 0);
+    (0..SAMPLES)
+        .map(|_| {
+            let at = f64::from(rng.uniform()) * sum;
+            let i = sums.partition_point(|sum| *sum <= at).min(sums.len() - 1);
+            DVec3::from(cloud.means[i].map(f64::from))
+        })
+        .collect()
+}
+
+/// Unit normal and a point of the plane with most of `points` within its thickness (RANSAC, Fischler and Bolles 1981), refined by least
+/// squares over them.
+fn densest(points: &[DVec3], eyes: &[DVec3], up: DVec3) -> Option<(DVec3, DVec3)> {
+    if points.len() < 3 {
+        return None;
+    }
+    let center = points.iter().copied().sum::<DVec3>() / points.len() as f64;
+    let mut distances: Vec<f64> = points.iter().map(|p| p.distance(center)).collect();
+    let middle = distances.len() / 2;
+    let thickness = THICKNESS * *distances.select_nth_unstable_by(middle, f64::total_cmp).1;
+    let is_near = |(normal, origin): &(DVec3, DVec3), p: &DVec3| (*p - *origin).dot(*normal).abs() <= thickness;
+    let is_ground = |(normal, origin): &(DVec3, DVec3)| {
+        let above = eyes.iter().filter(|eye| (**eye - *origin).dot(*normal) > 0.0).count();
+        normal.dot(up) >= MOST_TILT && 10 * above >= 9 * eyes.len()
+    };
+    let mut rng = Rng::new(2, 0);
+    let trials: Vec<(DVec3, DVec3)> = (0..DRAWS)
+        .filter_map(|_| {
+            let [a, b, c] = [(); 3].map(|()| points[rng.below(points.len() as u32) as usize]);
+            let normal = (b - a).cross(c - a).try_normalize()?;
+            let plane = (normal * normal.dot(up).signum(), a);
+            is_ground(&plane).then_some(plane)
+        })
+        .take(TRIALS)
+        .collect();
+    let score = |plane: &(DVec3, DVec3)| points.iter().filter(|p| is_near(plane, p)).count();
+    let scores: Vec<usize> = trials.par_iter().map(score).collect();
+    // The first of equal ones.
+    let best = (0..trials.len()).max_by_key(|i| (scores[*i], usize::MAX - i))?;
+    let mut plane = trials[best];
+    for _ in 0..3 {
+        let inliers: Vec<DVec3> = points.iter().copied().filter(|p| is_near(&plane, p)).collect();
+        let Some(refined) = fitted(&inliers, plane.0).filter(is_ground) else {
+            break;
+        };
+        plane = refined;
+    }
+    (score(&plane) as f64 >= LEAST * points.len() as f64).then_some(plane)
+}
+
+/// The plane of least squares, with its normal on the side of `toward`.
+fn fitted(points: &[DVec3], toward: DVec3) -> Option<(DVec3, DVec3)> {
+    if points.len() < 3 {
+        return None;
+    }
+    let center = points.iter().copied().sum::<DVec3>() / points.len() as f64;
+    let mut covariance = DMat3::ZERO;
+    for p in points {
+        let d = *p - center;
+        covariance += DMat3::from_cols(d * d.x, d * d.y, d * d.z);
+    }
+    // The direction of least variance, by power iteration on the inverse, from the normal so far.
+    let trace = covariance.col(0).x + covariance.col(1).y + covariance.col(2).z;
+    let inverse = (covariance + DMat3::from_diagonal(DVec3::splat(1e-9 * trace))).inverse();
+    let mut normal = toward;
+    for _ in 0..30 {
+        normal = (inverse * normal).try_normalize()?;
+    }
+    Some((normal * normal.dot(toward).signum(), center))
+}

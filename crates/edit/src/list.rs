@@ -1,0 +1,432 @@
+//! Edits as data: a list that can be written, read, replayed and shortened.
+
+use crate::EditError;
+use crate::shape::{SelectStep, direction, finite, positive};
+use serde::{Deserialize, Serialize};
+
+/// The version of the layout that is written and read.
+const VERSION: u32 = 1;
+/// Most edits of a list, and steps of a selection.
+const MOST: usize = 10_000;
+/// Most bytes of a list.
+const MOST_BYTES: usize = 64 << 20;
+
+/// Edits in the order in which they are made. Each has the coordinates of the scene as the edits before it leave it.
+///
+/// ```
+/// use irradia_edit::EditList;
+///
+/// let list = EditList::parse(r#"
+///     version = 1
+///
+///     [[edits]]
+///     op = "delete"
+///     select = [
+///         { shape = "sphere", center = [0, 0, 0], radius = 2 },
+///         { mode = "subtract", shape = "box", center = [0, 0, 0], size = [1, 1, 1] },
+///     ]
+///
+///     [[edits]]
+///     op = "rotate"
+///     axis = [0, 0, 1]
+///     degrees = 90
+/// "#)?;
+/// assert_eq!(list.edits[1].to_string(), "rotate axis=0,0,1 degrees=90");
+/// assert_eq!(EditList::parse(&list.to_toml())?, list);
+/// # Ok::<(), irradia_edit::EditError>(())
+/// ```
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct EditList {
+    /// Version of the layout: 1.
+    pub version: u32,
+    /// The edits.
+    #[serde(default)]
+    pub edits: Vec<Edit>,
+}
+
+/// An operation on what is selected.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Edit {
+    /// What is done.
+    #[serde(flatten)]
+    pub op: Operation,
+    /// To which splats, step by step; to the whole scene if absent.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub select: Option<Vec<SelectStep>>,
+}
+
+/// What is done. Hidden and locked splats are not selected, but move with the whole scene.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "op", rename_all = "kebab-case", deny_unknown_fields)]
+pub enum Operation {
+    /// Removes the selection.
+    Delete {},
+    /// Removes everything else.
+    Keep {},
+    /// Moves by a vector.
+    Move {
+        /// The vector.
+        by: [f64; 3],
+    },
+    /// Rotates about an axis, counter-clockwise for someone whom the axis points at.
+    Rotate {
+        /// The axis.
+        axis: [f64; 3],
+        /// The angle.
+        degrees: f64,
+        /// A point of the axis; if absent the origin for the whole scene, and the selection's centre.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        about: Option<[f64; 3]>,
+    },
+    /// Scales about a point.
+    Scale {
+        /// The factor.
+        factor: f64,
+        /// The point; if absent the origin for the whole scene, and the selection's centre.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        about: Option<[f64; 3]>,
+    },
+    /// Adds a copy.
+    Duplicate {
+        /// The vector by which the copy is moved.
+        #[serde(default)]
+        by: [f64; 3],
+    },
+    /// Adds the splats of another scene.
+    Merge {
+        /// Its name: for files, a path.
+        file: String,
+    },
+    /// Turns the scene so that a direction points up, and moves it so that the ground is at height 0.
+    Upright {
+        /// What points up; from the cameras and the densest plane if absent.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        up: Option<[f64; 3]>,
+        /// A point of the ground; of the densest plane if absent, and nothing moves if `up` is given alone.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        ground: Option<[f64; 3]>,
+        /// The axis that points up then.
+        #[serde(default)]
+        axis: UpAxis,
+    },
+    /// Scales the scene about the origin such that a distance becomes known.
+    SetLength {
+        /// Its one end.
+        from: [f64; 3],
+        /// Its other end.
+        to: [f64; 3],
+        /// Its length.
+        length: f64,
+    },
+    /// Changes colours, in this order: exposure, temperature and tint as gains of the encoded colour, saturation, contrast.
+    Recolor {
+        /// Stops; 1 doubles the light.
+        #[serde(default, skip_serializing_if = "is_zero")]
+        exposure: f64,
+        /// -1 (blue) to 1 (yellow).
+        #[serde(default, skip_serializing_if = "is_zero")]
+        temperature: f64,
+        /// -1 (green) to 1 (magenta).
+        #[serde(default, skip_serializing_if = "is_zero")]
+        tint: f64,
+        /// Factor on the distance to grey; 0 is grey, 1 changes nothing.
+        #[serde(default = "one", skip_serializing_if = "is_one")]
+        saturation: f64,
+        /// Factor on the distance to middle grey; 1 changes nothing.
+        #[serde(default = "one", skip_serializing_if = "is_one")]
+        contrast: f64,
+    },
+    /// Multiplies opacities, which stay below 1.
+    Opacity {
+        /// The factor.
+        factor: f64,
+    },
+    /// Leaves the splats that matter most.
+    Reduce {
+        /// Their number.
+        count: usize,
+    },
+    /// Neither draws nor writes the selection, until it is shown again.
+    Hide {},
+    /// Shows what is hidden.
+    Show {},
+    /// Keeps the selection from being selected.
+    Lock {},
+    /// Lets what is locked be selected.
+    Unlock {},
+    /// Moves the selection into a new scene.
+    Split {
+        /// Its name, without a folder.
+        name: String,
+    },
+}
+
+/// The axis that points up in an upright scene.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub enum UpAxis {
+    /// +Y
+    #[serde(rename = "y")]
+    PlusY,
+    /// -Y, as in most splat files.
+    #[default]
+    #[serde(rename = "-y")]
+    MinusY,
+    /// +Z
+    #[serde(rename = "z")]
+    PlusZ,
+}
+
+fn one() -> f64 {
+    1.0
+}
+
+fn is_one(value: &f64) -> bool {
+    *value == 1.0
+}
+
+fn is_zero(value: &f64) -> bool {
+    *value == 0.0
+}
+
+impl Default for EditList {
+    fn default() -> Self {
+        Self {
+            version: VERSION,
+            edits: Vec::new(),
+        }
+    }
+}
+
+/// The list before its edits are read one by one, so that an error names the edit.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct RawList {
+    version: u32,
+    #[serde(default)]
+    edits: Vec<toml::Table>,
+}
+
+impl EditList {
+    /// Reads and checks the content of an `edits.toml`.
+    ///
+    /// # Errors
+    /// One line that names the edit, when it is not TOML of this layout or a number is out of range.
+    pub fn parse(text: &str) -> Result<Self, EditError> {
+        if text.len() > MOST_BYTES {
+            return Err(EditError::List(format!(
+                "it has {} bytes, at most {MOST_BYTES} are read",
+                text.len()
+            )));
+        }
+        let raw: RawList = toml::from_str(text).map_err(|error| {
+            let line = error
+                .span()
+                .map_or(1, |span| 1 + text[..span.start].matches('\n').count());
+            EditError::List(format!("line {line}: {}", error.message().replace('\n', " ")))
+        })?;
+        if raw.version != VERSION {
+            let message = format!("its version is {}, this program reads version {VERSION}", raw.version);
+            return Err(EditError::List(message));
+        }
+        let edits = raw.edits.into_iter().enumerate().map(|(i, table)| {
+            Edit::from_table(table).map_err(|reason| EditError::InList {
+                number: i + 1,
+                reason: Box::new(reason),
+            })
+        });
+        let list = Self {
+            version: raw.version,
+            edits: edits.collect::<Result<_, _>>()?,
+        };
+        list.check()?;
+        Ok(list)
+    }
+
+    /// The content of an `edits.toml`.
+    ///
+    /// # Panics
+    /// Never: a list is representable.
+    pub fn to_toml(&self) -> String {
+        toml::to_string(self).expect("plain data")
+    }
+
+    /// Whether every edit is possible on some scene.
+    ///
+    /// # Errors
+    /// [`EditError::InList`] for the first that is not.
+    pub fn check(&self) -> Result<(), EditError> {
+        if self.edits.len() > MOST {
+            return Err(EditError::List(format!(
+                "it has {} edits, at most {MOST} are made",
+                self.edits.len()
+            )));
+        }
+        for (i, edit) in self.edits.iter().enumerate() {
+            edit.check().map_err(|reason| EditError::InList {
+                number: i + 1,
+                reason: Box::new(reason),
+            })?;
+        }
+        Ok(())
+    }
+}
+
+impl Edit {
+    /// An operation on the whole scene.
+    pub fn of_scene(op: Operation) -> Self {
+        Self { op, select: None }
+    }
+
+    /// An operation on what `steps` select.
+    pub fn of(op: Operation, steps: impl Into<Vec<SelectStep>>) -> Self {
+        Self {
+            op,
+            select: Some(steps.into()),
+        }
+    }
+
+    pub(crate) fn from_table(table: toml::Table) -> Result<Self, EditError> {
+        let edit: Self = table
+            .try_into()
+            .map_err(|error: toml::de::Error| EditError::Words(error.message().replace('\n', " ")))?;
+        edit.check()?;
+        Ok(edit)
+    }
+
+    /// Whether every number is in range, and the operation and its selection fit.
+    ///
+    /// # Errors
+    /// One line that names the key.
+    pub fn check(&self) -> Result<(), EditError> {
+        let name = self.op.name();
+        match (&self.select, self.op.needs()) {
+            (None, Needs::Selection) => {
+                let example = "such as: sphere center=0,0,0 radius=1";
+                return Err(EditError::Selection(format!("{name} needs a selection, {example}")));
+            }
+            (Some(_), Needs::Scene) => {
+                return Err(EditError::Selection(format!(
+                    "{name} is of the whole scene and has no selection"
+                )));
+            }
+            _ => {}
+        }
+        let steps = self.select.as_deref().unwrap_or_default();
+        if steps.len() > MOST {
+            let message = format!("has {} steps, at most {MOST} are made", steps.len());
+            return Err(EditError::value(format!("{name} select"), message));
+        }
+        steps.iter().try_for_each(SelectStep::check)?;
+        match &self.op {
+            Operation::Move { by } | Operation::Duplicate { by } => finite(&format!("{name} by"), by),
+            Operation::Rotate { axis, degrees, about } => {
+                direction("rotate axis", axis)?;
+                finite("rotate degrees", &[*degrees])?;
+                finite("rotate about", about.as_ref().map_or(&[], |v| v))
+            }
+            Operation::Scale { factor, about } => {
+                positive("scale factor", *factor)?;
+                finite("scale about", about.as_ref().map_or(&[], |v| v))
+            }
+            Operation::Upright { up, ground, .. } => {
+                up.as_ref().map_or(Ok(()), |up| direction("upright up", up))?;
+                finite("upright ground", ground.as_ref().map_or(&[], |v| v))
+            }
+            Operation::SetLength { from, to, length } => {
+                direction("set-length to - from", &std::array::from_fn(|c| to[c] - from[c]))?;
+                finite("set-length from", from)?;
+                positive("set-length length", *length)
+            }
+            Operation::Recolor {
+                exposure,
+                temperature,
+                tint,
+                saturation,
+                contrast,
+            } => {
+                within("recolor exposure", *exposure, -20.0, 20.0)?;
+                within("recolor temperature", *temperature, -1.0, 1.0)?;
+                within("recolor tint", *tint, -1.0, 1.0)?;
+                within("recolor saturation", *saturation, 0.0, 100.0)?;
+                within("recolor contrast", *contrast, 0.0, 100.0)
+            }
+            Operation::Opacity { factor } => within("opacity factor", *factor, 0.0, 1e6),
+            Operation::Merge { file } => {
+                let is_plain = !file.is_empty() && file.len() <= 4096 && !file.chars().any(char::is_control);
+                match is_plain {
+                    true => Ok(()),
+                    false => Err(EditError::value("merge file", "must be the path of a scene")),
+                }
+            }
+            Operation::Split { name } => {
+                let is_plain = !name.is_empty()
+                    && name.len() <= 200
+                    && !name.starts_with('.')
+                    && !name.chars().any(|c| c.is_control() || "/\\:*?\"<>|".contains(c));
+                match is_plain {
+                    true => Ok(()),
+                    false => Err(EditError::value(
+                        "split name",
+                        "must be the name of a file, without a folder",
+                    )),
+                }
+            }
+            Operation::Reduce { count: 0 } => Err(EditError::value("reduce count", "must be 1 or more")),
+            Operation::Delete {}
+            | Operation::Keep {}
+            | Operation::Reduce { .. }
+            | Operation::Hide {}
+            | Operation::Show {}
+            | Operation::Lock {}
+            | Operation::Unlock {} => Ok(()),
+        }
+    }
+}
+
+fn within(name: &str, value: f64, low: f64, high: f64) -> Result<(), EditError> {
+    match (low..=high).contains(&value) {
+        true => Ok(()),
+        false => Err(EditError::value(name, format!("must be {low} to {high}"))),
+    }
+}
+
+/// What an operation is made of.
+enum Needs {
+    Selection,
+    Scene,
+    Either,
+}
+
+impl Operation {
+    /// Its name in lists.
+    pub fn name(&self) -> &'static str {
+        match self {
+            Self::Delete {} => "delete",
+            Self::Keep {} => "keep",
+            Self::Move { .. } => "move",
+            Self::Rotate { .. } => "rotate",
+            Self::Scale { .. } => "scale",
+            Self::Duplicate { .. } => "duplicate",
+            Self::Merge { .. } => "merge",
+            Self::Upright { .. } => "upright",
+            Self::SetLength { .. } => "set-length",
+            Self::Recolor { .. } => "recolor",
+            Self::Opacity { .. } => "opacity",
+            Self::Reduce { .. } => "reduce",
+            Self::Hide {} => "hide",
+            Self::Show {} => "show",
+            Self::Lock {} => "lock",
+            Self::Unlock {} => "unlock",
+            Self::Split { .. } => "split",
+        }
+    }
+
+    fn needs(&self) -> Needs {
+        match self {
+            Self::Delete {} | Self::Keep {} | Self::Hide {} | Self::Lock {} | Self::Split { .. } => Needs::Selection,
+            Self::Merge { .. } | Self::Upright { .. } | Self::SetLength { .. } => Needs::Scene,
+            _ => Needs::Either,
+        }
+    }
+}

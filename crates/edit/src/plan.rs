@@ -1,0 +1,362 @@
+//! Operations: first everything that may fail, then the change itself.
+
+use crate::color::ColorMap;
+use crate::draft::{append, gather};
+use crate::ground::ground;
+use crate::select::{select, select_among};
+use crate::transform::{transform_scene, transform_splats};
+use crate::{Draft, Edit, EditError, Operation, Selection, Transform, UpAxis};
+use glam::{DQuat, DVec3};
+use irradia_scene::GaussianCloud;
+use irradia_splat::{logit, sigmoid};
+use rayon::prelude::*;
+
+/// Opens the scenes that [`Operation::Merge`] names; an error is one line.
+pub type Open<'a> = &'a dyn Fn(&str) -> Result<GaussianCloud, String>;
+
+/// For edits that must not read other scenes.
+pub fn open_nothing(file: &str) -> Result<GaussianCloud, String> {
+    Err(format!("{file} cannot be opened here"))
+}
+
+/// From where the splats of an edited scene come.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Provenance {
+    /// For each splat its number before, or [`Provenance::NEW`]; `None` if they are the same splats in the same order.
+    pub sources: Option<Vec<u32>>,
+    /// The splats whose numbers differ from those of their source; new ones that are not copies included.
+    pub changed: Selection,
+}
+
+impl Provenance {
+    /// A splat that was not there.
+    pub const NEW: u32 = u32::MAX;
+
+    /// Of a scene of `n` splats in which nothing changed.
+    pub fn identity(n: usize) -> Self {
+        Self {
+            sources: None,
+            changed: Selection::none(n),
+        }
+    }
+
+    /// The number before of splat `i`, if it was there.
+    pub fn source(&self, i: usize) -> Option<u32> {
+        match &self.sources {
+            None => Some(i as u32),
+            Some(sources) => Some(sources[i]).filter(|source| *source != Self::NEW),
+        }
+    }
+
+    /// Of this edit and then `next`.
+    pub fn then(&self, next: &Self) -> Self {
+        let n = next.changed.len();
+        let changed = Selection::of(n, |i| {
+            let before = next.source(i);
+            next.changed.contains(i) || before.is_none_or(|i| self.changed.contains(i as usize))
+        });
+        let sources = (self.sources.is_some() || next.sources.is_some()).then(|| {
+            let source = |i| next.source(i).and_then(|before| self.source(before as usize));
+            (0..n).map(|i| source(i).unwrap_or(Self::NEW)).collect()
+        });
+        Self { sources, changed }
+    }
+}
+
+/// What an edit did.
+#[derive(Clone, Debug)]
+pub struct Applied {
+    /// The edit with everything that was found automatically written out, so that it can be made again in the same way.
+    pub edit: Edit,
+    /// From where the splats come.
+    pub provenance: Provenance,
+    /// Number of splats that were selected; all if the edit is of the whole scene.
+    pub selected: usize,
+    /// How the whole scene was moved, in the dataset's coordinates, if it was: for what else stands in it. The draft's cameras have followed.
+    pub moved: Option<Transform>,
+    /// The scene that was split off, with its name.
+    pub split: Option<(String, GaussianCloud)>,
+}
+
+/// Makes an edit. If it fails, nothing has changed.
+///
+/// # Errors
+/// When the edit is invalid or not possible on this scene.
+pub fn apply(draft: &mut Draft, edit: &Edit, open: Open) -> Result<Applied, EditError> {
+    Ok(Plan::new(draft, edit, open)?.carry_out(draft))
+}
+
+/// An edit of which nothing can fail any more.
+pub(crate) struct Plan {
+    edit: Edit,
+    selected: usize,
+    pub(crate) change: Change,
+}
+
+/// What happens to the splats.
+pub(crate) enum Change {
+    Remove(Selection),
+    /// Removes the splats, and gives them to a new scene of this name.
+    Split(Selection, String),
+    Transform(Selection, Transform),
+    TransformScene(Transform),
+    Recolor(Selection, ColorMap),
+    Fade(Selection, f64),
+    /// New splats, with their sources.
+    Append(GaussianCloud, Vec<u32>),
+    Hide(Selection, bool),
+    Lock(Selection, bool),
+    Nothing,
+}
+
+impl Plan {
+    pub fn new(draft: &Draft, edit: &Edit, open: Open) -> Result<Self, EditError> {
+        edit.check()?;
+        let mut edit = edit.clone();
+        let n = draft.len();
+        let selection = match (&edit.op, &edit.select) {
+            (Operation::Show {}, steps) => among(draft, &draft.hidden, steps.as_deref())?,
+            (Operation::Unlock {}, steps) => among(draft, &draft.locked, steps.as_deref())?,
+            (_, Some(steps)) => select(draft, steps)?,
+            (_, None) => Selection::all(n),
+        };
+        let is_scene = edit.select.is_none();
+        let selected = selection.count();
+        let transformed = |transform: Transform, selection: Selection| match is_scene {
+            _ if transform.is_identity() => Change::Nothing,
+            true => Change::TransformScene(transform),
+            false => Change::Transform(selection, transform),
+        };
+        // The origin for the whole scene, otherwise the selection's centre.
+        let pivot = |about: &mut Option<[f64; 3]>| {
+            let center = || {
+                if is_scene {
+                    DVec3::ZERO
+                } else {
+                    center_of(draft, &selection)
+                }
+            };
+            DVec3::from(*about.get_or_insert_with(|| center().to_array()))
+        };
+        let change = match &mut edit.op {
+            Operation::Delete {} => Change::Remove(selection),
+            Operation::Keep {} => {
+                let mut rest = selection;
+                rest.add(&draft.hidden);
+                rest.add(&draft.locked);
+                rest.invert();
+                Change::Remove(rest)
+            }
+            Operation::Move { by } => transformed(Transform::translation((*by).into()), selection),
+            Operation::Rotate { axis, degrees, about } => {
+                let rotation = match *degrees % 360.0 == 0.0 {
+                    true => DQuat::IDENTITY,
+                    false => DQuat::from_axis_angle(DVec3::from(*axis).normalize(), degrees.to_radians()),
+                };
+                let transform = match rotation == DQuat::IDENTITY {
+                    true => Transform::IDENTITY,
+                    false => Transform::about(pivot(about), 1.0, rotation),
+                };
+                transformed(transform, selection)
+            }
+            Operation::Scale { factor, about } => {
+                let transform = match *factor == 1.0 {
+                    true => Transform::IDENTITY,
+                    false => Transform::about(pivot(about), *factor, DQuat::IDENTITY),
+                };
+                transformed(transform, selection)
+            }
+            Operation::Upright {
+                up,
+                ground: point,
+                axis,
+            } => {
+                if up.is_none() {
+                    let found = ground(draft).ok_or(EditError::NoCameras("upright without up"))?;
+                    *up = Some(found.up);
+                    *point = point.or(found.point);
+                }
+                transformed(upright(up.unwrap_or_default(), *point, *axis), selection)
+            }
+            Operation::SetLength { from, to, length } => {
+                let factor = *length / DVec3::from(*from).distance(DVec3::from(*to));
+                if !(1e-12..=1e12).contains(&factor) {
+                    let message = "would scale the scene by more than 1e12; check from, to and length";
+                    return Err(EditError::value("set-length length", message));
+                }
+                let transform = Transform::about(DVec3::ZERO, factor, DQuat::IDENTITY);
+                transformed(transform, selection)
+            }
+            Operation::Duplicate { by } => {
+                let sources = selection.indices();
+                let mut copy = gather(&draft.cloud, &sources);
+                let all = Selection::all(copy.len());
+                transform_splats(&mut copy, &all, &Transform::translation((*by).into()));
+                Change::Append(copy, sources)
+            }
+            Operation::Merge { file } => {
+                let mut other = open(file).map_err(EditError::Source)?;
+                if !other.is_consistent() {
+                    return Err(EditError::Source(format!("{file} has columns of unequal lengths")));
+                }
+                other.bring_to_world(draft.cloud.world_from_dataset);
+                let new = vec![Provenance::NEW; other.len()];
+                Change::Append(other, new)
+            }
+            op @ Operation::Recolor { .. } => match ColorMap::of(op) {
+                map if map.is_identity() => Change::Nothing,
+                map => Change::Recolor(selection, map),
+            },
+            Operation::Opacity { factor } if *factor == 1.0 => Change::Nothing,
+            Operation::Opacity { factor } => Change::Fade(selection, *factor),
+            Operation::Reduce { count } => Change::Remove(least_important(draft, selection, *count)),
+            Operation::Hide {} => Change::Hide(selection, true),
+            Operation::Show {} => Change::Hide(selection, false),
+            Operation::Lock {} => Change::Lock(selection, true),
+            Operation::Unlock {} => Change::Lock(selection, false),
+            Operation::Split { name } => Change::Split(selection, name.clone()),
+        };
+        let grown = match &change {
+            Change::Append(cloud, _) => n + cloud.len(),
+            _ => n,
+        };
+        if grown >= Provenance::NEW as usize {
+            return Err(EditError::Scene(format!(
+                "the scene would have {grown} splats, at most 4294967294 are possible"
+            )));
+        }
+        Ok(Self { edit, selected, change })
+    }
+
+    pub fn carry_out(self, draft: &mut Draft) -> Applied {
+        let n = draft.len();
+        let mut provenance = Provenance::identity(n);
+        let (mut moved, mut split) = (None, None);
+        match self.change {
+            Change::Remove(selection) => provenance = remove(draft, selection),
+            Change::Split(selection, name) => {
+                split = Some((name, gather(&draft.cloud, &selection.indices())));
+                provenance = remove(draft, selection);
+            }
+            Change::Transform(selection, transform) => {
+                transform_splats(&mut draft.cloud, &selection, &transform);
+                provenance.changed = selection;
+            }
+            Change::TransformScene(transform) => {
+                transform_scene(draft, &transform);
+                (moved, provenance.changed) = (Some(transform), Selection::all(n));
+            }
+            Change::Recolor(selection, map) => {
+                let width = 3 * draft.cloud.sh_coefficients();
+                let rows = draft.cloud.sh.par_chunks_exact_mut(width).zip(selection.as_slice());
+                rows.filter(|(_, s)| **s).for_each(|(row, _)| map.apply(row));
+                provenance.changed = selection;
+            }
+            Change::Fade(selection, factor) => {
+                let rows = draft.cloud.opacity_logits.iter_mut().zip(selection.as_slice());
+                rows.filter(|(_, s)| **s)
+                    .for_each(|(value, _)| *value = faded(*value, factor));
+                provenance.changed = selection;
+            }
+            Change::Append(mut cloud, new) => {
+                let degree = draft.cloud.sh_degree.max(cloud.sh_degree);
+                draft.cloud.set_degree(degree);
+                cloud.set_degree(degree);
+                append(&mut draft.cloud, &cloud);
+                draft.hidden.append(new.len());
+                draft.locked.append(new.len());
+                provenance = Provenance {
+                    sources: Some((0..n as u32).chain(new.iter().copied()).collect()),
+                    changed: Selection::of(n + new.len(), |i| i >= n),
+                };
+            }
+            Change::Hide(selection, true) => draft.hidden.add(&selection),
+            Change::Hide(selection, false) => draft.hidden.subtract(&selection),
+            Change::Lock(selection, true) => draft.locked.add(&selection),
+            Change::Lock(selection, false) => draft.locked.subtract(&selection),
+            Change::Nothing => {}
+        }
+        Applied {
+            edit: self.edit,
+            provenance,
+            selected: self.selected,
+            moved,
+            split,
+        }
+    }
+}
+
+/// What `steps` select among `marked`; all of them if there are no steps.
+fn among(draft: &Draft, marked: &Selection, steps: Option<&[crate::SelectStep]>) -> Result<Selection, EditError> {
+    steps.map_or_else(|| Ok(marked.clone()), |steps| select_among(draft, steps, marked))
+}
+
+fn remove(draft: &mut Draft, selection: Selection) -> Provenance {
+    if selection.is_empty() {
+        return Provenance::identity(draft.len());
+    }
+    let mut kept = selection;
+    kept.invert();
+    let kept = kept.indices();
+    draft.cloud = gather(&draft.cloud, &kept);
+    draft.hidden = draft.hidden.gather(&kept);
+    draft.locked = draft.locked.gather(&kept);
+    Provenance {
+        changed: Selection::none(kept.len()),
+        sources: Some(kept),
+    }
+}
+
+/// Mean position of the selected splats.
+fn center_of(draft: &Draft, selection: &Selection) -> DVec3 {
+    let indices = selection.indices();
+    let sum: DVec3 = indices.iter().map(|i| draft.position(*i as usize)).sum();
+    sum / indices.len().max(1) as f64
+}
+
+/// The logit of an opacity times `factor`.
+fn faded(opacity_logit: f32, factor: f64) -> f32 {
+    let opacity = f64::from(sigmoid(opacity_logit)) * factor;
+    logit(opacity.clamp(1e-6, 0.9999) as f32)
+}
+
+/// The turn of `up` to the axis, and the move of the ground to height 0.
+fn upright(up: [f64; 3], ground: Option<[f64; 3]>, axis: UpAxis) -> Transform {
+    let to = match axis {
+        UpAxis::PlusY => DVec3::Y,
+        UpAxis::MinusY => DVec3::NEG_Y,
+        UpAxis::PlusZ => DVec3::Z,
+    };
+    let up = DVec3::from(up).normalize();
+    let rotation = match (up - to).length() < 1e-12 {
+        true => DQuat::IDENTITY,
+        false => DQuat::from_rotation_arc(up, to),
+    };
+    let height = ground.map_or(0.0, |ground| to.dot(rotation * DVec3::from(ground)));
+    Transform {
+        scale: 1.0,
+        rotation,
+        translation: -height * to,
+    }
+}
+
+/// Of the selected splats those that matter least, all but `count`.
+fn least_important(draft: &Draft, selection: Selection, count: usize) -> Selection {
+    let cloud = &draft.cloud;
+    let importance = |i: &u32| {
+        let mut scales = cloud.log_scales[*i as usize];
+        scales.sort_unstable_by(f32::total_cmp);
+        // ln of the opacity times the area of the largest cross section.
+        (
+            sigmoid(cloud.opacity_logits[*i as usize]).ln() + scales[1] + scales[2],
+            *i,
+        )
+    };
+    let mut order: Vec<(f32, u32)> = selection.indices().par_iter().map(importance).collect();
+    order.par_sort_unstable_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
+    let mut least = Selection::none(draft.len());
+    for (_, i) in order.iter().skip(count) {
+        least.set(*i as usize, true);
+    }
+    least
+}

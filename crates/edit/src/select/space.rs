@@ -1,0 +1,125 @@
+//! Neighbourhood: growing, connection, clusters. Cells of a grid stand for their splats, so that the cost is that of the splats.
+
+use crate::{Draft, Selection};
+use glam::DVec3;
+use irradia_splat::Nearest;
+use rayon::prelude::*;
+use std::collections::HashMap;
+
+/// Factor on the median distance of neighbours for a gap that is not given.
+const USUAL_GAP: f64 = 4.0;
+
+/// A cell of a grid: its corner in units of its side.
+type Cell = [i64; 3];
+
+fn cell_of(position: DVec3, side: f64) -> Cell {
+    // Saturates, so that distant splats share a cell.
+    (position / side).floor().to_array().map(|v| v as i64)
+}
+
+/// The cells that touch `cell`, itself included.
+fn around(cell: Cell) -> impl Iterator<Item = Cell> {
+    (0..27).map(move |i| {
+        let step = [i % 3, i / 3 % 3, i / 9];
+        std::array::from_fn(|c| cell[c].saturating_add(step[c] - 1))
+    })
+}
+
+/// What is selected, and all splats within `by` of it.
+pub(super) fn grown(draft: &Draft, selected: &Selection, by: f64) -> Selection {
+    let mut cells: HashMap<Cell, Vec<DVec3>> = HashMap::new();
+    for i in selected.indices() {
+        let position = draft.position(i as usize);
+        cells.entry(cell_of(position, by)).or_default().push(position);
+    }
+    Selection::of(draft.len(), |i| {
+        let position = draft.position(i);
+        let mut near = around(cell_of(position, by))
+            .filter_map(|cell| cells.get(&cell))
+            .flatten();
+        selected.contains(i) || near.any(|other| other.distance(position) <= by)
+    })
+}
+
+/// The component of each splat, where cells of side `gap` that touch are connected, and the number of splats in each.
+struct Components {
+    of: Vec<u32>,
+    sizes: Vec<usize>,
+}
+
+fn components(draft: &Draft, gap: Option<f64>) -> Components {
+    let side = gap
+        .unwrap_or_else(|| USUAL_GAP * usual_distance(draft))
+        .max(f64::MIN_POSITIVE);
+    let mut numbers: HashMap<Cell, u32> = HashMap::new();
+    let mut cells: Vec<Cell> = Vec::new();
+    let cell_of_splat: Vec<u32> = (0..draft.len())
+        .map(|i| {
+            let cell = cell_of(draft.position(i), side);
+            *numbers.entry(cell).or_insert_with(|| {
+                cells.push(cell);
+                cells.len() as u32 - 1
+            })
+        })
+        .collect();
+    // Flood from cell to cell, in the order of the splats.
+    let mut component = vec![u32::MAX; cells.len()];
+    let mut count = 0;
+    for start in 0..cells.len() {
+        if component[start] != u32::MAX {
+            continue;
+        }
+        component[start] = count;
+        let mut open = vec![start];
+        while let Some(cell) = open.pop() {
+            for next in around(cells[cell]).filter_map(|near| numbers.get(&near)) {
+                let next = *next as usize;
+                if component[next] == u32::MAX {
+                    component[next] = count;
+                    open.push(next);
+                }
+            }
+        }
+        count += 1;
+    }
+    let of: Vec<u32> = cell_of_splat.iter().map(|cell| component[*cell as usize]).collect();
+    let mut sizes = vec![0; count as usize];
+    of.iter().for_each(|component| sizes[*component as usize] += 1);
+    Components { of, sizes }
+}
+
+/// What is selected, and everything connected to it.
+pub(super) fn connected(draft: &Draft, selected: &Selection, gap: Option<f64>) -> Selection {
+    let components = components(draft, gap);
+    let mut reached = vec![false; components.sizes.len()];
+    for i in selected.indices() {
+        reached[components.of[i as usize] as usize] = true;
+    }
+    Selection::of(draft.len(), |i| reached[components.of[i] as usize])
+}
+
+/// The splats in components of `min` to `max` splats.
+pub(super) fn clusters(draft: &Draft, min: Option<usize>, max: Option<usize>, gap: Option<f64>) -> Selection {
+    let components = components(draft, gap);
+    let range = min.unwrap_or(0)..=max.unwrap_or(usize::MAX);
+    Selection::of(draft.len(), |i| {
+        range.contains(&components.sizes[components.of[i] as usize])
+    })
+}
+
+/// Median distance of splats to their nearest neighbours, dataset units; 1 if there are no two.
+pub(crate) fn usual_distance(draft: &Draft) -> f64 {
+    let means = &draft.cloud.means;
+    if means.len() < 2 {
+        return 1.0;
+    }
+    let tree = Nearest::new(means);
+    let mut squares: Vec<f32> = means
+        .par_iter()
+        .with_min_len(1024)
+        .map(|mean| tree.of::<2>(*mean)[1].0)
+        .collect();
+    let middle = squares.len() / 2;
+    let square = *squares.select_nth_unstable_by(middle, f32::total_cmp).1;
+    f64::from(square).sqrt().max(1e-9) / draft.cloud.world_from_dataset.scale
+}

@@ -1,0 +1,135 @@
+//! What cameras see of each splat.
+
+use crate::draft::gather;
+use crate::{Draft, Selection};
+use glam::Vec3;
+use irradia_scene::Camera;
+use irradia_splat::{Gather, OutputGradient, RenderOptions, Renderer, SplatGradients, Splats, ViewParams};
+use rayon::prelude::*;
+
+/// Longest side of the pictures, pixels.
+const SIDE: f32 = 480.0;
+/// From how many pixels on a splat counts as seen; its blending weights count, so that a hidden splat has none.
+pub(crate) const SEEN: f32 = 0.25;
+/// Pixels of less alpha have no depth.
+const COVERED: f32 = 0.5;
+
+/// Renders small pictures of some splats.
+pub(crate) struct Observer {
+    splats: Splats,
+    /// The draft's number of each splat.
+    numbers: Vec<u32>,
+    /// Splats of the draft.
+    count: usize,
+    options: RenderOptions,
+    renderer: Renderer,
+    gradients: SplatGradients,
+    zeros: Vec<f32>,
+}
+
+/// Mean depth along +Z in each pixel of a picture.
+pub(crate) struct Depths {
+    camera: Camera,
+    /// `[H, W]`, world units; infinite where nothing is.
+    depth: Vec<f32>,
+}
+
+impl Depths {
+    /// Number of pixels.
+    pub fn len(&self) -> usize {
+        self.depth.len()
+    }
+
+    /// The depth that the picture shows in the direction of a point, and the point's own; `None` if it is outside the picture.
+    pub fn at(&self, point: Vec3) -> Option<[f32; 2]> {
+        let (pixel, depth) = self.camera.project(point)?;
+        let k = &self.camera.intrinsics;
+        let inside = pixel.x >= 0.0 && pixel.y >= 0.0 && pixel.x < k.width as f32 && pixel.y < k.height as f32;
+        inside.then(|| {
+            let at = pixel.y as usize * k.width as usize + pixel.x as usize;
+            [self.depth[at], depth]
+        })
+    }
+}
+
+impl Observer {
+    /// Of the splats `of`.
+    pub fn new(draft: &Draft, of: &Selection) -> Self {
+        let numbers = of.indices();
+        Self {
+            splats: Splats::from_cloud(&gather(&draft.cloud, &numbers)),
+            numbers,
+            count: draft.len(),
+            options: RenderOptions {
+                antialias: draft.cloud.antialiased,
+                depth: true,
+                // Colours do not matter.
+                sh_degree: 0,
+                ..RenderOptions::default()
+            },
+            renderer: Renderer::new(),
+            gradients: SplatGradients::default(),
+            zeros: Vec::new(),
+        }
+    }
+
+    fn render(&mut self, camera: &Camera) -> Camera {
+        let k = camera.intrinsics;
+        let longest = k.width.max(k.height) as f32;
+        let camera = Camera {
+            intrinsics: k.scaled((SIDE / longest).min(1.0)),
+            ..*camera
+        };
+        self.renderer
+            .render(&self.splats, &ViewParams::new(&camera), &self.options);
+        camera
+    }
+
+    /// The depths that `camera` sees.
+    pub fn depths(&mut self, camera: &Camera) -> Depths {
+        let camera = self.render(camera);
+        let pixels = self.renderer.depth().iter().zip(self.renderer.alpha());
+        let mean = |(depth, alpha): (&f32, &f32)| match *alpha >= COVERED {
+            true => depth / alpha,
+            false => f32::INFINITY,
+        };
+        Depths {
+            camera,
+            depth: pixels.map(mean).collect(),
+        }
+    }
+
+    /// The sum of each splat's blending weights in the view of `camera`, pixels; zero for splats that are not rendered.
+    pub fn weights(&mut self, camera: &Camera) -> Vec<f32> {
+        self.render(camera);
+        let pixels = self.renderer.alpha().len();
+        self.zeros.resize(3 * pixels, 0.0);
+        // The backward pass adds up blending weights for density control.
+        let gradient = OutputGradient {
+            gather: Gather::Error(&self.zeros[..pixels]),
+            ..OutputGradient::of_color(&self.zeros[..3 * pixels])
+        };
+        self.renderer.backward(&self.splats, &gradient, &mut self.gradients);
+        let mut weights = vec![0.0; self.count];
+        for (i, number) in self.numbers.iter().enumerate() {
+            if self.gradients.active[i] > 0.0 {
+                weights[*number as usize] = self.gradients.gathered.get(1, i);
+            }
+        }
+        weights
+    }
+}
+
+/// The number of the draft's cameras that see each splat.
+pub(crate) fn views_that_see(draft: &Draft) -> Vec<u32> {
+    let mut shown = draft.hidden.clone();
+    shown.invert();
+    let mut observer = Observer::new(draft, &shown);
+    let mut views = vec![0; draft.len()];
+    for camera in &draft.cameras {
+        let weights = observer.weights(camera);
+        let each = views.par_iter_mut().zip(weights).with_min_len(1024);
+        each.for_each(|(views, weight)| *views += u32::from(weight >= SEEN));
+    }
+    views
+}

@@ -1,0 +1,143 @@
+//! Edits in one line, for command lines and lists of what was done:
+//!
+//! ```text
+//! OPERATION [KEY=VALUE ..] [[+|-|&]SHAPE [KEY=VALUE ..]] ..
+//! ```
+//!
+//! `+` adds a shape to the selection (as no sign does), `-` subtracts it, `&` intersects. Values are numbers, words, vectors
+//! (`1,2,3`) and lists of vectors (`0,0;1,0;1,1`, a single one as `0,0;`); `camera.size=640,480` is a key of a table. The words stand for the same keys
+//! as in TOML, so that a new operation or shape needs nothing here.
+
+use crate::{Edit, EditError};
+use std::fmt;
+use std::str::FromStr;
+use toml::{Table, Value};
+
+impl FromStr for Edit {
+    type Err = EditError;
+
+    fn from_str(text: &str) -> Result<Self, EditError> {
+        let mut words = text.split_whitespace();
+        let op = words.next().ok_or_else(|| {
+            EditError::Words("an empty edit: name an operation, such as: delete sphere center=0,0,0 radius=1".into())
+        })?;
+        if op.contains('=') {
+            return Err(EditError::Words(format!(
+                "{op}: an edit begins with its operation, such as delete"
+            )));
+        }
+        let mut edit = Table::from_iter([("op".to_owned(), Value::from(op))]);
+        let mut steps: Vec<Table> = Vec::new();
+        for word in words {
+            match word.split_once('=') {
+                Some((key, text)) => {
+                    let table = steps.last_mut().unwrap_or(&mut edit);
+                    insert(table, key, value(text))
+                        .map_err(|why| EditError::Words(format!("{word}: {why}; a key is written KEY=VALUE")))?;
+                }
+                None => {
+                    let (mode, shape) = match word.split_at_checked(1) {
+                        Some(("+", shape)) => ("add", shape),
+                        Some(("-", shape)) => ("subtract", shape),
+                        Some(("&", shape)) => ("intersect", shape),
+                        _ => ("add", word),
+                    };
+                    let entries = [("mode", mode), ("shape", shape)];
+                    steps.push(entries.into_iter().map(|(k, v)| (k.to_owned(), v.into())).collect());
+                }
+            }
+        }
+        if !steps.is_empty() {
+            let steps = steps.into_iter().map(Value::Table).collect();
+            edit.insert("select".into(), Value::Array(steps));
+        }
+        Edit::from_table(edit)
+    }
+}
+
+/// Puts `value` under `key`, whose dots open tables.
+fn insert(table: &mut Table, key: &str, value: Value) -> Result<(), &'static str> {
+    let reserved = ["op", "select", "mode", "shape"];
+    if key.is_empty() || reserved.contains(&key) {
+        return Err("not a key");
+    }
+    let Some((outer, inner)) = key.split_once('.') else {
+        return match table.insert(key.to_owned(), value) {
+            None => Ok(()),
+            Some(_) => Err("given twice"),
+        };
+    };
+    let entry = table.entry(outer).or_insert_with(|| Value::Table(Table::new()));
+    insert(entry.as_table_mut().ok_or("given twice")?, inner, value)
+}
+
+/// A number, a vector, a list of vectors, a truth value, otherwise a word.
+fn value(text: &str) -> Value {
+    let number = |text: &str| {
+        let whole = text.parse().map(Value::Integer);
+        whole.or_else(|_| text.parse().map(Value::Float)).ok()
+    };
+    let vector = |text: &str| -> Option<Value> {
+        let numbers: Option<Vec<Value>> = text.split(',').map(number).collect();
+        Some(Value::Array(numbers?))
+    };
+    let found = if text.contains(';') {
+        let vectors: Option<Vec<Value>> = text.split(';').filter(|v| !v.is_empty()).map(vector).collect();
+        vectors.map(Value::Array)
+    } else if text.contains(',') {
+        vector(text)
+    } else {
+        text.parse().map(Value::Boolean).ok().or_else(|| number(text))
+    };
+    found.unwrap_or_else(|| text.into())
+}
+
+impl fmt::Display for Edit {
+    /// The edit in one line, which parses to the same edit unless a name contains spaces.
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        let mut edit = Table::try_from(self).map_err(|_| fmt::Error)?;
+        f.write_str(self.op.name())?;
+        let select = edit.remove("select");
+        edit.remove("op");
+        write_keys(f, "", &edit)?;
+        for step in select.iter().flat_map(|steps| steps.as_array()).flatten() {
+            let Some(step) = step.as_table() else { continue };
+            let text = |key: &str| step.get(key).and_then(Value::as_str).unwrap_or_default();
+            let sign = match text("mode") {
+                "subtract" => "-",
+                "intersect" => "&",
+                _ => "",
+            };
+            write!(f, " {sign}{}", text("shape"))?;
+            let keys = step
+                .iter()
+                .filter(|(key, _)| !["mode", "shape"].contains(&key.as_str()));
+            write_keys(f, "", &keys.map(|(k, v)| (k.clone(), v.clone())).collect())?;
+        }
+        Ok(())
+    }
+}
+
+fn write_keys(f: &mut fmt::Formatter, prefix: &str, table: &Table) -> fmt::Result {
+    for (key, value) in table {
+        match value {
+            Value::Table(inner) => write_keys(f, &format!("{prefix}{key}."), inner)?,
+            Value::Array(items) if items.iter().any(Value::is_array) => {
+                let vectors: Vec<String> = items.iter().map(in_words).collect();
+                let end = if vectors.len() == 1 { ";" } else { "" };
+                write!(f, " {prefix}{key}={}{end}", vectors.join(";"))?;
+            }
+            value => write!(f, " {prefix}{key}={}", in_words(value))?,
+        }
+    }
+    Ok(())
+}
+
+fn in_words(value: &Value) -> String {
+    match value {
+        Value::String(text) => text.clone(),
+        Value::Float(number) => number.to_string(),
+        Value::Array(items) => items.iter().map(in_words).collect::<Vec<_>>().join(","),
+        other => other.to_string(),
+    }
+}

@@ -1,0 +1,304 @@
+//! Edits of a scene on disk: read, replay a list, write.
+
+use crate::folder::{cameras_beside, cameras_moved};
+use crate::lock::FolderLock;
+use crate::scene_file::is_field;
+use crate::{RunError, RunFolder, SCENE, Scene, scene_of, write_image};
+use irradia_edit::{Applied, Draft, Edit, EditList, Provenance, Transform, apply};
+use irradia_formats::{SplatFormat, WriteOptions, read_splat_file, write_atomic, write_splats, write_splats_with};
+use irradia_scene::GaussianCloud;
+use irradia_splat::{RenderOptions, Splats};
+use irradia_train::checkpoint::{splats_of, with_splats};
+use irradia_train::model::Model;
+use std::borrow::Cow;
+use std::fs;
+use std::path::{Path, PathBuf};
+
+/// The list of edits beside an edited scene.
+pub const EDITS: &str = "edits.toml";
+
+/// A scene in memory with its edits, from a splat file or a run.
+pub struct Editing {
+    /// The file of the scene.
+    path: PathBuf,
+    draft: Draft,
+    list: EditList,
+    made: Vec<Made>,
+    /// How the whole scene was moved, in the dataset's coordinates.
+    moved: Transform,
+    splits: Vec<(String, GaussianCloud)>,
+    /// What was left out when the scene was read, a line each.
+    pub notes: Vec<String>,
+}
+
+/// An edit that was made.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Made {
+    /// The edit, with everything that was found automatically written out.
+    pub edit: Edit,
+    /// Splats that were selected, and that there were.
+    pub selected: [usize; 2],
+    /// Splats after it.
+    pub splats: usize,
+}
+
+impl Editing {
+    /// Reads a scene; the cameras beside it are known to the edits.
+    ///
+    /// # Errors
+    /// When it cannot be read, or is a field.
+    pub fn open(input: &Path) -> Result<Self, RunError> {
+        let path = scene_of(input);
+        if is_field(&path) {
+            let message = format!("{} is a radiance field; only splats can be edited", path.display());
+            return Err(RunError::Refused(message));
+        }
+        let file = read_splat_file(&path)?;
+        let cameras = cameras_beside(&path, &file.cloud.world_from_dataset).unwrap_or_default();
+        Ok(Self {
+            notes: file.warnings(),
+            draft: Draft::new(file.cloud, cameras),
+            path,
+            list: EditList::default(),
+            made: Vec::new(),
+            moved: Transform::IDENTITY,
+            splits: Vec::new(),
+        })
+    }
+
+    /// The scene as the edits left it.
+    pub fn draft(&self) -> &Draft {
+        &self.draft
+    }
+
+    /// The edits made, with everything that was found automatically written out.
+    pub fn list(&self) -> &EditList {
+        &self.list
+    }
+
+    /// What the edits did.
+    pub fn made(&self) -> &[Made] {
+        &self.made
+    }
+
+    /// Makes edits in their order. Scenes to merge are found from the current folder.
+    ///
+    /// # Errors
+    /// When one is not possible; those before it have been made.
+    pub fn apply(&mut self, list: &EditList) -> Result<(), RunError> {
+        list.check()?;
+        for edit in &list.edits {
+            let before = self.draft.len();
+            let Applied {
+                edit,
+                selected,
+                moved,
+                split,
+                ..
+            } = apply(&mut self.draft, edit, &open_scene)?;
+            if let Some(moved) = moved {
+                self.moved = self.moved.then(&moved);
+            }
+            self.splits.extend(split);
+            self.list.edits.push(edit.clone());
+            self.made.push(Made {
+                edit,
+                selected: [selected, before],
+                splats: self.draft.len(),
+            });
+        }
+        Ok(())
+    }
+
+    /// Writes the scene without hidden splats: to a file, whose name selects the format, or to a folder, which gets `scene.ply`, the
+    /// cameras, the recipe, by which it is rendered, and `edits.toml`. Scenes that were split off are written beside it. Returns what the reader should
+    /// know, a line each.
+    ///
+    /// # Errors
+    /// When the format is unknown, the output is a run or would replace the input, or a file cannot be written.
+    pub fn write(&self, output: &Path, options: &WriteOptions) -> Result<Vec<String>, RunError> {
+        let is_file = SplatFormat::of(output).is_ok();
+        if !is_file && output.extension().is_some() && !output.is_dir() {
+            // The known endings.
+            SplatFormat::of(output)?;
+        }
+        let file = match is_file {
+            true => output.to_owned(),
+            false => output.join(SCENE),
+        };
+        if same_file(&file, &self.path) {
+            let message = format!("{} would be replaced: name another output", self.path.display());
+            return Err(RunError::Refused(message));
+        }
+        if !is_file && output.join("run.json").exists() {
+            let message = format!("{} holds a run: name another folder", output.display());
+            return Err(RunError::Refused(message));
+        }
+        let mut notes = Vec::new();
+        for (name, cloud) in &self.splits {
+            let path = self.beside(&file, name)?;
+            notes.extend(write_splats_with(&path, cloud, options)?);
+            notes.push(format!("{}: {} splats split off", path.display(), cloud.len()));
+        }
+        if !is_file {
+            fs::create_dir_all(output).map_err(RunError::io("create", output))?;
+            let folder = RunFolder::at(output);
+            if let Some(cameras) = cameras_moved(&self.path, &self.moved) {
+                folder.write("cameras.json", &cameras)?;
+            }
+            if let Ok(recipe) = fs::read(self.path.with_file_name("recipe.toml")) {
+                folder.write("recipe.toml", &recipe)?;
+            }
+            folder.write(EDITS, self.list.to_toml().as_bytes())?;
+            if self.path.with_file_name(crate::RESIDUAL).is_file() {
+                notes.push(format!(
+                    "{} is left out: it belongs to the scene as it was",
+                    crate::RESIDUAL
+                ));
+            }
+        }
+        notes.extend(write_splats_with(&file, &self.draft.shown(), options)?);
+        match self.draft.hidden.count() {
+            0 => {}
+            hidden => notes.push(format!("{hidden} hidden splats left out")),
+        }
+        Ok(notes)
+    }
+
+    /// Writes the edited scene over that of its run, and its edits behind those of its `edits.toml`. The latest checkpoint is edited alike:
+    /// what did not change keeps its moments, and the run resumes with the edited splats. Returns what the reader should know, a line each.
+    ///
+    /// # Errors
+    /// When the scene is not that of a run, the whole scene was moved away from its photographs, the run is training, or a file cannot be
+    /// written.
+    pub fn write_in_place(&self) -> Result<Vec<String>, RunError> {
+        let refused = |message: String| Err(RunError::Refused(message));
+        let folder = match RunFolder::containing(&self.path) {
+            Some(folder) if self.path == folder.file(SCENE) => folder,
+            _ => return refused(format!("{} is not a run: name an output with -o", self.path.display())),
+        };
+        if !self.moved.is_identity() {
+            return refused(
+                "the whole scene would be moved away from its photographs: name another folder with -o".to_owned(),
+            );
+        }
+        if self.draft.shown().is_empty() {
+            return refused("nothing would be left of the run: name an output with -o".to_owned());
+        }
+        let _lock = FolderLock::take(folder.path())?;
+        let mut list = match fs::read_to_string(folder.file(EDITS)) {
+            Ok(text) => EditList::parse(&text).map_err(|error| RunError::Damaged {
+                path: folder.file(EDITS),
+                reason: error.to_string(),
+            })?,
+            Err(_) => EditList::default(),
+        };
+        list.edits.extend(self.list.edits.iter().cloned());
+        let mut notes = Vec::new();
+        for (name, cloud) in &self.splits {
+            let path = self.beside(&self.path, name)?;
+            write_splats(&path, cloud)?;
+            notes.push(format!("{}: {} splats split off", path.display(), cloud.len()));
+        }
+        if let Some(path) = folder.newest_checkpoint()? {
+            let kept = self.edit_checkpoint(&path)?;
+            notes.push(format!("{}: {kept} splats keep their optimiser state", path.display()));
+        }
+        write_splats(&self.path, &self.draft.shown())?;
+        folder.write(EDITS, list.to_toml().as_bytes())?;
+        notes.push("the figures of the run are those before the edit: irradia eval measures again".to_owned());
+        Ok(notes)
+    }
+
+    /// Makes the edits on a checkpoint. Returns the number of splats that keep their moments.
+    fn edit_checkpoint(&self, path: &Path) -> Result<usize, RunError> {
+        let failed = |source| RunError::File {
+            path: path.to_owned(),
+            source,
+        };
+        let bytes = fs::read(path).map_err(RunError::io("read", path))?;
+        let mut cloud = splats_of(&bytes).map_err(failed)?.to_cloud();
+        let degree = cloud.sh_degree;
+        cloud.antialiased = self.draft.cloud.antialiased;
+        cloud.world_from_dataset = self.draft.cloud.world_from_dataset;
+        let mut draft = Draft::new(cloud, self.draft.cameras.clone());
+        let mut total = Provenance::identity(draft.len());
+        for edit in &self.list.edits {
+            total = total.then(&apply(&mut draft, edit, &open_scene)?.provenance);
+        }
+        draft.cloud.set_degree(degree);
+        let source = |i: usize| total.source(i).filter(|_| !total.changed.contains(i));
+        let shown = (0..draft.len()).filter(|i| !draft.hidden.contains(*i));
+        let sources: Vec<Option<u32>> = shown.map(source).collect();
+        let splats = Splats::from_cloud(&draft.shown());
+        let bytes = with_splats(&bytes, &splats, &sources).map_err(failed)?;
+        write_atomic(path, |out| out.write_all(&bytes))?;
+        Ok(sources.iter().flatten().count())
+    }
+
+    /// The file for a scene that is split off, beside `file`.
+    fn beside(&self, file: &Path, name: &str) -> Result<PathBuf, RunError> {
+        let mut path = file.with_file_name(name);
+        if SplatFormat::of(&path).is_err() {
+            path = file.with_file_name(format!("{name}.ply"));
+        }
+        let is_taken = same_file(&path, file) || same_file(&path, &self.path);
+        match is_taken {
+            true => Err(RunError::Refused(format!(
+                "split {name}: {} is the scene itself; choose another name",
+                path.display()
+            ))),
+            false => Ok(path),
+        }
+    }
+
+    /// Writes `before.png` and `after.png` to a folder: the scene around which a camera looks, as it was and as it is.
+    ///
+    /// # Errors
+    /// When the scene cannot be read again or a picture cannot be written.
+    pub fn write_pictures(&self, folder: &Path) -> Result<(), RunError> {
+        fs::create_dir_all(folder).map_err(RunError::io("create", folder))?;
+        let before = Scene::read(&self.path)?;
+        let options = before.options;
+        let size = {
+            let k = before.outlook().intrinsics;
+            let factor = (800.0 / k.width.max(k.height) as f32).min(1.0);
+            let k = k.scaled(factor);
+            (k.width, k.height)
+        };
+        let camera = before.orbit(1, Some(size))[0];
+        write_image(folder.join("before.png"), &before.render(&camera).color)?;
+        let after = self.scene(options);
+        let camera = match self.moved.is_identity() {
+            true => camera,
+            // The camera that moved along.
+            false => after.orbit(1, Some(size))[0],
+        };
+        write_image(folder.join("after.png"), &after.render(&camera).color)
+    }
+
+    /// The scene as it is drawn.
+    fn scene(&self, options: RenderOptions) -> Scene {
+        Scene {
+            model: Model::Splats {
+                splats: Cow::Owned(Splats::from_cloud(&self.draft.shown())),
+                residual: None,
+            },
+            options,
+            cameras: (!self.draft.cameras.is_empty()).then(|| self.draft.cameras.clone().into()),
+            world_from_dataset: self.draft.cloud.world_from_dataset,
+        }
+    }
+}
+
+fn open_scene(file: &str) -> Result<GaussianCloud, String> {
+    let path = scene_of(Path::new(file));
+    Ok(read_splat_file(&path).map_err(|error| error.to_string())?.cloud)
+}
+
+fn same_file(a: &Path, b: &Path) -> bool {
+    match (a.canonicalize(), b.canonicalize()) {
+        (Ok(a), Ok(b)) => a == b,
+        _ => false,
+    }
+}

@@ -275,6 +275,8 @@ pub fn read_splat_file(path: &Path) -> Result<SplatFile, FormatError> {
         })?,
         SplatFormat::SogFolder => sog::read_folder(&sog_meta(path))?,
         SplatFormat::Gltf => read_and_parse(path, |text| gltf::parse_gltf(text, &|name| read_beside(path, name)))?,
+        // Nothing is read for what is never read.
+        SplatFormat::Npz => return Err(FormatError::malformed(path, "NumPy archives are written, not read")),
         _ => read_and_parse(path, |bytes| parse(format, bytes))?,
     };
     let left_out = rows::leave_out_invalid(&mut cloud);

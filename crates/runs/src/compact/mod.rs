@@ -48,7 +48,7 @@ pub struct CompactInput {
 }
 
 impl CompactInput {
-    /// Usual steps of a try: on fox_colmap at a thirtieth of the bytes, 300 lose 0.1 dB more.
+    /// Usual steps of a try. On lund_door at a thirtieth of the bytes 1,500 gain 0.3 dB on training views, and nothing on held-out ones.
     pub const STEPS: u64 = 600;
 
     /// Makes the scene `scene`, trained on `data`, as small as `keep_psnr` 0.2 allows.

@@ -22,6 +22,7 @@ use irradia_scene::{GaussianCloud, PointCloud, Similarity, sh};
 use std::borrow::Cow;
 use std::fmt;
 use std::fs;
+use std::io::{self, ErrorKind, Write};
 use std::path::{Path, PathBuf};
 
 /// The splat file formats, identified by the end of the file's name.
@@ -325,8 +326,36 @@ pub fn write_splats_with(
     cloud: &GaussianCloud,
     options: &WriteOptions,
 ) -> Result<Vec<String>, FormatError> {
-    assert!(cloud.is_consistent(), "the columns of the cloud have unequal lengths");
     let format = SplatFormat::of(path)?;
+    let (cloud, notes) = fitted(cloud, format);
+    match format {
+        SplatFormat::SogFolder => write_folder(&sog_meta(path), &cloud, options.quality)?,
+        _ => write_atomic(path, |out| write_file(out, &cloud, format, options))?,
+    }
+    Ok(notes)
+}
+
+/// The bytes of a splat file, and what the format could not hold, a line each.
+///
+/// # Errors
+/// When the format is a folder of images, or an encoder fails.
+///
+/// # Panics
+/// When the cloud's columns have unequal lengths: a bug in the caller.
+pub fn encode_splats(
+    cloud: &GaussianCloud,
+    format: SplatFormat,
+    options: &WriteOptions,
+) -> io::Result<(Vec<u8>, Vec<String>)> {
+    let (cloud, notes) = fitted(cloud, format);
+    let mut bytes = Vec::new();
+    write_file(&mut bytes, &cloud, format, options)?;
+    Ok((bytes, notes))
+}
+
+/// What of `cloud` a file of `format` holds, and a line for each thing that it does not.
+fn fitted(cloud: &GaussianCloud, format: SplatFormat) -> (Cow<'_, GaussianCloud>, Vec<String>) {
+    assert!(cloud.is_consistent(), "the columns of the cloud have unequal lengths");
     let mut notes = Vec::new();
     let cloud = match format.is_lossless() {
         true => Cow::Borrowed(cloud),
@@ -344,27 +373,34 @@ pub fn write_splats_with(
             "{format} does not say that the scene was trained with antialiasing"
         ));
     }
+    (cloud, notes)
+}
+
+/// Writes the one file of a format.
+fn write_file(
+    out: &mut dyn Write,
+    cloud: &GaussianCloud,
+    format: SplatFormat,
+    options: &WriteOptions,
+) -> io::Result<()> {
     let quality = options.quality;
     match format {
-        SplatFormat::SogFolder => {
-            write_folder(&sog_meta(path), &cloud, quality)?;
-        }
-        _ => write_atomic(path, |out| match format {
-            SplatFormat::Ply => ply::write_splat_ply(out, &cloud),
-            SplatFormat::CompressedPly => compressed_ply::write(out, &cloud),
-            SplatFormat::PointsPly => out.write_all(&encode_points(&points(&cloud))),
-            SplatFormat::Spz => spz::write(out, &cloud, quality, options.spz_version),
-            SplatFormat::Splat => antimatter::write(out, &cloud),
-            SplatFormat::Ksplat => ksplat::write(out, &cloud, quality),
-            SplatFormat::Sog => sog::write(out, &cloud, quality),
-            SplatFormat::SogFolder => unreachable!("written above"),
-            SplatFormat::Glb => gltf::write_glb(out, &cloud),
-            SplatFormat::GlbSpz => gltf::write_glb_spz(out, &cloud, quality),
-            SplatFormat::Gltf => gltf::write_gltf(out, &cloud),
-            SplatFormat::Npz => npz::write(out, &cloud),
-        })?,
+        SplatFormat::Ply => ply::write_splat_ply(out, cloud),
+        SplatFormat::CompressedPly => compressed_ply::write(out, cloud),
+        SplatFormat::PointsPly => out.write_all(&encode_points(&points(cloud))),
+        SplatFormat::Spz => spz::write(out, cloud, quality, options.spz_version),
+        SplatFormat::Splat => antimatter::write(out, cloud),
+        SplatFormat::Ksplat => ksplat::write(out, cloud, quality),
+        SplatFormat::Sog => sog::write(out, cloud, quality),
+        SplatFormat::SogFolder => Err(io::Error::new(
+            ErrorKind::Unsupported,
+            "SOG as a folder is several files: choose .sog",
+        )),
+        SplatFormat::Glb => gltf::write_glb(out, cloud),
+        SplatFormat::GlbSpz => gltf::write_glb_spz(out, cloud, quality),
+        SplatFormat::Gltf => gltf::write_gltf(out, cloud),
+        SplatFormat::Npz => npz::write(out, cloud),
     }
-    Ok(notes)
 }
 
 /// The splats that can be drawn, in the coordinates of the dataset, about the origin of its world if that is far away: other formats

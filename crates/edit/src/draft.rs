@@ -1,6 +1,6 @@
 use crate::Selection;
 use glam::{DVec3, Vec3};
-use irradia_scene::{Camera, GaussianCloud, Similarity, sh};
+use irradia_scene::{Camera, GaussianCloud};
 use rayon::prelude::*;
 
 /// A scene that is being edited.
@@ -59,7 +59,9 @@ impl Draft {
     pub(crate) fn extent(&self) -> f64 {
         let means = &self.cloud.means;
         let center = Vec3::from_array([0, 1, 2].map(|c| median(means.iter().map(|mean| mean[c]).collect())));
-        f64::from(median(means.iter().map(|mean| center.distance(Vec3::from(*mean))).collect()))
+        f64::from(median(
+            means.iter().map(|mean| center.distance(Vec3::from(*mean))).collect(),
+        ))
     }
 
     /// Centre of splat `i` in the coordinates of the dataset.
@@ -144,34 +146,4 @@ pub(crate) fn scatter(cloud: &mut GaussianCloud, indices: &[u32], from: &Gaussia
         cloud.opacity_logits[i] = from.opacity_logits[row];
         cloud.sh[i * width..][..width].copy_from_slice(&from.sh[row * width..][..width]);
     }
-}
-
-/// Gives harmonics of `degree`: higher bands are dropped, new ones are zero.
-pub(crate) fn set_degree(cloud: &mut GaussianCloud, degree: u32) {
-    if cloud.sh_degree == degree {
-        return;
-    }
-    let (old, new) = (3 * cloud.sh_coefficients(), 3 * sh::coefficients(degree));
-    let common = old.min(new);
-    let mut harmonics = vec![0.0; cloud.len() * new];
-    for (to, from) in harmonics.chunks_exact_mut(new).zip(cloud.sh.chunks_exact(old)) {
-        to[..common].copy_from_slice(&from[..common]);
-    }
-    (cloud.sh, cloud.sh_degree) = (harmonics, degree);
-}
-
-/// Converts the splats to another world of the same dataset.
-pub(crate) fn bring_to_world(cloud: &mut GaussianCloud, world_from_dataset: Similarity) {
-    let from = cloud.world_from_dataset;
-    if from == world_from_dataset {
-        return;
-    }
-    let log_ratio = (world_from_dataset.scale / from.scale).ln() as f32;
-    cloud.means.par_iter_mut().for_each(|mean| {
-        let position = from.invert(DVec3::from(mean.map(f64::from)));
-        *mean = world_from_dataset.apply(position).as_vec3().to_array();
-    });
-    let scales = cloud.log_scales.as_flattened_mut().par_iter_mut();
-    scales.for_each(|scale| *scale += log_ratio);
-    cloud.world_from_dataset = world_from_dataset;
 }

@@ -20,13 +20,13 @@ const ISOLATED: [f32; 2] = [12.0, 4.0];
 /// Ratio of the largest to the middle standard deviation of a needle, and its length.
 const NEEDLE: [f32; 2] = [15.0, 0.1];
 /// Size of a huge splat.
-const HUGE: f32 = 0.4;
+const HUGE: f32 = 0.6;
 /// Spacing in units of size of a splat that no view shows.
 const UNSEEN: f32 = 6.0;
 /// Of a splat in front of what views show: the share of views that see past it, its spacing in units of size, its opacity, and the
 /// largest sum of its blending weights as a share of a picture's pixels. Fainter and smaller ones are many, do no harm, and in a forward-facing capture
 /// of leaves are leaves.
-const IN_FRONT: [f32; 4] = [0.7, 2.5, 0.05, 1e-4];
+const IN_FRONT: [f32; 4] = [0.8, 2.5, 0.05, 1e-4];
 
 /// How much each reason speaks for a splat being a floater.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]

@@ -1,4 +1,4 @@
-use crate::draft::{append, gather, scatter, set_degree, truncate};
+use crate::draft::{append, gather, scatter, truncate};
 use crate::plan::{Change, Plan};
 use crate::{Applied, Draft, Edit, EditError, EditList, Open, Provenance, Selection};
 use irradia_scene::{Camera, GaussianCloud, Similarity};
@@ -167,7 +167,7 @@ impl Undo {
         } else {
             let was_longer = cloud.len() > self.len;
             truncate(cloud, self.len);
-            set_degree(cloud, self.sh_degree);
+            cloud.set_degree(self.sh_degree);
             scatter(cloud, &self.indices, &self.rows);
             let mut changed = Selection::none(self.len);
             self.indices.iter().for_each(|i| changed.set(*i as usize, true));

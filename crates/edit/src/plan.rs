@@ -1,7 +1,7 @@
 //! Operations: first everything that may fail, then the change itself.
 
 use crate::color::ColorMap;
-use crate::draft::{append, bring_to_world, gather, set_degree};
+use crate::draft::{append, gather};
 use crate::ground::ground;
 use crate::select::{select, select_among};
 use crate::transform::{transform_scene, transform_splats};
@@ -199,7 +199,7 @@ impl Plan {
                 if !other.is_consistent() {
                     return Err(EditError::Source(format!("{file} has columns of unequal lengths")));
                 }
-                bring_to_world(&mut other, draft.cloud.world_from_dataset);
+                other.bring_to_world(draft.cloud.world_from_dataset);
                 let new = vec![Provenance::NEW; other.len()];
                 Change::Append(other, new)
             }
@@ -266,8 +266,8 @@ impl Plan {
             }
             Change::Append(mut cloud, new) => {
                 let degree = draft.cloud.sh_degree.max(cloud.sh_degree);
-                set_degree(&mut draft.cloud, degree);
-                set_degree(&mut cloud, degree);
+                draft.cloud.set_degree(degree);
+                cloud.set_degree(degree);
                 append(&mut draft.cloud, &cloud);
                 draft.hidden.append(new.len());
                 draft.locked.append(new.len());

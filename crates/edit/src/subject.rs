@@ -5,8 +5,8 @@ use glam::Vec3;
 use irradia_scene::Camera;
 use irradia_splat::init::focus_point;
 
-/// The point at which the cameras look, and a radius around it that they see whole: the median of the radii of the balls there that
-/// touch the borders of the pictures. In the coordinates of the dataset; `None` without cameras.
+/// The point at which the cameras look, and a radius around it that fills their pictures: the median of the radii of the balls there that
+/// touch the farther borders. In the coordinates of the dataset; `None` without cameras.
 pub fn subject(draft: &Draft) -> Option<([f64; 3], f64)> {
     if draft.cameras.is_empty() {
         return None;
@@ -26,15 +26,9 @@ pub fn subject(draft: &Draft) -> Option<([f64; 3], f64)> {
     ))
 }
 
-/// Radius of the ball at the distance of `focus` on the camera's axis that touches the nearest border of the picture.
+/// Radius of the ball around `focus` that spans the longer side of the camera's picture, if the camera looked at it.
 fn framed_radius(camera: &Camera, focus: Vec3) -> f32 {
     let k = &camera.intrinsics;
-    let tangents = [
-        k.cx / k.fx,
-        (k.width as f32 - k.cx) / k.fx,
-        k.cy / k.fy,
-        (k.height as f32 - k.cy) / k.fy,
-    ];
-    let tangent = tangents.into_iter().fold(f32::INFINITY, f32::min).max(0.0);
+    let tangent = (0.5 * k.width as f32 / k.fx).max(0.5 * k.height as f32 / k.fy);
     camera.pose.position.distance(focus) * tangent.atan().sin()
 }

@@ -1,6 +1,5 @@
 //! Moving, rotating and scaling splats and cameras.
 
-use crate::draft::bring_to_world;
 use crate::harmonics::BandRotation;
 use crate::{Draft, Selection};
 use glam::{DQuat, DVec3};
@@ -146,7 +145,7 @@ pub(crate) fn transform_scene(draft: &mut Draft, transform: &Transform) {
         for camera in &mut draft.cameras {
             camera.pose.position = world.invert(camera.pose.position.as_dvec3()).as_vec3();
         }
-        bring_to_world(&mut draft.cloud, Similarity::IDENTITY);
+        draft.cloud.bring_to_world(Similarity::IDENTITY);
     }
 }
 

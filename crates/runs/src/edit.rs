@@ -1,12 +1,14 @@
 //! Edits of a scene on disk: read, replay a list, write.
 
 use crate::folder::{cameras_beside, cameras_moved};
+use crate::lock::FolderLock;
 use crate::scene_file::is_field;
 use crate::{RunError, RunFolder, SCENE, Scene, scene_of, write_image};
-use irradia_edit::{Applied, Draft, Edit, EditList, Operation, Transform, apply, select};
-use irradia_formats::{SplatFormat, WriteOptions, read_splat_file, write_splats_with};
+use irradia_edit::{Applied, Draft, Edit, EditList, Provenance, Transform, apply};
+use irradia_formats::{SplatFormat, WriteOptions, read_splat_file, write_atomic, write_splats, write_splats_with};
 use irradia_scene::GaussianCloud;
 use irradia_splat::{RenderOptions, Splats};
+use irradia_train::checkpoint::{splats_of, with_splats};
 use irradia_train::model::Model;
 use std::borrow::Cow;
 use std::fs;
@@ -108,17 +110,6 @@ impl Editing {
         Ok(())
     }
 
-    /// What each edit would select, if those before it had been made. Nothing changes.
-    ///
-    /// # Errors
-    /// Those of [`Self::apply`].
-    pub fn preview(&self, edit: &Edit) -> Result<usize, RunError> {
-        Ok(match &edit.select {
-            Some(steps) => select(&self.draft, steps)?.count(),
-            None => self.draft.len(),
-        })
-    }
-
     /// Writes the scene without hidden splats: to a file, whose name selects the format, or to a folder, which gets `scene.ply`, the
     /// cameras, the recipe, by which it is rendered, and `edits.toml`. Scenes that were split off are written beside it. Returns what the reader should
     /// know, a line each.
@@ -160,7 +151,10 @@ impl Editing {
             }
             folder.write(EDITS, self.list.to_toml().as_bytes())?;
             if self.path.with_file_name(crate::RESIDUAL).is_file() {
-                notes.push(format!("{} is left out: it belongs to the scene as it was", crate::RESIDUAL));
+                notes.push(format!(
+                    "{} is left out: it belongs to the scene as it was",
+                    crate::RESIDUAL
+                ));
             }
         }
         notes.extend(write_splats_with(&file, &self.draft.shown(), options)?);
@@ -169,6 +163,77 @@ impl Editing {
             hidden => notes.push(format!("{hidden} hidden splats left out")),
         }
         Ok(notes)
+    }
+
+    /// Writes the edited scene over that of its run, and its edits behind those of its `edits.toml`. The latest checkpoint is edited alike:
+    /// what did not change keeps its moments, and the run resumes with the edited splats. Returns what the reader should know, a line each.
+    ///
+    /// # Errors
+    /// When the scene is not that of a run, the whole scene was moved away from its photographs, the run is training, or a file cannot be
+    /// written.
+    pub fn write_in_place(&self) -> Result<Vec<String>, RunError> {
+        let refused = |message: String| Err(RunError::Refused(message));
+        let folder = match RunFolder::containing(&self.path) {
+            Some(folder) if self.path == folder.file(SCENE) => folder,
+            _ => return refused(format!("{} is not a run: name an output with -o", self.path.display())),
+        };
+        if !self.moved.is_identity() {
+            return refused(
+                "the whole scene would be moved away from its photographs: name another folder with -o".to_owned(),
+            );
+        }
+        if self.draft.shown().is_empty() {
+            return refused("nothing would be left of the run: name an output with -o".to_owned());
+        }
+        let _lock = FolderLock::take(folder.path())?;
+        let mut list = match fs::read_to_string(folder.file(EDITS)) {
+            Ok(text) => EditList::parse(&text).map_err(|error| RunError::Damaged {
+                path: folder.file(EDITS),
+                reason: error.to_string(),
+            })?,
+            Err(_) => EditList::default(),
+        };
+        list.edits.extend(self.list.edits.iter().cloned());
+        let mut notes = Vec::new();
+        for (name, cloud) in &self.splits {
+            let path = self.beside(&self.path, name)?;
+            write_splats(&path, cloud)?;
+            notes.push(format!("{}: {} splats split off", path.display(), cloud.len()));
+        }
+        if let Some(path) = folder.newest_checkpoint()? {
+            let kept = self.edit_checkpoint(&path)?;
+            notes.push(format!("{}: {kept} splats keep their optimiser state", path.display()));
+        }
+        write_splats(&self.path, &self.draft.shown())?;
+        folder.write(EDITS, list.to_toml().as_bytes())?;
+        notes.push("the figures of the run are those before the edit: irradia eval measures again".to_owned());
+        Ok(notes)
+    }
+
+    /// Makes the edits on a checkpoint. Returns the number of splats that keep their moments.
+    fn edit_checkpoint(&self, path: &Path) -> Result<usize, RunError> {
+        let failed = |source| RunError::File {
+            path: path.to_owned(),
+            source,
+        };
+        let bytes = fs::read(path).map_err(RunError::io("read", path))?;
+        let mut cloud = splats_of(&bytes).map_err(failed)?.to_cloud();
+        let degree = cloud.sh_degree;
+        cloud.antialiased = self.draft.cloud.antialiased;
+        cloud.world_from_dataset = self.draft.cloud.world_from_dataset;
+        let mut draft = Draft::new(cloud, self.draft.cameras.clone());
+        let mut total = Provenance::identity(draft.len());
+        for edit in &self.list.edits {
+            total = total.then(&apply(&mut draft, edit, &open_scene)?.provenance);
+        }
+        draft.cloud.set_degree(degree);
+        let source = |i: usize| total.source(i).filter(|_| !total.changed.contains(i));
+        let shown = (0..draft.len()).filter(|i| !draft.hidden.contains(*i));
+        let sources: Vec<Option<u32>> = shown.map(source).collect();
+        let splats = Splats::from_cloud(&draft.shown());
+        let bytes = with_splats(&bytes, &splats, &sources).map_err(failed)?;
+        write_atomic(path, |out| out.write_all(&bytes))?;
+        Ok(sources.iter().flatten().count())
     }
 
     /// The file for a scene that is split off, beside `file`.
@@ -224,15 +289,6 @@ impl Editing {
             world_from_dataset: self.draft.cloud.world_from_dataset,
         }
     }
-}
-
-/// Whether the edits of a list leave the splats where the photographs saw them.
-pub fn keeps_place(list: &EditList) -> bool {
-    list.edits.iter().all(|edit| match edit.op {
-        Operation::Move { .. } | Operation::Rotate { .. } | Operation::Scale { .. } => edit.select.is_some(),
-        Operation::Upright { .. } | Operation::SetLength { .. } => false,
-        _ => true,
-    })
 }
 
 fn open_scene(file: &str) -> Result<GaussianCloud, String> {

@@ -65,7 +65,7 @@ mod synth_files;
 pub use background::Background;
 pub use convert::{COMPARED_VIEWS, Conversion, convert};
 pub use describe::describe;
-pub use edit::{EDITS, Editing, Made, keeps_place};
+pub use edit::{EDITS, Editing, Made};
 pub use error::RunError;
 pub use evaluate::{distinct, evaluate, file_stem, file_stems, unmeasured};
 pub use folder::{FIELD, RESIDUAL, RunFolder, RunRecord, SCENE};

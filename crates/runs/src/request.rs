@@ -1,11 +1,12 @@
 //! Training requests: raw input, and the validated request.
 
-use crate::{Background, RunError, RunFolder};
-use irradia_formats::{DEFAULT_MAX_SIDE, DatasetFormat, DatasetOptions, Holdout, read_dataset};
-use irradia_scene::Dataset;
+use crate::{Background, RunError, RunFolder, scene_of};
+use irradia_formats::{DEFAULT_MAX_SIDE, DatasetFormat, DatasetOptions, Holdout, read_dataset, read_splats};
+use irradia_scene::{Dataset, sh};
+use irradia_splat::Splats;
 use irradia_train::Recipe;
 use irradia_train::paces::Paces;
-use irradia_train::recipe::Param;
+use irradia_train::recipe::{Param, Represents};
 use irradia_train::schedule::{OutlinePoint, outline};
 use serde::{Deserialize, Serialize};
 use std::fmt::Display;
@@ -169,6 +170,9 @@ pub struct TrainInput {
     /// Background of photographs with alpha. `None`: white for Blender scenes, otherwise the recipe's.
     #[serde(default)]
     pub background: Option<Background>,
+    /// A scene whose splats the training begins with, a file or a run's folder, in the coordinates of the dataset.
+    #[serde(default)]
+    pub from: Option<PathBuf>,
     /// Whether to replace an existing run in `out`.
     #[serde(skip)]
     pub overwrite: bool,
@@ -197,6 +201,7 @@ impl TrainInput {
             unseen_lpips: None,
             reading: Reading::default(),
             background: None,
+            from: None,
             overwrite: false,
         }
     }
@@ -262,6 +267,13 @@ impl TrainInput {
         overrides.extend(self.max_splats.map(|n| format!("max_splats={n}")));
         let recipe = read_recipe(&self.recipe, &overrides)?;
         self.data = std::path::absolute(&self.data).unwrap_or(self.data);
+        if let Some(from) = &mut self.from {
+            if recipe.stage[0].represents == Represents::Field {
+                let message = format!("recipe {} begins with a field, not with splats", recipe.name);
+                return Err(RunError::setting("from", from.display(), message));
+            }
+            *from = std::path::absolute(&from).unwrap_or(std::mem::take(from));
+        }
         Ok(TrainRequest {
             input: self,
             recipe,
@@ -352,6 +364,22 @@ impl TrainRequest {
             background.apply_to(&mut self.recipe);
         }
         Ok(())
+    }
+
+    /// The splats to begin with, in the world of `dataset`, with room for all bands; and whether they need antialiasing.
+    pub(crate) fn first_splats(&self, dataset: &Dataset) -> Result<Option<(Splats, bool)>, RunError> {
+        let Some(from) = &self.input.from else { return Ok(None) };
+        let path = scene_of(from);
+        let mut cloud = read_splats(&path)?;
+        if cloud.is_empty() {
+            return Err(RunError::Refused(format!(
+                "{} has no splats to begin with",
+                path.display()
+            )));
+        }
+        cloud.bring_to_world(dataset.world_from_dataset);
+        cloud.set_degree(sh::MAX_DEGREE);
+        Ok(Some((Splats::from_cloud(&cloud), cloud.antialiased)))
     }
 
     /// The paces of the run to repeat.

@@ -89,7 +89,7 @@ impl Run {
         let held = FolderLock::take_existing(out)?;
         let paces = request.paces()?;
         let options = train_options(&request)?;
-        let trainer = Trainer::new(Arc::new(dataset), request.recipe.clone(), options)?;
+        let trainer = first_trainer(&request, Arc::new(dataset), options)?;
         let (folder, lock) = RunFolder::create(out, overwrite, held)?;
         folder.write("recipe.toml", trainer.recipe.to_toml().as_bytes())?;
         folder.write_cameras(&trainer)?;
@@ -139,7 +139,7 @@ impl Run {
                 read_checkpoint(&path, dataset, options)?
             }
             // Interrupted before its first checkpoint: no step depends on the earlier data.
-            None => Trainer::new(dataset, request.recipe.clone(), options)?,
+            None => first_trainer(&request, dataset, options)?,
         };
         folder.write_views(&trainer.dataset)?;
         Self::new(folder, lock, request, trainer, paces)
@@ -270,6 +270,18 @@ impl Run {
         }
         Ok(())
     }
+}
+
+/// A trainer before its first step.
+fn first_trainer(request: &TrainRequest, dataset: Arc<Dataset>, options: TrainOptions) -> Result<Trainer, RunError> {
+    let mut recipe = request.recipe.clone();
+    Ok(match request.first_splats(&dataset)? {
+        Some((splats, antialiased)) => {
+            recipe.render.antialias |= antialiased;
+            Trainer::from_splats(dataset, recipe, options, splats)?
+        }
+        None => Trainer::new(dataset, recipe, options)?,
+    })
 }
 
 /// The trainer's options of the request, with the LPIPS network read.

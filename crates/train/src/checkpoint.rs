@@ -2,8 +2,11 @@
 //! uninterrupted one. This module only serialises and parses bytes; the caller stores them.
 
 mod carried;
+mod edited;
 #[cfg(test)]
 mod tests;
+
+pub use edited::{splats_of, with_splats};
 
 use crate::field_file;
 use crate::recipe::{Choice, Recipe};
@@ -133,43 +136,70 @@ impl<'a> Checkpoint<'a> {
             shape: tensor.shape.clone(),
             content: Content::Bytes(tensor.bytes()),
         }));
-        // Larger types first, so that all are aligned (the format's own order).
-        tensors.sort_by(|a, b| b.dtype.cmp(&a.dtype).then(a.name.cmp(&b.name)));
-        let mut at = 0;
-        let infos = tensors.iter().map(|tensor| {
-            let from = at;
-            at += tensor.content.len();
-            let info = TensorInfo {
-                dtype: tensor.dtype,
-                shape: tensor.shape.clone(),
-                data_offsets: (from, at),
-            };
-            (tensor.name.clone(), info)
-        });
-        let header = Metadata::new(Some(self.metadata.clone()), infos.collect()).map_err(io::Error::other)?;
-        let mut header = serde_json::to_vec(&header)?;
-        header.resize(header.len().next_multiple_of(8), b' ');
-        out.write_all(&(header.len() as u64).to_le_bytes())?;
-        out.write_all(&header)?;
-        let mut encoded = Vec::new();
-        for tensor in &tensors {
-            match tensor.content {
-                Content::Bytes(bytes) => out.write_all(bytes)?,
-                Content::Planes(planes) => {
-                    for c in 0..planes.count() {
-                        for piece in planes.plane(c)[..planes.len()].chunks(PIECE) {
-                            encoded.resize(4 * piece.len(), 0);
-                            for (to, value) in encoded.as_chunks_mut().0.iter_mut().zip(piece) {
-                                *to = value.to_le_bytes();
-                            }
-                            out.write_all(&encoded)?;
+        write_tensors(tensors, &self.metadata, out)
+    }
+}
+
+/// Writes a safetensors file.
+fn write_tensors(
+    mut tensors: Vec<Tensor>,
+    metadata: &HashMap<String, String>,
+    out: &mut (impl Write + ?Sized),
+) -> io::Result<()> {
+    // Larger types first, so that all are aligned (the format's own order).
+    tensors.sort_by(|a, b| b.dtype.cmp(&a.dtype).then(a.name.cmp(&b.name)));
+    let mut at = 0;
+    let infos = tensors.iter().map(|tensor| {
+        let from = at;
+        at += tensor.content.len();
+        let info = TensorInfo {
+            dtype: tensor.dtype,
+            shape: tensor.shape.clone(),
+            data_offsets: (from, at),
+        };
+        (tensor.name.clone(), info)
+    });
+    let header = Metadata::new(Some(metadata.clone()), infos.collect()).map_err(io::Error::other)?;
+    let mut header = serde_json::to_vec(&header)?;
+    header.resize(header.len().next_multiple_of(8), b' ');
+    out.write_all(&(header.len() as u64).to_le_bytes())?;
+    out.write_all(&header)?;
+    let mut encoded = Vec::new();
+    for tensor in &tensors {
+        match tensor.content {
+            Content::Bytes(bytes) => out.write_all(bytes)?,
+            Content::Planes(planes) => {
+                for c in 0..planes.count() {
+                    for piece in planes.plane(c)[..planes.len()].chunks(PIECE) {
+                        encoded.resize(4 * piece.len(), 0);
+                        for (to, value) in encoded.as_chunks_mut().0.iter_mut().zip(piece) {
+                            *to = value.to_le_bytes();
                         }
+                        out.write_all(&encoded)?;
                     }
                 }
             }
         }
-        Ok(())
     }
+    Ok(())
+}
+
+/// A column of a checkpoint.
+fn planes_of(file: &SafeTensors, name: &str) -> Result<Planes, String> {
+    let view = file.tensor(name).map_err(|e| e.to_string())?;
+    if view.dtype() != Dtype::F32 {
+        return Err(format!("{name} is not {:?}", Dtype::F32));
+    }
+    let [count, len] = view.shape()[..] else {
+        return Err(format!("{name} has {} dimensions", view.shape().len()));
+    };
+    let mut planes = Planes::zeros(count, len);
+    for c in 0..count {
+        let from = view.data()[4 * c * len..4 * (c + 1) * len].as_chunks().0;
+        let to = planes.plane_mut(c)[..len].par_iter_mut().with_min_len(PIECE);
+        to.zip(from).for_each(|(to, from)| *to = f32::from_le_bytes(*from));
+    }
+    Ok(planes)
 }
 
 /// Numbers that are encoded at a time: they stay in cache on their way to the system.
@@ -252,19 +282,7 @@ pub fn from_bytes(bytes: &[u8], dataset: Arc<Dataset>, options: TrainOptions) ->
         }
         Ok((view.shape().to_vec(), view.data()))
     };
-    let planes = |name: &str| -> Result<Planes, TrainError> {
-        let (shape, bytes) = array(name, Dtype::F32)?;
-        let [count, len] = shape[..] else {
-            return Err(wrong(format!("{name} has {} dimensions", shape.len())));
-        };
-        let mut planes = Planes::zeros(count, len);
-        for c in 0..count {
-            let from = bytes[4 * c * len..4 * (c + 1) * len].as_chunks().0;
-            let to = planes.plane_mut(c)[..len].par_iter_mut().with_min_len(PIECE);
-            to.zip(from).for_each(|(to, from)| *to = f32::from_le_bytes(*from));
-        }
-        Ok(planes)
-    };
+    let planes = |name: &str| planes_of(&file, name).map_err(wrong);
     let splats = |owner: &str| -> Result<Splats, TrainError> {
         Ok(Splats {
             means: planes(&format!("{owner}.means"))?,

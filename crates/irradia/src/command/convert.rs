@@ -35,13 +35,19 @@ pub enum QualityArg {
     High,
 }
 
+impl From<QualityArg> for Quality {
+    fn from(quality: QualityArg) -> Self {
+        match quality {
+            QualityArg::Low => Self::Low,
+            QualityArg::Normal => Self::Normal,
+            QualityArg::High => Self::High,
+        }
+    }
+}
+
 pub fn convert(args: &ConvertArgs) -> Result<()> {
     let options = WriteOptions {
-        quality: match args.quality {
-            QualityArg::Low => Quality::Low,
-            QualityArg::Normal => Quality::Normal,
-            QualityArg::High => Quality::High,
-        },
+        quality: args.quality.into(),
         spz_version: match args.spz_version {
             4 => SpzVersion::V4,
             _ => SpzVersion::V3,

@@ -3,6 +3,7 @@
 pub mod compare;
 pub mod convert;
 pub mod demo;
+pub mod edit;
 pub mod eval;
 pub mod files;
 mod film;

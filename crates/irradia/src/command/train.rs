@@ -26,6 +26,9 @@ pub struct Args {
     /// Built-in recipe or a .toml file
     #[arg(long, value_name = "NAME|FILE", default_value = DEFAULT_RECIPE, conflicts_with = "resume")]
     pub recipe: String,
+    /// Begin with the splats of this scene, a file or a run's folder, in the coordinates of the photographs, instead of points
+    #[arg(long, value_name = "SCENE", conflicts_with = "resume")]
+    pub from: Option<PathBuf>,
     /// Train although fewer than 80 % of the photographs could be posed
     #[arg(long)]
     pub anyway: bool,
@@ -59,7 +62,7 @@ pub struct Args {
     #[arg(long, value_name = "RUN", conflicts_with_all = ["out", "overwrite", "downscale", "max_side", "full_size", "holdout", "format"])]
     pub resume: Option<PathBuf>,
     /// Repeat RUN into --out, each step at its recorded pace: the same bytes, even for a run with a --budget
-    #[arg(long, value_name = "RUN", conflicts_with_all = ["resume", "recipe", "set", "steps", "max_splats", "seed", "until_psnr", "budget", "downscale", "max_side", "full_size", "holdout", "format", "background"])]
+    #[arg(long, value_name = "RUN", conflicts_with_all = ["resume", "recipe", "set", "steps", "max_splats", "seed", "until_psnr", "budget", "downscale", "max_side", "full_size", "holdout", "format", "background", "from"])]
     pub replay: Option<PathBuf>,
     /// Replace an existing run in --out
     #[arg(long)]
@@ -179,6 +182,7 @@ fn input(args: &Args) -> Result<TrainInput> {
         lpips,
         reading: args.reading.reading(),
         background: args.background,
+        from: args.from.clone(),
         overwrite: args.overwrite,
         ..TrainInput::new(given(&args.data), given(&args.out))
     })

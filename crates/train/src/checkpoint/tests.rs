@@ -206,3 +206,39 @@ fn an_unknown_parameter_is_rejected_by_name() {
     let other = rewritten(&bytes, "irradia-checkpoint-3", |_| ());
     assert!(read(&other).err().is_some_and(|error| error.contains(FORMAT)));
 }
+
+#[test]
+fn moments_follow_edited_splats() {
+    let mut trainer = trainer();
+    let state = trainer.engine.state_mut();
+    let n = state.len();
+    for i in 0..n {
+        state.moments[0].means.set(1, i, i as f32 + 0.5);
+        state.moments[1].sh.set(2, i, i as f32 + 0.25);
+        state.statistics.set(0, i, i as f32);
+    }
+    let bytes = to_bytes(&trainer);
+    let splats = splats_of(&bytes).unwrap();
+    assert_eq!(splats, trainer.engine.state().splats);
+    let same: Vec<Option<u32>> = (0..n as u32).map(Some).collect();
+    assert!(
+        with_splats(&bytes, &splats, &same).unwrap() == bytes,
+        "an edit that changes nothing"
+    );
+
+    // The last splat, a new one, the first.
+    let edited = splats.gather(&[n as u32 - 1, 3, 0]);
+    let sources = [Some(n as u32 - 1), None, Some(0)];
+    let bytes = with_splats(&bytes, &edited, &sources).unwrap();
+    let resumed = from_bytes(&bytes, dataset(), TrainOptions::default()).unwrap();
+    let state = resumed.engine.state();
+    assert_eq!((state.splats.means.clone(), resumed.clock.step), (edited.means, 7));
+    let first = |c: usize| (0..3).map(|i| state.moments[0].means.get(c, i)).collect::<Vec<_>>();
+    assert_eq!(first(1), [n as f32 - 0.5, 0.0, 0.5]);
+    assert_eq!(state.moments[1].sh.get(2, 0), n as f32 - 0.75);
+    assert_eq!(
+        (state.statistics.get(0, 0), state.statistics.get(0, 1)),
+        (n as f32 - 1.0, 0.0)
+    );
+    assert!(splats_of(&bytes[..bytes.len() - 9]).is_err() && splats_of(b"no checkpoint").is_err());
+}

@@ -1,0 +1,86 @@
+//! Checkpoints of edited scenes: the optimiser's state follows the splats.
+
+use super::{COLUMN_NAMES, Content, OWNERS, Tensor, planes_of, recipe_of, write_tensors};
+use crate::trainer::TrainError;
+use irradia_compute::Planes;
+use irradia_splat::Splats;
+use safetensors::tensor::SafeTensors;
+
+/// The splats of a checkpoint, in its order and in the world of its training.
+///
+/// # Errors
+/// When the bytes are not a checkpoint of this program.
+pub fn splats_of(bytes: &[u8]) -> Result<Splats, TrainError> {
+    recipe_of(bytes)?;
+    let damaged = |why: String| TrainError::Checkpoint(format!("the checkpoint is damaged: {why}"));
+    let file = SafeTensors::deserialize(bytes).map_err(|e| damaged(e.to_string()))?;
+    let mut splats = Splats::default();
+    for (name, planes) in COLUMN_NAMES.iter().zip(splats.columns_mut()) {
+        *planes = planes_of(&file, &format!("{}.{name}", OWNERS[0])).map_err(damaged)?;
+    }
+    let shapes = |splats: &Splats| splats.columns().map(|column| (column.count(), column.len()));
+    match shapes(&splats) == shapes(&Splats::zeros(splats.len(), splats.sh_degree())) {
+        true => Ok(splats),
+        false => Err(damaged("its columns have different lengths".into())),
+    }
+}
+
+/// The checkpoint with other splats. Splat i was number `sources[i]` and keeps its moments, statistics and filter; without a source they
+/// are zero.
+///
+/// # Errors
+/// When the bytes are not a checkpoint of this program.
+///
+/// # Panics
+/// When there is not a source for every splat, or the splats have other bands than those of the checkpoint.
+pub fn with_splats(bytes: &[u8], splats: &Splats, sources: &[Option<u32>]) -> Result<Vec<u8>, TrainError> {
+    let before = splats_of(bytes)?;
+    assert_eq!(splats.len(), sources.len(), "a source for every splat");
+    assert_eq!(splats.sh.count(), before.sh.count(), "the bands of the checkpoint");
+    let damaged = |why: String| TrainError::Checkpoint(format!("the checkpoint is damaged: {why}"));
+    let file = SafeTensors::deserialize(bytes).map_err(|e| damaged(e.to_string()))?;
+    let (_, header) = SafeTensors::read_metadata(bytes).map_err(|e| damaged(e.to_string()))?;
+    let of_splats: Vec<String> = COLUMN_NAMES
+        .iter()
+        .map(|name| format!("{}.{name}", OWNERS[0]))
+        .collect();
+    let followers = OWNERS[1..]
+        .iter()
+        .flat_map(|owner| COLUMN_NAMES.map(|name| format!("{owner}.{name}")));
+    let followers: Vec<String> = followers
+        .chain(["statistics".to_owned(), "filter".to_owned()])
+        .collect();
+    let mut followed = Vec::new();
+    for name in &followers {
+        let planes = planes_of(&file, name).map_err(damaged)?;
+        if planes.len() != before.len() {
+            return Err(damaged("its columns have different lengths".into()));
+        }
+        let mut moved = Planes::zeros(planes.count(), splats.len());
+        for c in 0..planes.count() {
+            let (from, to) = (planes.plane(c), moved.plane_mut(c));
+            for (to, source) in to.iter_mut().zip(sources) {
+                *to = source.map_or(0.0, |source| from[source as usize]);
+            }
+        }
+        followed.push(moved);
+    }
+    let mut tensors: Vec<Tensor> = Vec::new();
+    for (name, view) in file.iter() {
+        let is_column = |list: &[String]| list.iter().position(|known| known == name);
+        tensors.push(match (is_column(&of_splats), is_column(&followers)) {
+            (Some(column), _) => Tensor::of_planes(name.to_owned(), splats.columns()[column]),
+            (_, Some(column)) => Tensor::of_planes(name.to_owned(), &followed[column]),
+            _ => Tensor {
+                name: name.to_owned(),
+                dtype: view.dtype(),
+                shape: view.shape().to_vec(),
+                content: Content::Bytes(view.data()),
+            },
+        });
+    }
+    let mut edited = Vec::new();
+    let metadata = header.metadata().clone().unwrap_or_default();
+    write_tensors(tensors, &metadata, &mut edited).expect("in memory");
+    Ok(edited)
+}

@@ -125,7 +125,7 @@ test("handles move what is selected, which stays selected, and a region is pulle
   await edited(page, (e) => e.selected > 0);
   const { selected, box } = await get(page, "editing");
   await page.getByRole("button", { name: "Rectangle" }).click();
-  await page.getByRole("button", { name: "Move", exact: true }).click();
+  await page.getByRole("group", { name: "Handles" }).getByRole("button", { name: "Move" }).click();
   await sharp(page);
   const middle = await page.evaluate(async (box) => {
     const stage = document.querySelector("irr-stage");
@@ -138,7 +138,7 @@ test("handles move what is selected, which stays selected, and a region is pulle
   const moved = await get(page, "editing");
   assert.equal(moved.selected, selected, "the same splats");
   assert.ok(Math.hypot(...moved.box[0].map((v, c) => v - box[0][c])) > 0.01);
-  await page.getByRole("button", { name: "Scale", exact: true }).click();
+  await page.getByRole("group", { name: "Handles" }).getByRole("button", { name: "Scale" }).click();
   await drag(page, [[middle[0] + 0.1, middle[1]], [middle[0] + 0.15, middle[1] - 0.05]]);
   await edited(page, (e) => e.at === 3);
   const scaled = await get(page, "editing");

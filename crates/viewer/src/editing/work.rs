@@ -71,12 +71,15 @@ impl Bench {
         let edition = subject.edition();
         let scene = edition.as_ref().map(|edition| edition.scene());
         let cameras = scene.and_then(|scene| scene.cameras.as_deref()).unwrap_or_default();
+        let session = Session::new(Draft::new(cloud, cameras.to_vec()));
+        let drawn = scene.and_then(|scene| scene.model.splats()).map(Splats::len);
         Ok(Self {
-            session: Session::new(Draft::new(cloud, cameras.to_vec())),
             options: scene.map_or_else(RenderOptions::default, |scene| scene.options),
             before: false,
             saved: None,
-            shown: None,
+            // What is drawn was read from the same file.
+            shown: (drawn == Some(session.draft().len())).then(|| (session.original().clone(), None)),
+            session,
             mask: 0,
             masks: 0,
         })

@@ -194,7 +194,7 @@ class EditPanel extends HTMLElement {
       choose(ways, state.get("transform"));
     });
     return section("Selection", el("div", { className: "buttons" }, ...edits), el("div", { className: "row wrap" }, show, unlock),
-      el("div", { className: "row" }, el("span", { className: "label", textContent: "Handles" }), ways));
+      line("Handles", ways));
   }
 
   coloring() {
@@ -238,7 +238,7 @@ class EditPanel extends HTMLElement {
       const of = state.get("editing")?.of ?? 0;
       if (document.activeElement !== number) number.value = `${Math.round(of / 2)}`;
     });
-    return section("Scene", row("Upright", found, view), row("Scale", measure), el("div", { className: "row" }, known, set), row("Splats", number, reduce));
+    return section("Scene", line("Upright", found, view), line("Scale", measure), el("div", { className: "row" }, known, set), row("Splats", number, reduce));
   }
 
   history() {
@@ -269,6 +269,9 @@ const button = (text, title, onclick) => el("button", { type: "button", textCont
 
 /** @param {Parameters<typeof icon>[0]} name @param {string} label @param {() => void} onclick */
 const tool = (name, label, onclick) => el("button", { type: "button", className: "icon", title: label, "aria-label": label, onclick }, icon(name));
+
+/** A row of buttons, which have names of their own. @param {string} label @param {...Node} controls */
+const line = (label, ...controls) => el("div", { className: "row" }, el("span", { className: "label", textContent: label }), ...controls);
 
 /** @param {number} min @param {number} max @param {number} step */
 function slider(min, max, step) {

@@ -179,16 +179,20 @@ impl Bench {
     }
 }
 
-/// The corners of the box around the centres of the selected splats, world.
+/// The corners of a box around the centres of the selected splats, world. Along each axis the outermost hundredth is left out: what a
+/// lasso catches in the far background would make the box say nothing.
 fn box_around(draft: &Draft, selected: &Selection) -> Option<[[f32; 3]; 2]> {
-    let (mut low, mut high) = ([f32::INFINITY; 3], [f32::NEG_INFINITY; 3]);
     let means = draft.cloud.means.iter().zip(selected.as_slice());
-    for (mean, _) in means.filter(|(_, selected)| **selected) {
-        for c in 0..3 {
-            (low[c], high[c]) = (low[c].min(mean[c]), high[c].max(mean[c]));
-        }
-    }
-    (low[0] <= high[0]).then_some([low, high])
+    let means: Vec<[f32; 3]> = means
+        .filter(|(_, selected)| **selected)
+        .map(|(mean, _)| *mean)
+        .collect();
+    let last = means.len().checked_sub(1)?;
+    let bounds = [0, 1, 2].map(|c| {
+        let mut values: Vec<f32> = means.iter().map(|mean| mean[c]).collect();
+        [last / 100, last - last / 100].map(|at| *values.select_nth_unstable_by(at, f32::total_cmp).1)
+    });
+    Some([0, 1].map(|side| bounds.map(|bound| bound[side])))
 }
 
 /// The scene to draw.

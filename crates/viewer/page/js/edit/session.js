@@ -5,7 +5,7 @@ import { state } from "../state.js";
 
 /** @typedef {import("../math.js").Vec3} Vec3 */
 /** One entry of the list. @typedef {{ kind: "select" | "edit", text: string }} Entry */
-/** What the server says of the session: how many splats are selected, of how many, and the box around them; the list, of which the
+/** What the server says of the session: how many splats are selected, of how many, and the box around nearly all of them; the list, of which the
  * first `at` entries are made, from number `first` on; the gesture of the last one made.
  * @typedef {{ selected: number, of: number, hidden: number, locked: number, box: [Vec3, Vec3] | null, at: number, first: number,
  *   total: number, entries: Entry[], gesture: number, before: boolean, busy: boolean, mask: number, saved: string | null }} Editing */

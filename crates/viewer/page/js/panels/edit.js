@@ -217,10 +217,10 @@ class EditPanel extends HTMLElement {
   }
 
   scene() {
-    const found = button("Found", "Finds up and the ground from the cameras and the densest plane", () => session.edit({ op: "upright" }, true));
+    const found = button("Find", "Finds up and the ground from the cameras and the densest plane", () => session.edit({ op: "upright" }, true));
     state.watch(["views"], () => (found.hidden = state.get("views").length === 0));
     const view = button("This view's up", "Turns the scene so that the up axis of the Scene panel points up in its file", () => session.edit({ op: "upright", up: state.get("up") }, true));
-    const known = el("input", { type: "number", min: "0", step: "any", placeholder: "metres", "aria-label": "True length in metres, for the scale" });
+    const known = el("input", { type: "number", min: "0", step: "any", placeholder: "metres", "aria-label": "Metres between the points" });
     const measure = button("Measure", "Click two points (M)", () => state.set({ tool: "measure", measured: [] }));
     const set = button("Set scale", "Scales the scene to metres", () => {
       const [a, b] = state.get("measured");

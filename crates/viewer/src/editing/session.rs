@@ -352,8 +352,9 @@ impl Session {
             debug_assert_eq!(made, edits);
             self.set_draft(draft);
         }
-        self.steps = self.steps_at(at);
-        self.selected = Arc::new(select(&self.draft, &self.steps)?);
+        let steps = self.steps_at(at);
+        self.selected = Arc::new(self.evaluate(&steps, 0)?);
+        self.steps = steps;
         Ok(())
     }
 
@@ -405,8 +406,12 @@ fn bytes_of(cloud: &GaussianCloud) -> usize {
 
 /// A selection in the list.
 fn select_text(steps: &[SelectStep], replace: bool) -> String {
-    let Some(last) = steps.last() else { return String::new() };
-    let name = match &last.shape {
+    let Some(first) = steps.first() else {
+        return String::new();
+    };
+    let connected = steps.iter().find(|step| matches!(step.shape, Shape::Connected { .. }));
+    let named = &connected.unwrap_or(first).shape;
+    let name = match named {
         Shape::All {} => "All",
         Shape::Box { .. } => "Box",
         Shape::Sphere { .. } => "Sphere",
@@ -426,13 +431,8 @@ fn select_text(steps: &[SelectStep], replace: bool) -> String {
         Shape::Connected { .. } => "Connected",
         Shape::Last {} => "Last",
     };
-    match (replace, steps[0].mode) {
-        (false, Mode::Add)
-            if !matches!(
-                last.shape,
-                Shape::Invert {} | Shape::Grow { .. } | Shape::Connected { .. }
-            ) =>
-        {
+    match (replace, first.mode) {
+        (false, Mode::Add) if !matches!(named, Shape::Invert {} | Shape::Grow { .. } | Shape::Connected { .. }) => {
             format!("+ {name}")
         }
         (_, Mode::Subtract) => format!("− {name}"),

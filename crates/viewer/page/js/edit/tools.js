@@ -141,7 +141,8 @@ export class Tools extends EventTarget {
       state.set({ dropped: { color: picked.splat.base, mode } });
     } else if (tool === "connected" && picked.splat) {
       const reach = Math.max(picked.splat.scales[0], 0.002 * (state.get("scene")?.radius ?? 1));
-      session.select([ball(picked.splat.mean, 1.5 * reach), { shape: "connected" }], mode);
+      // It grows what is selected: there is nothing that it could be taken away from.
+      session.select([ball(picked.splat.mean, 1.5 * reach), { shape: "connected" }], mode === "add" ? "add" : "replace");
     }
   }
 }

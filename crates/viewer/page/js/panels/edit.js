@@ -133,7 +133,9 @@ class EditPanel extends HTMLElement {
       const measure = chosen();
       if (!measure) return;
       at.value.textContent = measure[7](Number(at.input.value));
-      session.select(measure[6](Number(at.input.value)), state.get("selectMode"), session.live("measure"));
+      const shapes = measure[6](Number(at.input.value));
+      // What inverts would invert what was selected before, too.
+      session.select(shapes, shapes.length > 1 ? "replace" : state.get("selectMode"), session.live("measure"));
     };
     which.onchange = () => {
       const measure = chosen();

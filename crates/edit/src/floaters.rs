@@ -19,14 +19,16 @@ const SUPPORTED: f32 = 2.0;
 const ISOLATED: [f32; 2] = [12.0, 4.0];
 /// Ratio of the largest to the middle standard deviation of a needle, and its length.
 const NEEDLE: [f32; 2] = [15.0, 0.1];
-/// Size of a huge splat.
+/// Size of a huge splat; and of one that is huge among smaller ones, its size in units of spacing: a background's splats are as large as
+/// they are apart.
 const HUGE: f32 = 0.6;
+const HUGE_AMONG: [f32; 2] = [0.35, 4.0];
 /// Spacing in units of size of a splat that no view shows.
 const UNSEEN: f32 = 6.0;
-/// Of a splat in front of what views show: the share of views that see past it, its spacing in units of size, its opacity, and the
-/// largest sum of its blending weights as a share of a picture's pixels. Fainter and smaller ones are many, do no harm, and in a forward-facing capture
+/// Of a splat in front of what views show: the share of views that see past it, its spacing in units of size, the product of both, its
+/// opacity, and the largest sum of its blending weights as a share of a picture's pixels. Fainter and smaller ones are many, do no harm, and in a forward-facing capture
 /// of leaves are leaves.
-const IN_FRONT: [f32; 4] = [0.8, 2.5, 0.05, 1e-4];
+const IN_FRONT: [f32; 5] = [0.4, 2.5, 2.0, 0.05, 1e-4];
 
 /// How much each reason speaks for a splat being a floater.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -99,7 +101,7 @@ pub fn floater_scores(draft: &Draft) -> Vec<FloaterScores> {
             let scores = FloaterScores {
                 isolated: (apart / ISOLATED[0]).min(spacing / usual / ISOLATED[1]),
                 needle: (elongation / NEEDLE[0]).min(largest / reach / NEEDLE[1]),
-                huge: largest / reach / HUGE,
+                huge: (largest / reach / HUGE).max((largest / reach / HUGE_AMONG[0]).min(1.0 / apart / HUGE_AMONG[1])),
                 ..FloaterScores::default()
             };
             (scores, apart)
@@ -144,7 +146,8 @@ fn score_views(draft: &Draft, shown: &Selection, apart: &[f32], scores: &mut [Fl
         if whole.contains(i) {
             scores.unseen = if votes.seen { 0.0 } else { apart[i] / UNSEEN };
             let opacity = sigmoid(cloud.opacity_logits[i]);
-            let found = [votes.in_front_share(), apart[i], opacity, votes.weight];
+            let share = votes.in_front_share();
+            let found = [share, apart[i], share * apart[i], opacity, votes.weight];
             let ratios = found.iter().zip(IN_FRONT).map(|(found, needed)| found / needed);
             scores.in_front = ratios.fold(f32::INFINITY, f32::min);
         }

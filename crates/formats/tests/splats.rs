@@ -121,7 +121,11 @@ fn every_format_round_trips_within_its_precision() {
     for (name, quality, spz_version, position, scale, color, harmonic, rotation) in cases {
         for degree in 0..=4 {
             let cloud = scene(600, degree);
-            let options = WriteOptions { quality, spz_version };
+            let options = WriteOptions {
+                quality,
+                spz_version,
+                palette: None,
+            };
             let back = round_trip(name, &cloud, options);
             let format = SplatFormat::of(Path::new(name)).unwrap();
             assert_eq!(back.sh_degree, degree.min(format.max_degree()), "{name}");

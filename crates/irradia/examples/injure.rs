@@ -3,16 +3,17 @@
 //! ```text
 //! cargo run --release --example injure -- DATA OUT --gains 0.6,1.6 --balance 0.15      # exposure and white balance per photograph
 //! cargo run --release --example injure -- DATA OUT --pose-noise 0.5,0.005              # degrees, fraction of the scene's extent
+//! cargo run --release --example injure -- DATA OUT --people 0.33                       # share of the training photographs
 //! ```
 //!
 //! The copy is a nerfstudio folder with the split of the original, undistorted PNG images and its points. Faults affect all
-//! photographs, including held-out ones. Tracks of points are not copied.
+//! photographs, including held-out ones, except people, who walk through training views only. Tracks of points are not copied.
 
 use anyhow::{Context, Result, bail};
 use clap::Parser;
 use glam::{Mat4, Quat, Vec3};
 use irradia_formats::{DatasetOptions, read_dataset, write_atomic, write_png, write_points_ply};
-use irradia_scene::{Camera, Dataset, Rng};
+use irradia_scene::{Camera, Dataset, Photo, Rng};
 use irradia_splat::init::camera_extent;
 use rayon::prelude::*;
 use serde_json::{Value, json};
@@ -36,6 +37,9 @@ struct Args {
     /// Standard deviations of the poses' rotation in degrees and of their position in extents of the scene
     #[arg(long, value_name = "DEG,FRACTION", value_parser = pair)]
     pose_noise: Option<[f32; 2]>,
+    /// Share of the training photographs with a textured box the size of a person, each time elsewhere
+    #[arg(long, default_value_t = 0.0)]
+    people: f32,
     /// Random seed
     #[arg(long, default_value_t = 0)]
     seed: u64,
@@ -85,6 +89,28 @@ fn main() -> Result<()> {
     Ok(())
 }
 
+/// Covers a box of 0.55 x 0.2 times the height at a random place: dark legs, a chequered shirt, a head, the same in every photograph.
+fn stand_in_the_way(photo: &mut Photo, rng: &mut Rng) {
+    let (columns, rows) = (photo.width as usize, photo.height as usize);
+    let (tall, wide) = (rows * 11 / 20, rows / 5);
+    let left = rng.below((columns.saturating_sub(wide) + 1) as u32) as usize;
+    let top = rng.below((rows - tall + 1) as u32) as usize;
+    let check = (wide / 8).max(1);
+    let channels = photo.channels as usize;
+    for y in 0..tall {
+        for x in 0..wide.min(columns) {
+            let color = match 100 * y / tall {
+                0..15 => [224, 172, 140],
+                15..55 if (x / check + y / check).is_multiple_of(2) => [200, 40, 40],
+                15..55 => [235, 225, 210],
+                _ => [40, 44, 70],
+            };
+            let at = channels * ((top + y) * columns + left + x);
+            photo.data[at..at + 3].copy_from_slice(&color);
+        }
+    }
+}
+
 /// Writes one photograph; returns its frame of `transforms.json`.
 fn write_view(args: &Args, dataset: &Dataset, extent: f32, view: usize) -> Result<Value> {
     let mut rng = Rng::new(args.seed, view as u64);
@@ -100,6 +126,9 @@ fn write_view(args: &Args, dataset: &Dataset, extent: f32, view: usize) -> Resul
         for (value, factor) in pixel.iter_mut().zip(factors) {
             *value = (f32::from(*value) * factor).round().min(255.0) as u8;
         }
+    }
+    if args.people > 0.0 && dataset.train.contains(&view) && rng.uniform() < args.people {
+        stand_in_the_way(&mut photo, &mut rng);
     }
     let name = format!("images/{view:05}.png");
     write_png(

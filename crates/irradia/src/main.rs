@@ -48,6 +48,8 @@ enum Command {
     Info(command::files::InfoArgs),
     /// Convert a scene to another file format, by the end of its name, and say what it costs
     Convert(command::convert::ConvertArgs),
+    /// Make a scene small: fewer splats, trained to take the place of the others and to suit the file
+    Compact(command::compact::Args),
     /// Edit a scene: select, delete, move, recolour, remove floaters, merge, ..
     Edit(command::edit::Args),
     /// Write a ray-traced scene as a dataset: images, depth, normals, points, cameras
@@ -80,6 +82,7 @@ fn main() -> ExitCode {
         Command::Share(args) => command::share::run(&args),
         Command::Info(args) => command::files::info(&args),
         Command::Convert(args) => command::convert::convert(&args),
+        Command::Compact(args) => command::compact::run(&args),
         Command::Edit(args) => command::edit::run(&args),
         Command::Synth(args) => command::demo::synth(&args),
     };

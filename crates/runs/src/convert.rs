@@ -5,7 +5,7 @@ use crate::orbit::orbit;
 use crate::{RunError, scene_of};
 use irradia_formats::{SplatFormat, WriteOptions, read_splat_file, read_splats, splat_file_size, write_splats_with};
 use irradia_measure::psnr;
-use irradia_scene::GaussianCloud;
+use irradia_scene::{GaussianCloud, Similarity};
 use irradia_splat::{RenderOptions, Renderer, Splats};
 use irradia_train::model::Model;
 use std::borrow::Cow;
@@ -54,20 +54,24 @@ pub fn convert(input: &Path, output: &Path, options: &WriteOptions, compares: bo
     })
 }
 
+/// `cloud`, read from a file that may hold no world, in the world of `world_from_dataset`, in which it was written.
+pub(crate) fn in_world(mut cloud: GaussianCloud, world_from_dataset: &Similarity) -> GaussianCloud {
+    if cloud.world_from_dataset != *world_from_dataset {
+        // The file has the dataset's unit, about the origin of the world.
+        let (scale, log_scale) = (world_from_dataset.scale as f32, world_from_dataset.scale.ln() as f32);
+        let lengths = cloud.means.as_flattened_mut().iter_mut();
+        lengths.for_each(|v| *v *= scale);
+        let logarithms = cloud.log_scales.as_flattened_mut().iter_mut();
+        logarithms.for_each(|v| *v += log_scale);
+        cloud.world_from_dataset = *world_from_dataset;
+    }
+    cloud
+}
+
 /// PSNR of each view around the scene.
 fn compare(input: &Path, before: &GaussianCloud, output: &Path) -> Result<Vec<f64>, RunError> {
     let world = before.world_from_dataset;
-    let mut after = read_splats(output)?;
-    if after.world_from_dataset != world {
-        // The file has the dataset's unit, about the origin of the world.
-        let (scale, log_scale) = (world.scale as f32, world.scale.ln() as f32);
-        after.means.as_flattened_mut().iter_mut().for_each(|v| *v *= scale);
-        after
-            .log_scales
-            .as_flattened_mut()
-            .iter_mut()
-            .for_each(|v| *v += log_scale);
-    }
+    let after = in_world(read_splats(output)?, &world);
     // The flag itself is no part of the comparison: where a format loses it, a note says so.
     let options = RenderOptions {
         antialias: before.antialiased,

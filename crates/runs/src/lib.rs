@@ -29,7 +29,8 @@
 //! | view a training run from another thread | [`Run::snapshots`] |
 //! | read and render a scene | [`Scene`] |
 //! | evaluate a scene against photographs | [`evaluate`] |
-//! | convert a scene to another format | [`convert`] |
+//! | convert a scene to another format | [`convert`], [`write_levels`] |
+//! | make a scene small | [`CompactInput`], [`compact`] |
 //! | edit a scene | [`Editing`] |
 //! | describe a file or folder | [`describe`] |
 //!
@@ -41,6 +42,7 @@
 #![forbid(unsafe_code)]
 
 mod background;
+mod compact;
 mod convert;
 mod describe;
 mod edit;
@@ -48,6 +50,7 @@ mod error;
 mod evaluate;
 mod folder;
 mod journal;
+mod levels;
 mod lock;
 mod orbit;
 mod path;
@@ -63,6 +66,7 @@ mod snapshot;
 mod synth_files;
 
 pub use background::Background;
+pub use compact::{CompactEvent, CompactInput, CompactTarget, Compacted, compact};
 pub use convert::{COMPARED_VIEWS, Conversion, convert};
 pub use describe::describe;
 pub use edit::{EDITS, Editing, Made};
@@ -74,6 +78,7 @@ pub use irradia_scene as scene;
 pub use irradia_synth as synth;
 pub use irradia_train as train;
 pub use journal::logged_errors;
+pub use levels::{LEVELS, Level, level_file, read_levels, write_levels};
 pub use orbit::Outlook;
 pub use path::{CameraPath, Film, PathKey};
 pub use pose::{CameraReport, LeftOutPhoto, PoseInput, PoseProgress, PoseReport, StageReport, is_film, pose};

@@ -4,7 +4,7 @@ use crate::RunError;
 use crate::folder::{FIELD, RESIDUAL, SCENE, cameras_beside, world_beside};
 use crate::orbit::{Outlook, orbit, outlook};
 use irradia_field::{Field, Sampler};
-use irradia_formats::read_splats;
+use irradia_formats::{SplatFormat, is_sog_folder, read_splats};
 use irradia_scene::{Camera, Dataset, Similarity};
 use irradia_splat::{RenderOptions, Renderer, Splats};
 use irradia_train::model::{Frame, Model};
@@ -92,13 +92,12 @@ impl Scene {
     }
 }
 
-/// By which a folder of SOG images is recognised.
-const SOG_META: &str = "meta.json";
-
 /// The file of the scene if `path` is a run's folder or one of SOG images, otherwise `path` itself.
 pub fn scene_of(path: &Path) -> PathBuf {
-    let files = [SCENE, FIELD, SOG_META].map(|name| path.join(name));
-    files.into_iter().find(|file| file.is_file()).unwrap_or(path.to_owned())
+    let files = [SCENE, FIELD].map(|name| path.join(name));
+    let meta = is_sog_folder(path).then(|| path.join(SplatFormat::SogFolder.suffix()));
+    let found = files.into_iter().find(|file| file.is_file());
+    found.or(meta).unwrap_or(path.to_owned())
 }
 
 /// The field in a file.

@@ -48,6 +48,11 @@ impl Pose {
         (rotation, -(rotation * self.position))
     }
 
+    /// How far `other` is: the distance of the positions in units of `unit`, plus the angle of the rotations.
+    pub fn distance(&self, other: &Self, unit: f32) -> f32 {
+        self.position.distance(other.position) / unit + self.rotation.angle_between(other.rotation)
+    }
+
     /// Whether every number is finite and the rotation is not the zero quaternion.
     pub fn is_valid(&self) -> bool {
         self.rotation.is_finite() && self.position.is_finite() && self.rotation.length_squared() > 1e-12

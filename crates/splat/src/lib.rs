@@ -6,11 +6,15 @@ pub mod densify;
 mod engine;
 pub mod filter;
 pub mod init;
+pub mod levels;
 mod nearest;
+mod principal;
 pub mod regularize;
 pub mod render;
 mod splats;
 mod state;
+
+pub(crate) use principal::eigen;
 
 pub use engine::{Engine, Noise, Placement, Update};
 pub use nearest::{Nearest, Neighbour};

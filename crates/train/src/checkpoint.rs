@@ -15,6 +15,7 @@ use crate::socket::Exposure;
 use crate::tensor_file::{NamedTensor, TensorSource};
 use crate::times::Times;
 use crate::trainer::{TrainError, TrainOptions, Trainer};
+use crate::transients::Hidden;
 use irradia_compute::Planes;
 use irradia_scene::Dataset;
 use irradia_splat::{COLUMN_NAMES, SplatState, Splats};
@@ -34,6 +35,8 @@ const FIELD: &str = "field.";
 const TIMES: &str = "times";
 /// Views to train on, where misfits are left out.
 const TRAINED: &str = "trained_views";
+/// View and block of what is hidden as transient.
+const HIDDEN: &str = "hidden_blocks";
 const OWNERS: [&str; 3] = ["splats", "first_moments", "second_moments"];
 
 /// A training run between two steps, as it is written: the splats' columns are borrowed, or copied to be written while training
@@ -86,6 +89,9 @@ impl<'a> Checkpoint<'a> {
         if trainer.trained.len() < trainer.dataset.train.len() {
             let trained: Vec<u64> = trainer.trained.iter().map(|view| *view as u64).collect();
             others.push(NamedTensor::whole(TRAINED, &trained));
+        }
+        if trainer.hidden.views() > 0 {
+            others.push(NamedTensor::whole(HIDDEN, &trainer.hidden.to_pairs()));
         }
         let carried = carried::named(&clock.carried);
         others.extend(carried.map(|(name, value)| NamedTensor::double(name, &[value])));
@@ -360,6 +366,11 @@ pub fn from_bytes(bytes: &[u8], dataset: Arc<Dataset>, options: TrainOptions) ->
             return Err(wrong(format!("{TRAINED} and the dataset do not agree")));
         }
         trainer.trained = trained.iter().map(|view| *view as usize).collect();
+    }
+    if let Some(pairs) = tensors("").whole(HIDDEN) {
+        let camera = |view: usize| trainer.dataset.views.get(view).map(|view| &view.camera);
+        trainer.hidden = Hidden::from_pairs(&pairs, camera)
+            .ok_or_else(|| wrong(format!("{HIDDEN} and the dataset do not agree")))?;
     }
     (trainer.pace, trainer.seconds, trainer.cpu_seconds) = (*pace, *seconds, *cpu_seconds);
     if let Ok((_, bytes)) = array(TIMES, Dtype::F64) {

@@ -55,12 +55,10 @@ fn unpredicted(views: &[(Camera, f64)], unit: f32) -> Option<f64> {
         return None;
     }
     let residual = |(i, (camera, own)): (usize, &(Camera, f64))| {
-        let distance = |other: &Camera| {
-            let moved = camera.pose.position.distance(other.pose.position) / unit;
-            moved + camera.pose.rotation.angle_between(other.pose.rotation)
-        };
         let others = views.iter().enumerate().filter(|(k, _)| *k != i);
-        let mut near: Vec<(f32, f64)> = others.map(|(_, (other, log))| (distance(other), *log)).collect();
+        let mut near: Vec<(f32, f64)> = others
+            .map(|(_, (other, log))| (camera.pose.distance(&other.pose, unit), *log))
+            .collect();
         near.sort_by(|a, b| a.0.total_cmp(&b.0));
         let predicted = near[..NEIGHBOURS].iter().map(|(_, log)| log).sum::<f64>() / NEIGHBOURS as f64;
         own - predicted
@@ -75,7 +73,7 @@ impl Trainer {
     pub(crate) fn decide_exposure(&mut self) -> Result<Option<Event>, TrainError> {
         let plan = plan(&self.recipe, &self.clock);
         let mut measured = Vec::new();
-        self.show_training_views(VIEWS, &plan, |trainer, view, photo| {
+        self.show_training_views(VIEWS, &plan, false, |trainer, view, photo| {
             let color = trainer.sockets.frame_color(&trainer.engine);
             measured.extend(log_exposure(color, photo).map(|log| (view, log)));
         })?;

@@ -1,6 +1,7 @@
 //! Training: recipes, the schedule, the loop, checkpoints and reports. Start at [`Trainer::step`].
 #![forbid(unsafe_code)]
 
+mod audit;
 pub mod checkpoint;
 pub mod compare;
 mod edges;
@@ -29,6 +30,7 @@ pub mod socket;
 pub mod tensor_file;
 pub mod times;
 mod trainer;
+mod transients;
 
 pub use recipe::{Recipe, RecipeError};
 pub use run::{RunLimits, run};

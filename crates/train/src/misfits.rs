@@ -7,11 +7,8 @@
 
 use crate::event::Event;
 use crate::robust::{median, spread};
-use crate::schedule::plan;
-use crate::trainer::{TrainError, Trainer};
+use crate::trainer::Trainer;
 
-/// Fraction of a run after which the decision is made.
-pub(crate) const AT: f64 = 0.2;
 /// Training views below which nothing is decided.
 const MIN_VIEWS: usize = 8;
 /// Standard deviations of the ln errors, from their median, beyond which a photograph is a misfit: five wrong poses of fifty were at 7
@@ -21,8 +18,6 @@ const DEVIATIONS: f64 = 5.0;
 const FACTOR: f64 = 2.5;
 /// Largest share of misfits: with more of them it is not clear who is wrong.
 const MOST: f64 = 0.2;
-/// Steps of a run for each training view below which nothing is decided: the renders would cost more than a twentieth of it.
-const STEPS_PER_VIEW: usize = 8;
 
 /// Those of `errors` that are far beyond the others' spread, worst first.
 fn outliers(errors: &[(usize, f64)]) -> Vec<(usize, f64)> {
@@ -41,26 +36,22 @@ fn outliers(errors: &[(usize, f64)]) -> Vec<(usize, f64)> {
 }
 
 impl Trainer {
-    /// Leaves out the photographs that do not fit the others, and says which.
-    pub(crate) fn leave_out_misfits(&mut self) -> Result<Option<Event>, TrainError> {
-        let count = self.trained.len();
-        if self.total_steps() < (STEPS_PER_VIEW * count) as u64 {
-            return Ok(None);
-        }
-        let plan = plan(&self.recipe, &self.clock);
-        let mut errors = Vec::with_capacity(count);
-        self.show_training_views(count, &plan, |trainer, view, photo| {
-            errors.push((view, trainer.error_of_frame(photo)));
-        })?;
-        let found = outliers(&errors);
+    /// Leaves out the photographs whose `errors`, over all pixels and over those that fit best, are both beyond the others', and says
+    /// which: a person before the camera makes a part of a photograph worse, a wrong pose all of it.
+    pub(crate) fn leave_out_misfits(&mut self, errors: &[(usize, [f64; 2])]) -> Option<Event> {
+        let [mut found, trimmed] = [0, 1].map(|kind| {
+            let errors: Vec<(usize, f64)> = errors.iter().map(|(view, error)| (*view, error[kind])).collect();
+            outliers(&errors)
+        });
+        found.retain(|(view, _)| trimmed.iter().any(|(other, _)| other == view));
         if found.is_empty() {
-            return Ok(None);
+            return None;
         }
         let names: Vec<String> = found
             .iter()
             .map(|(view, factor)| format!("{} ({factor:.1} times the usual error)", self.dataset.views[*view].name))
             .collect();
-        let (names, n) = (names.join(", "), found.len());
+        let (names, n, count) = (names.join(", "), found.len(), errors.len());
         let message = if n as f64 > MOST * count as f64 {
             format!(
                 "{n} of {count} photographs do not fit the others, too many to leave out; are their poses right? {names}"
@@ -72,7 +63,7 @@ impl Trainer {
                 "{n} of {count} photographs do not fit the others and are left out from here on (--set drop_misfits=false keeps them); are their poses right? {names}"
             )
         };
-        Ok(Some(Event::Warned { message }))
+        Some(Event::Warned { message })
     }
 }
 

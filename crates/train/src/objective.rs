@@ -15,6 +15,9 @@ use std::sync::Arc;
 
 /// Side of the random LPIPS crop of a step, pixels.
 pub(crate) const PATCH: usize = 128;
+/// Share of the pixels by which a photograph is compared with the others: a person before the camera makes the rest worse, a wrong pose
+/// makes all of them worse.
+const TRIMMED: f32 = 0.7;
 /// Edge sensitivity of depth smoothness: a colour edge of 0.1 reduces it to 1 / e (Godard et al. 2017 use 1 for colours normalised
 /// differently).
 const EDGE_SHARPNESS: f32 = 10.0;
@@ -213,6 +216,16 @@ impl Objective {
     /// The mean of the result of [`Objective::error`].
     pub fn mean_error(&self) -> f64 {
         self.error.iter().map(|e| f64::from(*e)).sum::<f64>() / self.error.len().max(1) as f64
+    }
+
+    /// The mean of the result of [`Objective::error`] over the [`TRIMMED`] best pixels.
+    pub fn trimmed_error(&self) -> f64 {
+        let mut errors = self.error.clone();
+        let count = (errors.len() as f32 * TRIMMED) as usize;
+        if count < errors.len() {
+            errors.select_nth_unstable_by(count, f32::total_cmp);
+        }
+        errors[..count].iter().map(|e| f64::from(*e)).sum::<f64>() / count.max(1) as f64
     }
 
     /// The gradient of the colour last evaluated, `[3, H, W]`, for components between it and the scene's colour.

@@ -14,7 +14,7 @@ const AHEAD: usize = 8;
 const WORKING_SHARE: usize = 4;
 
 /// A photograph ready for the loss.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub struct Prepared {
     /// Columns.
     pub width: u32,

@@ -7,7 +7,6 @@ use crate::first_splats::first_count;
 use crate::free_space::FreeSpace;
 use crate::half_fit::HalfFit;
 use crate::memory::{MemoryPlan, Needs};
-use crate::misfits;
 use crate::model::Model;
 use crate::objective::{Objective, Reference};
 use crate::photos::{PhotoCache, Prepared};
@@ -15,6 +14,7 @@ use crate::recipe::{AdamKind, Choice, DensityControl, LengthUnit, Param, Recipe}
 use crate::schedule::{Clock, Round, StepMetrics, StepPlan, plan, upcoming_views};
 use crate::socket::{Residual, Sockets};
 use crate::times::Times;
+use crate::transients::Hidden;
 use cpu_time::ProcessTime;
 use irradia_compute::adam::AdamStep;
 use irradia_field::{FieldError, FieldState, KnownDepth};
@@ -117,6 +117,8 @@ pub struct Trainer {
     pub dataset: Arc<Dataset>,
     /// Indices of the views to train on: those of the dataset without misfits.
     pub(crate) trained: Vec<usize>,
+    /// What is hidden of the training views.
+    pub(crate) hidden: Hidden,
     /// The splats; none while a field is trained.
     pub engine: Engine,
     /// The field, in stages that train one.
@@ -235,6 +237,7 @@ impl Trainer {
             field: None,
             sockets: Sockets::default(),
             trained: dataset.train.clone(),
+            hidden: Hidden::default(),
             recipe,
             dataset,
             options,
@@ -301,12 +304,13 @@ impl Trainer {
         let before = self.clock.time;
         let entered = self.tick(metrics) && !self.finished();
         let total = self.recipe.total_steps() as f64;
-        let passes = |at: f64, clock: &Clock| before < at * total && clock.time >= at * total;
-        if self.recipe.exposure == Choice::Auto && self.field.is_none() && passes(exposure_probe::AT, &self.clock) {
+        let at = exposure_probe::AT * total;
+        let probes = self.recipe.exposure == Choice::Auto && self.field.is_none();
+        if probes && before < at && self.clock.time >= at {
             events.extend(self.decide_exposure()?);
         }
-        if self.recipe.drop_misfits && self.field.is_none() && passes(misfits::AT, &self.clock) {
-            events.extend(self.leave_out_misfits()?);
+        if self.field.is_none() {
+            events.extend(self.audit(before)?);
         }
         if entered {
             events.push(Event::StageEntered {
@@ -326,6 +330,8 @@ impl Trainer {
         let upcoming = upcoming_views(&self.trained, self.options.seed, &self.clock);
         let photo = self.photos.get(&upcoming, plan.image_scale)?;
         let (started, cpu_started) = (Instant::now(), ProcessTime::now());
+        let camera = &self.dataset.views[upcoming[0]].camera;
+        let photo = self.hidden.apply(upcoming[0], camera, &photo).map_or(photo, Arc::new);
         let mut rng = Rng::new(self.options.seed ^ self.clock.step << 20, STREAM_STEP);
         let view = upcoming[0];
         let placement = self.sockets.place(view, &self.scaled_camera(view, plan.image_scale));
@@ -561,8 +567,9 @@ impl Trainer {
     /// Mean L1 error over some training views, evenly spaced, as the plan renders them.
     fn measure_error(&mut self, plan: &StepPlan) -> Result<f64, TrainError> {
         let (mut sum, mut count) = (0.0, 0);
-        self.show_training_views(MEASURED_VIEWS, plan, |trainer, _, photo| {
-            sum += trainer.error_of_frame(photo);
+        self.show_training_views(MEASURED_VIEWS, plan, false, |trainer, view, photo| {
+            let shown = trainer.hidden.apply(view, &trainer.dataset.views[view].camera, photo);
+            sum += trainer.error_of_frame(shown.as_ref().unwrap_or(photo));
             count += 1;
         })?;
         Ok(sum / f64::from(count.max(1)))
@@ -575,11 +582,18 @@ impl Trainer {
         self.objective.mean_error()
     }
 
-    /// Renders at most `most` training views, evenly spaced, as the plan does, and passes each with its photograph to `see`.
+    /// As [`Self::error_of_frame`] was last called, of the pixels that fit best.
+    pub(crate) fn trimmed_error(&self) -> f64 {
+        self.objective.trimmed_error()
+    }
+
+    /// Renders at most `most` training views, evenly spaced, as the plan does, with `depth` if asked for, and passes each with its
+    /// whole photograph to `see`.
     pub(crate) fn show_training_views(
         &mut self,
         most: usize,
         plan: &StepPlan,
+        depth: bool,
         mut see: impl FnMut(&mut Self, usize, &Prepared),
     ) -> Result<(), TrainError> {
         let upcoming = upcoming_views(&self.trained, self.options.seed, &self.clock);
@@ -592,7 +606,10 @@ impl Trainer {
             let photo = self.photos.get(&order, plan.image_scale)?;
             let (started, cpu_started) = (Instant::now(), ProcessTime::now());
             let placement = self.sockets.place(view, &self.scaled_camera(view, plan.image_scale));
-            let options = self.render_options(plan.sh_degree);
+            let options = RenderOptions {
+                depth,
+                ..self.render_options(plan.sh_degree)
+            };
             self.sockets.render(&mut self.engine, view, placement, &options, plan);
             see(self, view, &photo);
             self.seconds += started.elapsed().as_secs_f64();

@@ -1,7 +1,7 @@
 // A shared scene: draws it, and moves the camera about it with mouse, touch and keyboard.
 
 import { view } from "irradia/assets.js";
-import { add, axes, clamp, dot, length, multiply, rotate, scale, subtract, turn, unit } from "irradia/math.js";
+import { add, axes, clamp, dot, length, mix, multiply, rotate, scale, slerp, subtract, turn, unit } from "irradia/math.js";
 import { LocalRenderer } from "irradia/renderer.js";
 
 /** Radians per pixel of dragging, and the largest angle between the view and the horizon. */
@@ -27,7 +27,7 @@ Object.assign(window, { irradia: { renderer, camera: () => camera, set: (to) => 
 function intrinsics() {
   const density = Math.min(devicePixelRatio || 1, DENSITY);
   const [width, height] = [Math.max(1, Math.round(canvas.clientWidth * density)), Math.max(1, Math.round(canvas.clientHeight * density))];
-  const vertical = height / 2 / Math.tan(start.fov / 2);
+  const vertical = height / 2 / Math.tan(camera.fov / 2);
   const focal = Math.min(vertical, (vertical * width) / height / view.aspect);
   return { width, height, fx: focal, fy: focal, cx: width / 2, cy: height / 2 };
 }
@@ -64,6 +64,49 @@ function dolly(amount) {
   stale = true;
 }
 
+/** When the flight began, in milliseconds of the page; null while it does not play. @type {number | null} */
+let began = null;
+const play = /** @type {HTMLButtonElement} */ (document.getElementById("play"));
+
+/** The camera of the flight after some seconds. @param {number} seconds */
+function along(seconds) {
+  const { keys, step } = view.path;
+  const at = clamp(seconds / step, 0, keys.length - 1);
+  const i = Math.min(Math.floor(at), Math.max(0, keys.length - 2));
+  const [a, b] = [keys[i], keys[Math.min(i + 1, keys.length - 1)]];
+  const t = at - i;
+  return {
+    position: mix(a.slice(0, 3), b.slice(0, 3), t),
+    rotation: slerp(a.slice(3, 7), b.slice(3, 7), t),
+    fov: a[7] + (b[7] - a[7]) * t,
+  };
+}
+
+/** Begins or ends the flight. @param {number | null} now */
+function fly(now) {
+  if (began !== null && now === null) {
+    // The camera stays where it is, and turns about what is before it.
+    const ahead = axes(camera.rotation)[2];
+    const distance = Math.max(dot(subtract(view.pivot, camera.position), ahead), 0.1 * view.radius);
+    pivot = add(camera.position, scale(ahead, distance));
+  }
+  began = now;
+  play.textContent = now === null ? "Play" : "Stop";
+  play.setAttribute("aria-pressed", String(now !== null));
+}
+if (view.path) {
+  play.hidden = false;
+  play.addEventListener("click", () => fly(began === null ? performance.now() : null));
+}
+/** Whether the flight is still to begin by itself. */
+let opens = view.path && !matchMedia("(prefers-reduced-motion: reduce)").matches;
+/** Ends the flight, since the page is used. */
+function touch() {
+  opens = false;
+  fly(null);
+}
+for (const kind of ["pointerdown", "wheel"]) canvas.addEventListener(kind, touch);
+
 /** @type {Map<number, { x: number, y: number }>} */
 const pointers = new Map();
 canvas.addEventListener("pointerdown", (event) => {
@@ -95,6 +138,7 @@ canvas.addEventListener("dblclick", () => {
 });
 addEventListener("keydown", ({ key }) => {
   const step = 40;
+  if (key.startsWith("Arrow") || ["+", "-", "Home"].includes(key)) touch();
   if (key === "ArrowLeft") orbit(step, 0);
   else if (key === "ArrowRight") orbit(-step, 0);
   else if (key === "ArrowUp") orbit(0, step);
@@ -107,6 +151,11 @@ new ResizeObserver(() => (stale = true)).observe(canvas);
 
 /** @param {number} now */
 function frame(now) {
+  if (began !== null) {
+    const seconds = (now - began) / 1000;
+    [camera, stale] = [along(seconds), true];
+    if (seconds >= (view.path.keys.length - 1) * view.path.step) fly(null);
+  }
   if (stale) {
     stale = false;
     renderer.want(camera, intrinsics(), {});
@@ -114,6 +163,10 @@ function frame(now) {
   if (renderer.draw(now) && renderer.drawn > 0) {
     message.textContent = renderer.loaded < renderer.total ? `${Math.round((100 * renderer.loaded) / renderer.total)} %` : "";
     document.querySelector(".poster")?.remove();
+    if (opens && renderer.loaded >= renderer.total) {
+      opens = false;
+      fly(now);
+    }
   }
   requestAnimationFrame(frame);
 }

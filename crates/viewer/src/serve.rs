@@ -229,7 +229,7 @@ async fn download(State(shared): App, Path(name): Path<String>) -> Response {
             return Ok((format!("{stem}.edits.toml"), editing.list().into_bytes()));
         };
         let cloud = editing.cloud().map_err(|error| error.to_string())?;
-        let (bytes, _) = encode_splats(&cloud, format, &Default::default()).map_err(|error| error.to_string())?;
+        let bytes = encode_splats(format, &cloud, &Default::default()).map_err(|error| error.to_string())?;
         Ok((format!("{stem}.{end}"), bytes))
     });
     match written.await {

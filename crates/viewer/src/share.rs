@@ -6,11 +6,13 @@
 use crate::ViewerError;
 use crate::compact::compact;
 use crate::page::file;
-use irradia_runs::Scene;
 use irradia_runs::formats::{gzip, write_atomic};
 use irradia_runs::scene::base64;
+use irradia_runs::{Film, Scene};
 use irradia_splat::Splats;
+use irradia_splat::levels::merged;
 use serde_json::json;
+use std::borrow::Cow;
 use std::fs;
 use std::path::Path;
 
@@ -19,7 +21,9 @@ const SCENE_FILE: &str = "scene.irs.gz";
 const POSTER_FILE: &str = "poster.png";
 /// Size of a start picture when the page is not measured yet.
 const POSTER: (u32, u32) = (1280, 720);
-/// Tries to meet a limit of bytes by leaving splats out.
+/// Cameras of a flight that the page holds for each second.
+const KEYS_PER_SECOND: f32 = 5.0;
+/// Tries to meet a limit of bytes by merging splats.
 const TRIES: u32 = 5;
 
 /// What to share, and how.
@@ -33,6 +37,8 @@ pub struct ShareOptions {
     pub max_bytes: Option<u64>,
     /// A folder of page, scene and start picture instead of one page.
     pub folder: bool,
+    /// A flight of the camera, which plays until the page is touched and again at the press of a button.
+    pub path: Option<Film>,
 }
 
 /// What was written, and what of the scene is in it.
@@ -97,7 +103,7 @@ struct Fitted {
     degree: u32,
 }
 
-/// The compact form that costs at most `most`: harmonics are left out first, then splats.
+/// The compact form that costs at most `most`: harmonics are left out first, then splats are merged.
 fn fitting(
     splats: &Splats,
     degree: u32,
@@ -105,14 +111,11 @@ fn fitting(
     cost: &dyn Fn(&[u8]) -> u64,
 ) -> Result<Fitted, ViewerError> {
     let most = most.unwrap_or(u64::MAX);
-    let pack = |degree: u32, count: usize| {
-        let bytes = compact(splats, degree, count);
-        (gzip(&bytes), seen(&bytes))
-    };
     let highest = degree.min(splats.sh_degree());
     let mut last = (Vec::new(), 0);
     for degree in (0..=highest).rev() {
-        last = pack(degree, usize::MAX);
+        let bytes = compact(splats, degree, usize::MAX);
+        last = (gzip(&bytes), seen(&bytes));
         if cost(&last.0) <= most {
             return Ok(Fitted {
                 packed: last.0,
@@ -123,6 +126,7 @@ fn fitting(
     }
     let all = last.1;
     let around = cost(&[]);
+    let mut fewer = Cow::Borrowed(splats);
     for _ in 0..TRIES {
         let share = most.saturating_sub(around) as f64 / (cost(&last.0) - around) as f64;
         // A little less than the share, since what is left compresses a little worse.
@@ -130,7 +134,9 @@ fn fitting(
         if count == 0 {
             break;
         }
-        last = pack(0, count);
+        fewer = Cow::Owned(merged(&fewer, count));
+        let bytes = compact(&fewer, 0, usize::MAX);
+        last = (gzip(&bytes), seen(&bytes));
         if cost(&last.0) <= most {
             return Ok(Fitted {
                 packed: last.0,
@@ -186,7 +192,7 @@ fn page(scene: &Scene, options: &ShareOptions, packed: Option<&[u8]>) -> String 
     text(
         "application/json",
         "view",
-        &view(scene, packed.is_none() && options.folder).to_string(),
+        &view(scene, options, packed.is_none() && options.folder).to_string(),
     );
     if let Some(packed) = packed {
         text("text/plain", "splats", &base64::encode(packed));
@@ -207,7 +213,7 @@ fn page(scene: &Scene, options: &ShareOptions, packed: Option<&[u8]>) -> String 
 }
 
 /// What the page knows of the scene beside its splats: the camera of `irradia render --orbit`'s first frame, and what it turns about.
-fn view(scene: &Scene, in_file: bool) -> serde_json::Value {
+fn view(scene: &Scene, options: &ShareOptions, in_file: bool) -> serde_json::Value {
     let camera = scene.orbit(1, None)[0];
     let outlook = scene.outlook();
     let k = camera.intrinsics;
@@ -226,7 +232,23 @@ fn view(scene: &Scene, in_file: bool) -> serde_json::Value {
         "background": scene.options.background,
         "antialias": scene.options.antialias,
         "file": in_file.then_some(SCENE_FILE),
+        "path": options.path.as_ref().map(path),
     })
+}
+
+/// A flight as the page knows it: a few cameras a second, between which it interpolates.
+fn path(film: &Film) -> serde_json::Value {
+    let step = (film.fps / KEYS_PER_SECOND).round().max(1.0) as usize;
+    let last = film
+        .cameras
+        .last()
+        .filter(|_| !(film.cameras.len() - 1).is_multiple_of(step));
+    let keys = film.cameras.iter().step_by(step).chain(last).map(|camera| {
+        let (p, q, k) = (camera.pose.position, camera.pose.rotation, &camera.intrinsics);
+        let fov = 2.0 * (0.5 * k.height as f32 / k.fy).atan();
+        [p.x, p.y, p.z, q.w, q.x, q.y, q.z, fov].map(|v| (f64::from(v) * 1e5).round() / 1e5)
+    });
+    json!({ "step": step as f32 / film.fps, "keys": keys.collect::<Vec<_>>() })
 }
 
 /// Text as it stands in HTML.
@@ -275,6 +297,7 @@ mod tests {
         };
         let shared = share(&scene, &output, &options).expect("shared");
         let text = fs::read_to_string(&output).expect("written");
+        assert!(text.contains("\"path\":null"));
         assert_eq!(
             (shared.bytes, shared.splats, shared.degree),
             (text.len() as u64, [2000, 2000], [2, 2])
@@ -288,6 +311,20 @@ mod tests {
         }
         // One opening tag for each end: no text ends its element early.
         assert_eq!(text.matches("</script>").count(), text.matches("<script").count());
+    }
+
+    #[test]
+    fn a_flight_is_a_few_cameras_a_second_and_ends_with_its_last() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let scene = scene(folder.path(), 300);
+        let film = Film::orbit(&scene, 32, None);
+        let value = path(&film);
+        let keys = value["keys"].as_array().expect("keys");
+        // Every 6th of 30 frames a second: 0, 6, .. 30, and the last.
+        assert_eq!(keys.len(), 7);
+        assert!((value["step"].as_f64().expect("seconds") - 0.2).abs() < 1e-6);
+        let position = film.cameras[31].pose.position;
+        assert!((keys[6][1].as_f64().expect("y") - f64::from(position.y)).abs() < 1e-5);
     }
 
     #[test]

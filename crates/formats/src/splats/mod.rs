@@ -22,7 +22,7 @@ use irradia_scene::{GaussianCloud, PointCloud, Similarity, sh};
 use std::borrow::Cow;
 use std::fmt;
 use std::fs;
-use std::io::{self, ErrorKind, Write};
+use std::io;
 use std::path::{Path, PathBuf};
 
 /// The splat file formats, identified by the end of the file's name.
@@ -89,12 +89,12 @@ impl SplatFormat {
         }
     }
 
-    /// The format for the end of `path`'s name, ignoring case; a folder with a `meta.json` is [`Self::SogFolder`].
+    /// The format for the end of `path`'s name, ignoring case; a folder of SOG images is [`Self::SogFolder`].
     ///
     /// # Errors
     /// [`FormatError::UnknownSplatFormat`], which lists the known ones.
     pub fn of(path: &Path) -> Result<Self, FormatError> {
-        if path.join(sog::META).is_file() {
+        if is_sog_folder(path) {
             return Ok(Self::SogFolder);
         }
         let name = path
@@ -186,6 +186,8 @@ pub struct WriteOptions {
     pub quality: Quality,
     /// The version of SPZ files.
     pub spz_version: SpzVersion,
+    /// Entries of SOG's palette of harmonics, 1 to 65,536; by the quality if `None`.
+    pub palette: Option<usize>,
 }
 
 /// A splat scene as read from a file, and what was not.
@@ -236,16 +238,11 @@ pub fn read_splat_file(path: &Path) -> Result<SplatFile, FormatError> {
                 true => SplatFormat::CompressedPly,
                 false => SplatFormat::Ply,
             };
-            ply::parse_splat_ply(bytes)
+            parse(format, bytes)
         })?,
-        SplatFormat::Spz => read_and_parse(path, spz::parse)?,
-        SplatFormat::Splat => read_and_parse(path, antimatter::parse)?,
-        SplatFormat::Ksplat => read_and_parse(path, ksplat::parse)?,
-        SplatFormat::Sog => read_and_parse(path, sog::parse)?,
         SplatFormat::SogFolder => sog::read_folder(&sog_meta(path))?,
-        SplatFormat::Glb | SplatFormat::GlbSpz => read_and_parse(path, gltf::parse_glb)?,
         SplatFormat::Gltf => read_and_parse(path, |text| gltf::parse_gltf(text, &|name| read_beside(path, name)))?,
-        SplatFormat::Npz => return Err(FormatError::malformed(path, "NumPy archives are written, not read")),
+        _ => read_and_parse(path, |bytes| parse(format, bytes))?,
     };
     let left_out = rows::leave_out_invalid(&mut cloud);
     Ok(SplatFile {
@@ -254,6 +251,72 @@ pub fn read_splat_file(path: &Path) -> Result<SplatFile, FormatError> {
         left_out,
         unread,
     })
+}
+
+/// The splats in a file of one piece.
+fn parse(format: SplatFormat, bytes: &[u8]) -> Result<GaussianCloud, Malformed> {
+    match format {
+        SplatFormat::Ply | SplatFormat::CompressedPly | SplatFormat::PointsPly => ply::parse_splat_ply(bytes),
+        SplatFormat::Spz => spz::parse(bytes),
+        SplatFormat::Splat => antimatter::parse(bytes),
+        SplatFormat::Ksplat => ksplat::parse(bytes),
+        SplatFormat::Sog | SplatFormat::SogFolder => sog::parse(bytes),
+        SplatFormat::Glb | SplatFormat::GlbSpz => gltf::parse_glb(bytes),
+        SplatFormat::Gltf => gltf::parse_gltf(bytes, &|name| {
+            Err(Malformed(format!("names the file {}", crate::zip::shown(name))))
+        }),
+        SplatFormat::Npz => Err(Malformed("NumPy archives are written, not read".into())),
+    }
+}
+
+/// The bytes of a splat file. A folder of images is one archive.
+///
+/// # Errors
+/// When the format cannot hold the cloud.
+///
+/// # Panics
+/// When the cloud's columns have unequal lengths: a bug in the caller.
+pub fn encode_splats(format: SplatFormat, cloud: &GaussianCloud, options: &WriteOptions) -> io::Result<Vec<u8>> {
+    assert!(cloud.is_consistent(), "the columns of the cloud have unequal lengths");
+    let prepared = match format.is_lossless() {
+        true => Cow::Borrowed(cloud),
+        false => prepared(cloud, &mut Vec::new()),
+    };
+    let mut bytes = Vec::new();
+    encode(format, &mut bytes, &prepared, options)?;
+    Ok(bytes)
+}
+
+/// `cloud` as it is after it was written and read again, and the bytes that this takes. A folder of images is taken as one archive.
+///
+/// # Errors
+/// When the format cannot hold the cloud, or cannot be read.
+///
+/// # Panics
+/// When the cloud's columns have unequal lengths: a bug in the caller.
+pub fn through_format(
+    format: SplatFormat,
+    cloud: &GaussianCloud,
+    options: &WriteOptions,
+) -> Result<(GaussianCloud, usize), FormatError> {
+    let name = Path::new(format.suffix());
+    let bytes = encode_splats(format, cloud, options).map_err(|source| FormatError::Write {
+        path: name.to_owned(),
+        source,
+    })?;
+    let mut read = parse(format, &bytes).map_err(|source| FormatError::Malformed {
+        path: name.to_owned(),
+        source,
+    })?;
+    rows::leave_out_invalid(&mut read);
+    Ok((read, bytes.len()))
+}
+
+/// Whether the folder `path` is a scene in images: other programs, too, call a file `meta.json`.
+pub fn is_sog_folder(path: &Path) -> bool {
+    let meta = path.join(sog::META);
+    let is_short = fs::metadata(&meta).is_ok_and(|file| file.is_file() && file.len() <= sog::MAX_META as u64);
+    is_short && fs::read(&meta).is_ok_and(|text| sog::is_meta(&text))
 }
 
 /// The `meta.json` that `path` is or contains.
@@ -326,36 +389,8 @@ pub fn write_splats_with(
     cloud: &GaussianCloud,
     options: &WriteOptions,
 ) -> Result<Vec<String>, FormatError> {
-    let format = SplatFormat::of(path)?;
-    let (cloud, notes) = fitted(cloud, format);
-    match format {
-        SplatFormat::SogFolder => write_folder(&sog_meta(path), &cloud, options.quality)?,
-        _ => write_atomic(path, |out| write_file(out, &cloud, format, options))?,
-    }
-    Ok(notes)
-}
-
-/// The bytes of a splat file, and what the format could not hold, a line each.
-///
-/// # Errors
-/// When the format is a folder of images, or an encoder fails.
-///
-/// # Panics
-/// When the cloud's columns have unequal lengths: a bug in the caller.
-pub fn encode_splats(
-    cloud: &GaussianCloud,
-    format: SplatFormat,
-    options: &WriteOptions,
-) -> io::Result<(Vec<u8>, Vec<String>)> {
-    let (cloud, notes) = fitted(cloud, format);
-    let mut bytes = Vec::new();
-    write_file(&mut bytes, &cloud, format, options)?;
-    Ok((bytes, notes))
-}
-
-/// What of `cloud` a file of `format` holds, and a line for each thing that it does not.
-fn fitted(cloud: &GaussianCloud, format: SplatFormat) -> (Cow<'_, GaussianCloud>, Vec<String>) {
     assert!(cloud.is_consistent(), "the columns of the cloud have unequal lengths");
+    let format = SplatFormat::of(path)?;
     let mut notes = Vec::new();
     let cloud = match format.is_lossless() {
         true => Cow::Borrowed(cloud),
@@ -373,14 +408,18 @@ fn fitted(cloud: &GaussianCloud, format: SplatFormat) -> (Cow<'_, GaussianCloud>
             "{format} does not say that the scene was trained with antialiasing"
         ));
     }
-    (cloud, notes)
+    match format {
+        SplatFormat::SogFolder => write_folder(&sog_meta(path), &cloud, options)?,
+        _ => write_atomic(path, |out| encode(format, out, &cloud, options))?,
+    }
+    Ok(notes)
 }
 
-/// Writes the one file of a format.
-fn write_file(
-    out: &mut dyn Write,
-    cloud: &GaussianCloud,
+/// Writes the file of one piece; a folder of images is one archive.
+fn encode(
     format: SplatFormat,
+    out: &mut dyn io::Write,
+    cloud: &GaussianCloud,
     options: &WriteOptions,
 ) -> io::Result<()> {
     let quality = options.quality;
@@ -391,11 +430,7 @@ fn write_file(
         SplatFormat::Spz => spz::write(out, cloud, quality, options.spz_version),
         SplatFormat::Splat => antimatter::write(out, cloud),
         SplatFormat::Ksplat => ksplat::write(out, cloud, quality),
-        SplatFormat::Sog => sog::write(out, cloud, quality),
-        SplatFormat::SogFolder => Err(io::Error::new(
-            ErrorKind::Unsupported,
-            "SOG as a folder is several files: choose .sog",
-        )),
+        SplatFormat::Sog | SplatFormat::SogFolder => sog::write(out, cloud, options),
         SplatFormat::Glb => gltf::write_glb(out, cloud),
         SplatFormat::GlbSpz => gltf::write_glb_spz(out, cloud, quality),
         SplatFormat::Gltf => gltf::write_gltf(out, cloud),
@@ -434,12 +469,12 @@ fn prepared<'a>(cloud: &'a GaussianCloud, notes: &mut Vec<String>) -> Cow<'a, Ga
 }
 
 /// Writes the files of a scene in images, `meta.json` last.
-fn write_folder(meta: &Path, cloud: &GaussianCloud, quality: Quality) -> Result<(), FormatError> {
+fn write_folder(meta: &Path, cloud: &GaussianCloud, options: &WriteOptions) -> Result<(), FormatError> {
     let failed = |source| FormatError::Write {
         path: meta.to_owned(),
         source,
     };
-    let files = sog::encode(cloud, quality).map_err(failed)?;
+    let files = sog::encode(cloud, options).map_err(failed)?;
     if let Some(folder) = meta.parent().filter(|folder| !folder.as_os_str().is_empty()) {
         fs::create_dir_all(folder).map_err(failed)?;
     }

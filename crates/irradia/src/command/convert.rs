@@ -1,9 +1,11 @@
 //! `irradia convert`
 
+use super::share;
+use crate::Usage;
 use crate::terminal::say;
 use anyhow::Result;
 use irradia_runs::formats::{Quality, SpzVersion, WriteOptions};
-use irradia_runs::{Conversion, convert as convert_scene};
+use irradia_runs::{Conversion, Level, convert as convert_scene, level_file, write_levels};
 use std::path::PathBuf;
 
 #[derive(clap::Args)]
@@ -11,7 +13,7 @@ pub struct ConvertArgs {
     /// The scene to read: a splat file of any format, a folder of SOG images, or a run
     pub input: PathBuf,
     /// The file to write; its name selects the format: .ply, .compressed.ply, .points.ply, .spz, .splat, .ksplat, .sog, meta.json,
-    /// .glb, .spz.glb, .gltf or .npz
+    /// .glb, .spz.glb, .gltf, .npz, or .html for a page as irradia share writes it
     pub output: PathBuf,
     /// How much a lossy format may lose, where it leaves the choice (.spz, .sog, .ksplat)
     #[arg(long, value_enum, default_value_t = QualityArg::Normal)]
@@ -19,6 +21,10 @@ pub struct ConvertArgs {
     /// Version of .spz files
     #[arg(long, value_name = "3|4", default_value_t = 3, value_parser = clap::value_parser!(u8).range(3..=4))]
     pub spz_version: u8,
+    /// Also write levels of detail beside the output, such as scene.lod1.sog: a half, a quarter and an eighth of the splats, merged so that
+    /// they look alike from afar
+    #[arg(long)]
+    pub lod: bool,
     /// Do not render the scene before and after to measure the loss
     #[arg(long)]
     pub no_compare: bool,
@@ -46,12 +52,24 @@ impl From<QualityArg> for Quality {
 }
 
 pub fn convert(args: &ConvertArgs) -> Result<()> {
+    let extension = args.output.extension().unwrap_or_default().to_ascii_lowercase();
+    if extension == "html" || extension == "htm" {
+        if args.lod {
+            return Err(Usage("--lod: a page holds no levels of detail".into()).into());
+        }
+        return share::run(&share::Args::of(&args.input, &args.output));
+    }
+    if args.lod {
+        // A format without levels is reported before anything is written.
+        level_file(&args.output, 1)?;
+    }
     let options = WriteOptions {
         quality: args.quality.into(),
         spz_version: match args.spz_version {
             4 => SpzVersion::V4,
             _ => SpzVersion::V3,
         },
+        palette: None,
     };
     let conversion = convert_scene(&args.input, &args.output, &options, !args.no_compare)?;
     say(format_args!(
@@ -59,7 +77,28 @@ pub fn convert(args: &ConvertArgs) -> Result<()> {
         args.output.display(),
         conversion.splats,
         lines(&conversion)
-    ))
+    ))?;
+    if args.lod {
+        for (level, made) in (1..).zip(write_levels(&args.input, &args.output, &options)?) {
+            say(level_lines(level, &made))?;
+        }
+    }
+    Ok(())
+}
+
+/// A level, and how it looks from where it is meant for.
+fn level_lines(level: u32, made: &Level) -> String {
+    format!(
+        "{}: {} splats, {:.3} MB\n  PSNR           {:.2} dB at 1/{} of the pixels, against the scene at full size shrunk ({:.2} dB for as \
+         many splats taken evenly, {:.2} dB for the whole scene drawn so small)",
+        made.path.display(),
+        made.splats,
+        made.bytes as f64 / 1e6,
+        made.psnr,
+        1 << level,
+        made.subsample_psnr,
+        made.whole_psnr
+    )
 }
 
 /// What the conversion cost, a line each.

@@ -1,5 +1,6 @@
 //! One file per command, and arguments common to several commands.
 
+pub mod compact;
 pub mod compare;
 pub mod convert;
 pub mod demo;

@@ -8,7 +8,7 @@ use anyhow::{Context, Result};
 use irradia_runs::scene::{Camera, Image};
 use irradia_runs::{Film, Scene, file_stems, write_image};
 use irradia_splat::Renderer;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 #[derive(clap::Args)]
 #[command(group(clap::ArgGroup::new("cameras").required(true).args(["data", "orbit", "path"])))]
@@ -91,20 +91,25 @@ fn film(args: &Args, scene: &Scene) -> Result<Option<Film>> {
     if let Some(frames) = args.orbit {
         return Ok(Some(Film::orbit(scene, frames, args.size)));
     }
-    let Some(path) = &args.path else { return Ok(None) };
-    let film = match path.to_str() {
-        Some("orbit") => Film::orbit(scene, args.frames, args.size),
-        Some("spiral") => Film::spiral(scene, args.frames, args.size),
+    let path = args.path.as_deref();
+    path.map(|path| film_of(path, scene, args.frames, args.size))
+        .transpose()
+}
+
+/// The cameras of the path `path`: a file, `orbit`, `spiral` or `training`, which have `frames` frames.
+pub(super) fn film_of(path: &Path, scene: &Scene, frames: u32, size: Option<(u32, u32)>) -> Result<Film> {
+    Ok(match path.to_str() {
+        Some("orbit") => Film::orbit(scene, frames, size),
+        Some("spiral") => Film::spiral(scene, frames, size),
         Some("training") => {
-            let film = Film::training(scene, args.frames, args.size);
+            let film = Film::training(scene, frames, size);
             film.ok_or_else(|| Usage("--path training: the cameras of this scene are not known".into()))?
         }
         _ => {
             let k = scene.outlook().intrinsics;
-            Film::read(path, args.size.unwrap_or((k.width, k.height)))?
+            Film::read(path, size.unwrap_or((k.width, k.height)))?
         }
-    };
-    Ok(Some(film))
+    })
 }
 
 fn write_film(args: &Args, scene: &Scene, film: &Film) -> Result<()> {

@@ -1,11 +1,12 @@
 //! `irradia share`
 
+use super::render::film_of;
 use crate::Usage;
 use crate::terminal::say;
 use anyhow::Result;
-use irradia_runs::Scene;
+use irradia_runs::{Film, Scene};
 use irradia_viewer::{ShareOptions, share};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 #[derive(clap::Args)]
 pub struct Args {
@@ -20,16 +21,20 @@ pub struct Args {
     /// A line below the title, such as who took the photographs
     #[arg(long, default_value = "")]
     pub credits: String,
-    /// Largest size of the page, such as 10MB or 800kB: harmonics are left out first, then the splats that are seen least
+    /// Largest size of the page, such as 10MB or 800kB: harmonics are left out first, then splats are merged
     #[arg(long, value_name = "SIZE", value_parser = parse_size)]
     pub max: Option<u64>,
+    /// A flight of the camera, played until the page is touched: a file that the viewer or nerfstudio saved, or orbit, spiral or training
+    /// (through the cameras)
+    #[arg(long, value_name = "FILE|orbit|spiral|training")]
+    pub path: Option<PathBuf>,
     /// Write a folder for a web server: page, scene and start picture
     #[arg(long)]
     pub folder: bool,
 }
 
 /// Bytes of `10MB`, `800kB`, `1.5GB` or `4096`.
-fn parse_size(text: &str) -> Result<u64, String> {
+pub(super) fn parse_size(text: &str) -> Result<u64, String> {
     let end = text
         .find(|c: char| !(c.is_ascii_digit() || c == '.'))
         .unwrap_or(text.len());
@@ -43,6 +48,36 @@ fn parse_size(text: &str) -> Result<u64, String> {
     };
     let number: f64 = number.parse().map_err(|_| "expected a size such as 10MB or 800kB")?;
     Ok((number * factor) as u64)
+}
+
+/// Frames of a flight that is no file: ten seconds.
+const FLIGHT: u32 = 300;
+
+/// The flight along `path`; a turn about the scene ends where it began.
+fn flight(path: &Path, scene: &Scene) -> Result<Film> {
+    let mut film = film_of(path, scene, FLIGHT, None)?;
+    if path.as_os_str() != "training" && !path.is_file() {
+        film.cameras.extend(film.cameras.first().copied());
+    }
+    match film.cameras.is_empty() {
+        true => Err(Usage("the path is empty".into()).into()),
+        false => Ok(film),
+    }
+}
+
+impl Args {
+    /// `scene` as the page `out`, with nothing chosen.
+    pub fn of(scene: &Path, out: &Path) -> Self {
+        Self {
+            scene: scene.to_owned(),
+            out: out.to_owned(),
+            title: None,
+            credits: String::new(),
+            max: None,
+            path: None,
+            folder: false,
+        }
+    }
 }
 
 pub fn run(args: &Args) -> Result<()> {
@@ -65,6 +100,7 @@ pub fn run(args: &Args) -> Result<()> {
         credits: args.credits.clone(),
         max_bytes: args.max,
         folder: args.folder,
+        path: args.path.as_deref().map(|path| flight(path, &scene)).transpose()?,
     };
     let shared = share(&scene, &args.out, &options)?;
     let [splats, of] = shared.splats;
@@ -74,7 +110,7 @@ pub fn run(args: &Args) -> Result<()> {
         lost.push(format!("harmonics of degree {of_degree} became degree {degree}"));
     }
     if splats < of {
-        lost.push(format!("{} of {of} splats were left out", of - splats));
+        lost.push(format!("{} of {of} splats were merged with others", of - splats));
     }
     let lost = if lost.is_empty() {
         String::new()

@@ -2,6 +2,7 @@
 
 mod bad_input;
 mod compare;
+mod edit;
 mod field;
 mod film;
 mod lpips;

@@ -94,7 +94,7 @@ fn a_checkpoint_round_trips() {
 }
 
 #[test]
-fn photographs_that_were_left_out_stay_left_out() {
+fn photographs_that_were_left_out_and_what_was_hidden_stay_so() {
     let mut trainer = trainer();
     assert_eq!(trainer.trained, [0, 1]);
     trainer.trained = vec![1];
@@ -104,6 +104,16 @@ fn photographs_that_were_left_out_stay_left_out() {
         tensors.retain(|(name, ..)| name != TRAINED)
     });
     assert_eq!(read(&older).unwrap().trained, [0, 1]);
+
+    let cameras = trainer.dataset.clone();
+    trainer.hidden = Hidden::from_pairs(&[0, 5, 1, 7], |view| Some(&cameras.views[view].camera)).unwrap();
+    let bytes = to_bytes(&trainer);
+    assert_eq!(read(&bytes).unwrap().hidden, trainer.hidden);
+    let elsewhere = rewritten(&bytes, FORMAT, |tensors| {
+        let (.., pairs) = tensors.iter_mut().find(|(name, ..)| name == HIDDEN).unwrap();
+        pairs[0] = 9;
+    });
+    assert!(read(&elsewhere).err().unwrap().contains("hidden_blocks"));
 }
 
 #[test]

@@ -110,6 +110,9 @@ documented! {
         /// Leave out photographs whose error, after a fifth of the run, is far beyond the others': wrong poses, or another scene.
         #[serde(default, skip_serializing_if = "is_false")]
         pub drop_misfits: bool,
+        /// Hide from training what stands in one photograph only, such as people who walk through, found after 0.3 of the run.
+        #[serde(default, skip_serializing_if = "is_false")]
+        pub hide_transients: bool,
         /// Refine the cameras' poses.
         #[serde(default, skip_serializing_if = "is_false")]
         pub refine_poses: bool,

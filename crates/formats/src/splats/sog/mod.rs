@@ -12,7 +12,7 @@ mod read;
 mod write;
 
 pub use read::parse_zip as parse;
-pub(crate) use read::read_folder;
+pub(crate) use read::{MAX_META, is_meta, read_folder};
 pub(crate) use write::{encode, write};
 
 /// The file that describes the others.

@@ -3,6 +3,8 @@
 
 use crate::splats::rows::CHUNK;
 use rayon::prelude::*;
+use std::collections::HashMap;
+use std::collections::hash_map::Entry;
 
 /// Bins of the histogram by which numbers are clustered.
 const BINS: usize = 1 << 16;
@@ -27,6 +29,9 @@ impl Codebook {
         let (low, high) = finite().fold((f32::MAX, f32::MIN), |(low, high), v| (low.min(v), high.max(v)));
         if low >= high {
             return Self([if low == high { low } else { 0.0 }; 256]);
+        }
+        if let Some(exact) = Self::exact(finite()) {
+            return exact;
         }
         let scale = (BINS - 1) as f64 / (f64::from(high) - f64::from(low));
         let mut bins = vec![(0u64, 0f64); BINS];
@@ -59,6 +64,22 @@ impl Codebook {
         Self(std::array::from_fn(|i| numbers[i] as f32))
     }
 
+    /// The numbers of `values` if there are at most 256.
+    fn exact(values: impl Iterator<Item = f32>) -> Option<Self> {
+        let mut distinct: Vec<f32> = Vec::with_capacity(257);
+        for value in values {
+            if let Err(at) = distinct.binary_search_by(|known| known.total_cmp(&value)) {
+                distinct.insert(at, value);
+            }
+            if distinct.len() > 256 {
+                return None;
+            }
+        }
+        let last = *distinct.last()?;
+        distinct.resize(256, last);
+        Some(Self(std::array::from_fn(|i| distinct[i])))
+    }
+
     /// 256 numbers to begin with: where the cube root of the density has its quantiles, which is the best there is for many numbers
     /// (Panter and Dite 1951).
     fn first(bins: &[(u64, f64)], low: f64, high: f64) -> Vec<f64> {
@@ -84,6 +105,13 @@ impl Codebook {
         numbers
     }
 
+    /// The number nearest to zero replaced by zero.
+    pub fn with_zero(mut self) -> Self {
+        let nearest = self.index(0.0);
+        self.0[usize::from(nearest)] = 0.0;
+        self
+    }
+
     /// The index of the number nearest to `value`.
     pub fn index(&self, value: f32) -> u8 {
         let above = self.0.partition_point(|number| *number < value).clamp(1, 255);
@@ -100,11 +128,59 @@ pub(super) struct Palette {
 }
 
 impl Palette {
-    /// At most `most` entries (65,536 or fewer) for `vectors` of `width` numbers.
+    /// At most `most` entries (2 to 65,536) for `vectors` of `width` numbers: all that differ if they are few enough.
+    pub fn of(vectors: &[f32], width: usize, most: usize) -> Self {
+        if let Some(exact) = Self::exact(vectors, width, most) {
+            return exact;
+        }
+        // Zeros, where harmonics do not show, have one entry; many of them would begin as centroids of their own.
+        let is_zero = |vector: &[f32]| vector.iter().all(|v| *v == 0.0);
+        let (zero, other): (Vec<usize>, Vec<usize>) =
+            (0..vectors.len() / width).partition(|i| is_zero(&vectors[i * width..(i + 1) * width]));
+        if zero.is_empty() {
+            return Self::clustered(vectors, width, most);
+        }
+        let others: Vec<f32> = other
+            .iter()
+            .flat_map(|i| &vectors[i * width..(i + 1) * width])
+            .copied()
+            .collect();
+        let clustered = Self::clustered(&others, width, most - 1);
+        let mut palette = Self {
+            entries: vec![0.0; width],
+            labels: vec![0; vectors.len() / width],
+        };
+        palette.entries.extend(clustered.entries);
+        for (i, label) in other.iter().zip(clustered.labels) {
+            palette.labels[*i] = label + 1;
+        }
+        palette
+    }
+
+    /// The vectors that differ, in the order of their first use, if there are at most `most`.
+    fn exact(vectors: &[f32], width: usize, most: usize) -> Option<Self> {
+        let mut known: HashMap<Vec<u32>, u16> = HashMap::new();
+        let (mut entries, mut labels) = (Vec::new(), Vec::with_capacity(vectors.len() / width));
+        for vector in vectors.chunks_exact(width) {
+            let next = known.len();
+            let label = match known.entry(vector.iter().map(|v| v.to_bits()).collect()) {
+                Entry::Occupied(known) => *known.get(),
+                Entry::Vacant(_) if next == most => return None,
+                Entry::Vacant(new) => {
+                    entries.extend_from_slice(vector);
+                    *new.insert(next as u16)
+                }
+            };
+            labels.push(label);
+        }
+        Some(Self { entries, labels })
+    }
+
+    /// Entries by clustering.
     ///
     /// In two steps: the square root of `most` coarse clusters, then each by itself, with as many entries as its share of the error
     /// asks for. This compares a vector with hundreds of centroids where one step would with tens of thousands.
-    pub fn of(vectors: &[f32], width: usize, most: usize) -> Self {
+    fn clustered(vectors: &[f32], width: usize, most: usize) -> Self {
         let count = vectors.len() / width;
         if count <= most {
             return Self {
@@ -281,6 +357,34 @@ mod tests {
         );
         assert_eq!(Codebook::of(&[f32::NAN]).0, [0.0; 256]);
         assert_eq!(Codebook::of(&[2.0, f32::INFINITY]).0, [2.0; 256]);
+    }
+
+    #[test]
+    fn what_fits_is_kept_and_vectors_of_zeros_share_an_entry() {
+        let mut rng = Rng::new(6, 1);
+        let few: Vec<f32> = (0..300).map(|_| rng.range(-1.0, 1.0)).collect();
+        // Each of 100 vectors of three numbers, many times.
+        let many: Vec<f32> = (0..5000)
+            .flat_map(|i| few[i * 7 % 100 * 3..][..3].iter().copied())
+            .collect();
+        let palette = Palette::of(&many, 3, 128);
+        assert_eq!(palette.entries.len(), 300);
+        for (vector, label) in many.chunks_exact(3).zip(&palette.labels) {
+            assert_eq!(vector, &palette.entries[usize::from(*label) * 3..][..3]);
+        }
+        let half: Vec<f32> = (0..5000)
+            .flat_map(|i| [0.0; 3].map(|_: f32| if i % 2 == 0 { 0.0 } else { rng.range(1.0, 2.0) }))
+            .collect();
+        let palette = Palette::of(&half, 3, 64);
+        assert!(palette.entries.len() <= 64 * 3);
+        let zeros = |i: usize| palette.entries[i * 3..][..3].iter().all(|v| *v == 0.0);
+        assert_eq!((0..palette.entries.len() / 3).filter(|i| zeros(*i)).count(), 1);
+        assert!((0..5000).all(|i| zeros(palette.labels[i].into()) == (i % 2 == 0)));
+        // Numbers nearer to each other than the bins of the histogram.
+        let near: Vec<f32> = (0..200).map(|i| 1.0 + i as f32 * 1e-6).chain([1000.0]).collect();
+        let codebook = Codebook::of(&near);
+        assert!(near.iter().all(|v| codebook.0[usize::from(codebook.index(*v))] == *v));
+        assert_eq!(Codebook::of(&[-1.0, 0.01, 2.0]).with_zero().0[..3], [-1.0, 0.0, 2.0]);
     }
 
     #[test]

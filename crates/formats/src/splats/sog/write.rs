@@ -1,8 +1,8 @@
 use super::palette::{Codebook, Palette};
 use super::{LARGEST_W, META, ROW};
-use crate::splats::Quality;
 use crate::splats::quantize::{byte, opacity_byte, smallest_three};
 use crate::splats::rows::{bounds, encode_rows, morton_order};
+use crate::splats::{Quality, WriteOptions};
 use crate::zip::Writer;
 use image_webp::{ColorType, EncoderParams, WebPEncoder};
 use irradia_scene::{GaussianCloud, sh};
@@ -17,19 +17,20 @@ type Files = Vec<(&'static str, Vec<u8>)>;
 type Image = (&'static str, usize, usize, usize, Vec<u8>);
 
 /// Writes `cloud` as one archive.
-pub(crate) fn write(out: &mut dyn Write, cloud: &GaussianCloud, quality: Quality) -> io::Result<()> {
+pub(crate) fn write(out: &mut dyn Write, cloud: &GaussianCloud, options: &WriteOptions) -> io::Result<()> {
     let mut archive = Writer::new(out);
-    for (name, content) in encode(cloud, quality)? {
+    for (name, content) in encode(cloud, options)? {
         archive.file(name, &content)?;
     }
     archive.finish()
 }
 
-/// The files of `cloud` in version 2; the quality limits the palette of the harmonics.
+/// The files of `cloud` in version 2. What was read from such files becomes equal files, but for the order of the splats: codebooks and
+/// palettes that hold everything are kept.
 ///
 /// # Errors
 /// When an image cannot be encoded: more than 16,384 pixels a side.
-pub(crate) fn encode(cloud: &GaussianCloud, quality: Quality) -> io::Result<Files> {
+pub(crate) fn encode(cloud: &GaussianCloud, options: &WriteOptions) -> io::Result<Files> {
     let count = cloud.len();
     let width = 3 * cloud.sh_coefficients();
     let order = morton_order(&cloud.means);
@@ -84,10 +85,10 @@ pub(crate) fn encode(cloud: &GaussianCloud, quality: Quality) -> io::Result<File
         "asset": { "generator": "Irradia" },
         "antialias": cloud.antialiased,
         "count": count,
-        "means": { "mins": low, "maxs": high, "files": ["means_l.webp", "means_u.webp"] },
-        "scales": { "codebook": &scales.0[..], "files": ["scales.webp"] },
+        "means": { "mins": low.map(shortest), "maxs": high.map(shortest), "files": ["means_l.webp", "means_u.webp"] },
+        "scales": { "codebook": scales.0.map(shortest)[..], "files": ["scales.webp"] },
         "quats": { "files": ["quats.webp"] },
-        "sh0": { "codebook": &colors.0[..], "files": ["sh0.webp"] },
+        "sh0": { "codebook": colors.0.map(shortest)[..], "files": ["sh0.webp"] },
     });
 
     // The format stops at degree 3.
@@ -98,8 +99,20 @@ pub(crate) fn encode(cloud: &GaussianCloud, quality: Quality) -> io::Result<File
             .par_iter()
             .flat_map_iter(|i| cloud.sh[*i as usize * width + 3..][..rest].iter().copied())
             .collect();
-        let palette = Palette::of(&vectors, rest, palette_size(count, quality));
+        let most = options
+            .palette
+            .map_or_else(|| palette_size(count, options.quality), |most| most.clamp(2, 65_536));
+        let palette = Palette::of(&vectors, rest, most);
         let codebook = Codebook::of(&palette.entries);
+        let codebook = match palette
+            .entries
+            .chunks_exact(rest)
+            .any(|entry| entry.iter().all(|v| *v == 0.0))
+        {
+            // No harmonics stay none.
+            true => codebook.with_zero(),
+            false => codebook,
+        };
         let entries = palette.entries.len() / rest;
         let mut pixels: Vec<u8> = palette.entries.iter().map(|v| codebook.index(*v)).collect();
         let rows = entries.div_ceil(ROW);
@@ -118,7 +131,7 @@ pub(crate) fn encode(cloud: &GaussianCloud, quality: Quality) -> io::Result<File
         meta["shN"] = json!({
             "count": entries,
             "bands": degree,
-            "codebook": &codebook.0[..],
+            "codebook": codebook.0.map(shortest)[..],
             "files": ["shN_centroids.webp", "shN_labels.webp"],
         });
     }
@@ -129,6 +142,11 @@ pub(crate) fn encode(cloud: &GaussianCloud, quality: Quality) -> io::Result<File
     // Last, so that a folder with it is complete.
     files.push((META, serde_json::to_vec(&meta).map_err(io::Error::other)?));
     Ok(files)
+}
+
+/// An `f64` with the digits of an `f32`: half of the text is otherwise digits beyond its precision.
+fn shortest(value: f32) -> f64 {
+    value.to_string().parse().unwrap_or(f64::from(value))
 }
 
 /// Entries of the palette: a power of two below the number of splats.

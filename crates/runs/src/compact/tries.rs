@@ -1,0 +1,343 @@
+//! Tries: a number of splats, trained for the format and measured.
+
+use super::{CompactEvent, CompactInput};
+use crate::convert::in_world;
+use crate::{RunError, Scene, evaluate};
+use irradia_formats::{SplatFormat, WriteOptions, through_format};
+use irradia_scene::{Camera, Dataset, GaussianCloud, Similarity};
+use irradia_splat::contribution::{Contributions, contributions};
+use irradia_splat::{SplatState, Splats};
+use irradia_train::eval::{EvalOptions, Metrics};
+use irradia_train::half_fit::HalfFit;
+use irradia_train::memory::usual_limit;
+use irradia_train::model::{Model, RenderOptions};
+use irradia_train::{Recipe, TrainOptions, Trainer};
+use std::borrow::Cow;
+use std::sync::Arc;
+
+/// The recipe by which splats are trained further.
+const RECIPE: &str = include_str!("recipe.toml");
+/// Rounds in which splats are removed.
+const ROUNDS: u32 = 6;
+/// Training views on which a loss is measured, at most.
+const MEASURED_VIEWS: usize = 32;
+/// Views by which contributions are found, at most.
+const JUDGING_VIEWS: usize = 160;
+/// Share of the splats whose harmonics are kept: those where they show most. With half of them fox_colmap loses 0.1 dB for 3 % of the
+/// bytes, more than splats would cost.
+const SHOWN: f64 = 0.8;
+/// Entries of the palette of harmonics per splat. On fox_colmap with 38,000 splats, 0.1 takes 100 kB more than 0.03, for 0.1 dB.
+const PALETTE: f64 = 0.03;
+/// Tries of a search for the smallest scene.
+const SEARCHES: u32 = 6;
+/// Neighbouring tries of a search that are not told apart: counts that differ by less than this factor.
+const CLOSE: f64 = 1.1;
+
+/// How splats compare with the photographs.
+pub(super) struct Measure {
+    dataset: Dataset,
+    options: RenderOptions,
+}
+
+impl Measure {
+    /// By the photographs of `dataset`.
+    pub fn new(dataset: &Dataset, options: RenderOptions) -> Self {
+        Self {
+            dataset: dataset.clone(),
+            options,
+        }
+    }
+
+    /// Mean PSNR over training views, evenly chosen, dB.
+    pub fn of(&self, model: &Model) -> Result<f64, RunError> {
+        let train = &self.dataset.train;
+        let step = train.len().div_ceil(MEASURED_VIEWS).max(1);
+        self.psnr(model, &train.iter().copied().step_by(step).collect::<Vec<_>>())
+    }
+
+    /// Mean PSNR over held-out views, dB; `None` if there are none.
+    pub fn of_held_out(&self, model: &Model) -> Result<Option<f64>, RunError> {
+        let psnr = self.psnr(model, &self.dataset.test)?;
+        Ok(Some(psnr).filter(|psnr| !psnr.is_nan()))
+    }
+
+    fn psnr(&self, model: &Model, views: &[usize]) -> Result<f64, RunError> {
+        let options = EvalOptions {
+            render: self.options,
+            metrics: Metrics::Psnr,
+            half_fit: HalfFit::default(),
+        };
+        Ok(evaluate::<RunError>(model, &self.dataset, views, &options, |_| Ok(()))?.psnr)
+    }
+}
+
+/// A scene as its file will hold it.
+pub(super) struct Found {
+    pub splats: Splats,
+    pub bytes: u64,
+    pub psnr: f64,
+    pub write: WriteOptions,
+}
+
+impl Found {
+    /// Number of splats with harmonics above degree 0.
+    pub fn with_harmonics(&self) -> usize {
+        let sh = &self.splats.sh;
+        let shows = |i: &usize| (3..sh.count()).any(|c| sh.get(c, *i) != 0.0);
+        (0..self.splats.len()).filter(shows).count()
+    }
+}
+
+/// What all tries have in common.
+pub(super) struct Tries<'a> {
+    input: &'a CompactInput,
+    format: SplatFormat,
+    measure: &'a Measure,
+    dataset: Arc<Dataset>,
+    recipe: Recipe,
+    options: RenderOptions,
+    world_from_dataset: Similarity,
+    /// The smallest scene so far that was good enough, from which the next try begins.
+    begin: Splats,
+}
+
+impl<'a> Tries<'a> {
+    /// Of `splats`, those of `scene`, trained on `dataset`.
+    pub fn new(
+        input: &'a CompactInput,
+        format: SplatFormat,
+        scene: &Scene,
+        splats: Splats,
+        dataset: Dataset,
+        measure: &'a Measure,
+    ) -> Result<Self, RunError> {
+        let mut recipe = Recipe::parse("compact", RECIPE, &[])?;
+        recipe.render.background = scene.options.background;
+        recipe.render.antialias = scene.options.antialias;
+        Ok(Self {
+            input,
+            format,
+            measure,
+            dataset: Arc::new(dataset),
+            recipe,
+            options: scene.options,
+            world_from_dataset: scene.world_from_dataset,
+            begin: splats,
+        })
+    }
+
+    /// `splats` to be rendered.
+    pub fn model<'s>(&self, splats: &'s Splats) -> Model<'s> {
+        Model::Splats {
+            splats: Cow::Borrowed(splats),
+            residual: None,
+        }
+    }
+
+    /// `splats` to be written.
+    pub fn cloud(&self, splats: &Splats) -> GaussianCloud {
+        GaussianCloud {
+            antialiased: self.options.antialias,
+            world_from_dataset: self.world_from_dataset,
+            ..splats.to_cloud()
+        }
+    }
+
+    /// How `count` splats are written.
+    fn write_options(&self, count: usize) -> WriteOptions {
+        WriteOptions {
+            palette: self
+                .input
+                .write
+                .palette
+                .or(Some(((count as f64 * PALETTE) as usize).clamp(64, 65_536))),
+            ..self.input.write
+        }
+    }
+
+    /// What the file will hold of `splats`, and its bytes.
+    fn through(&self, splats: &Splats) -> Result<(Splats, u64), RunError> {
+        let options = self.write_options(splats.len());
+        let (cloud, bytes) = through_format(self.format, &self.cloud(splats), &options)?;
+        let cloud = in_world(cloud, &self.world_from_dataset);
+        Ok((Splats::from_cloud(&cloud), bytes as u64))
+    }
+
+    fn judge(&self, splats: &Splats, seed: u64) -> Contributions {
+        let train = &self.dataset.train;
+        let step = train.len().div_ceil(JUDGING_VIEWS).max(1);
+        let views = train.iter().step_by(step);
+        let cameras: Vec<Camera> = views.map(|i| self.dataset.views[*i].camera).collect();
+        contributions(splats, &cameras, &self.options, seed)
+    }
+
+    /// `count` splats, trained.
+    pub fn with(&self, count: usize, see: &mut dyn FnMut(CompactEvent)) -> Result<Found, RunError> {
+        let options = TrainOptions {
+            seed: self.input.seed,
+            steps: Some(self.input.steps),
+            memory: usual_limit(),
+            lpips: None,
+        };
+        let first = self.begin.len();
+        let mut trainer = Trainer::from_splats(self.dataset.clone(), self.recipe.clone(), options, self.begin.clone())?;
+        let (mut rounds, mut stage, mut events) = (0, 0, Vec::new());
+        while !trainer.finished() {
+            let removed = trainer.clock.time / self.recipe.stage[0].steps as f64;
+            if rounds < ROUNDS && removed >= f64::from(rounds) / f64::from(ROUNDS) && count < first {
+                rounds += 1;
+                // By the same factor in each round.
+                let share = (count as f64 / first as f64).powf(f64::from(rounds) / f64::from(ROUNDS));
+                let most = ((first as f64 * share).round() as usize).max(count);
+                let change = self
+                    .judge(&trainer.engine.state().splats, self.input.seed + u64::from(rounds))
+                    .change;
+                keep(trainer.engine.state_mut(), &change, most);
+            }
+            if trainer.clock.stage > stage {
+                if stage == 0 {
+                    let weight = self.judge(&trainer.engine.state().splats, self.input.seed).weight;
+                    hide_harmonics(&mut trainer.engine.state_mut().splats, &weight, SHOWN);
+                }
+                stage = trainer.clock.stage;
+                let held = self.through(&trainer.engine.state().splats)?.0;
+                *trainer.engine.state_mut() = SplatState::new(held);
+            }
+            let report = trainer.step(&mut events)?;
+            events.clear();
+            see(CompactEvent::Step {
+                steps: [report.step, trainer.total_steps()],
+                splats: [trainer.engine.len(), count],
+            });
+        }
+        let (splats, bytes) = self.through(&trainer.engine.state().splats)?;
+        let found = Found {
+            bytes,
+            psnr: self.measure.of(&self.model(&splats))?,
+            write: self.write_options(splats.len()),
+            splats,
+        };
+        see(CompactEvent::Tried {
+            splats: found.splats.len(),
+            bytes,
+            psnr: found.psnr,
+        });
+        Ok(found)
+    }
+
+    /// As many splats as fit into `most` bytes, trained.
+    ///
+    /// # Errors
+    /// When not even a few do.
+    pub fn within(&mut self, most: u64, see: &mut dyn FnMut(CompactEvent)) -> Result<Found, RunError> {
+        let first = self.begin.len();
+        let mut order = SplatState::new(self.begin.clone());
+        let judged = self.judge(&order.splats, self.input.seed);
+        hide_harmonics(&mut order.splats, &judged.weight, SHOWN);
+        // Bytes are nearly linear in the number of splats: two points on the line, then its place at the limit.
+        let bytes_with = |count: usize| -> Result<f64, RunError> {
+            let mut state = order.clone();
+            keep(&mut state, &judged.change, count);
+            Ok(self.through(&state.splats)?.1 as f64)
+        };
+        let all = bytes_with(first)?;
+        let mut count = first;
+        if all > most as f64 {
+            let half = bytes_with(first / 2)?;
+            let slope = (all - half) / (first - first / 2) as f64;
+            count = (first as f64 - (all - most as f64) / slope) as usize;
+            let near = bytes_with(count.clamp(1, first))?;
+            count = (count as f64 + (most as f64 - near) / slope).max(0.0) as usize;
+        }
+        for _ in 0..4 {
+            if count == 0 {
+                break;
+            }
+            let found = self.with(count.min(first), see)?;
+            if found.bytes <= most {
+                return Ok(found);
+            }
+            // What is left is trained further with a little less.
+            count = (count as f64 * most as f64 / found.bytes as f64 * 0.98) as usize;
+            self.begin = found.splats;
+        }
+        Err(RunError::setting(
+            "target",
+            format!("{most} bytes"),
+            format!("no {} file of this scene is so small", self.format),
+        ))
+    }
+
+    /// The smallest scene of at least `fewest` splats with at least `least` PSNR, by bisection; the largest that was tried if there is
+    /// none.
+    pub fn smallest(
+        &mut self,
+        fewest: usize,
+        least: f64,
+        see: &mut dyn FnMut(CompactEvent),
+    ) -> Result<Found, RunError> {
+        let all = self.begin.len();
+        let (mut low, mut high) = ((all / 100).max(fewest).max(1) as f64, all as f64);
+        let mut best: Option<Found> = None;
+        for _ in 0..SEARCHES {
+            let count = (low * high).sqrt();
+            if high / low < CLOSE {
+                break;
+            }
+            let found = self.with(count as usize, see)?;
+            if found.psnr >= least {
+                high = count;
+                self.begin.clone_from(&found.splats);
+                best = Some(found);
+            } else {
+                low = count;
+            }
+        }
+        match best {
+            Some(best) => Ok(best),
+            None => self.with(all, see),
+        }
+    }
+}
+
+/// Keeps the `count` splats with the largest `score`.
+fn keep(state: &mut SplatState, score: &[f64], count: usize) {
+    let mut order: Vec<u32> = (0..state.len() as u32).collect();
+    order.sort_by(|a, b| score[*b as usize].total_cmp(&score[*a as usize]).then(a.cmp(b)));
+    order.truncate(count);
+    order.sort_unstable();
+    state.gather(&order);
+}
+
+/// Sets harmonics above degree 0 to zero but for the `share` of the splats where they show most: by the light that they change.
+fn hide_harmonics(splats: &mut Splats, weight: &[f64], share: f64) {
+    let planes = splats.sh.count();
+    let energy = |i: usize| (3..planes).map(|c| f64::from(splats.sh.get(c, i)).powi(2)).sum::<f64>();
+    let mut order: Vec<(f64, u32)> = (0..splats.len()).map(|i| (weight[i] * energy(i), i as u32)).collect();
+    order.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
+    let shown = (share * order.len() as f64).ceil() as usize;
+    for (_, i) in &order[shown..] {
+        (3..planes).for_each(|c| splats.sh.set(c, *i as usize, 0.0));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_splats_that_score_least_go_and_harmonics_that_do_not_show() {
+        let mut splats = Splats::zeros(4, 1);
+        for i in 0..4 {
+            splats.means.set(0, i, i as f32);
+            splats.sh.set(5, i, 1.0 + i as f32);
+        }
+        let mut state = SplatState::new(splats);
+        keep(&mut state, &[3.0, 1.0, 4.0, 2.0], 3);
+        let left: Vec<f32> = (0..3).map(|i| state.splats.means.get(0, i)).collect();
+        assert_eq!(left, [0.0, 2.0, 3.0]);
+        hide_harmonics(&mut state.splats, &[100.0, 1.0, 1.0], 0.5);
+        let shown: Vec<f32> = (0..3).map(|i| state.splats.sh.get(5, i)).collect();
+        assert_eq!(shown, [1.0, 0.0, 4.0], "by weight times energy");
+    }
+}

@@ -1,0 +1,203 @@
+//! Levels of detail beside a splat file: a half, a quarter and an eighth of its splats, merged so that they look alike from afar.
+
+use crate::folder::cameras_beside;
+use crate::orbit::orbit;
+use crate::{RunError, scene_of};
+use irradia_formats::{SplatFormat, WriteOptions, read_splats, splat_file_size, write_splats_with};
+use irradia_scene::{Camera, GaussianCloud, resize_area};
+use irradia_splat::levels::merged;
+use irradia_splat::{RenderOptions, Renderer, Splats, ViewParams};
+use std::path::{Path, PathBuf};
+
+/// Levels beside a scene; each has half of the splats of the one before.
+pub const LEVELS: u32 = 3;
+/// Views in which levels are compared, at most.
+const VIEWS: u32 = 12;
+/// Pixels of the largest compared picture where no cameras are known.
+const SIZE: (u32, u32) = (640, 480);
+
+/// A level that was written. PSNRs are those of pictures with `1 / 2^level` of the pixels, as from so much further away, against the
+/// picture of the whole scene at full size, shrunk by area; means over views, dB.
+#[derive(Clone, Debug)]
+pub struct Level {
+    /// The file.
+    pub path: PathBuf,
+    /// Splats.
+    pub splats: usize,
+    /// Bytes of the file.
+    pub bytes: u64,
+    /// PSNR of the level.
+    pub psnr: f64,
+    /// Of as many splats taken evenly from the scene.
+    pub subsample_psnr: f64,
+    /// Of the whole scene drawn at that size: its small splats are widened to a pixel each.
+    pub whole_psnr: f64,
+}
+
+/// The file of level `level` of the scene in the file `path`: `a.lod1.sog` for `a.sog`.
+///
+/// # Errors
+/// When the format is unknown, or is a folder.
+pub fn level_file(path: &Path, level: u32) -> Result<PathBuf, RunError> {
+    let format = SplatFormat::of(path)?;
+    let name = path.file_name().unwrap_or_default().to_string_lossy();
+    let stem = name.len().saturating_sub(format.suffix().len());
+    match (format, name.get(..stem)) {
+        (SplatFormat::SogFolder, _) | (_, None) => Err(RunError::Refused(format!(
+            "{}: levels of detail go beside a file: choose .sog",
+            path.display()
+        ))),
+        (_, Some(stem)) => Ok(path.with_file_name(format!("{stem}.lod{level}{}", format.suffix()))),
+    }
+}
+
+/// Writes the levels of the scene `input` beside `output`, and compares them from where its training cameras are.
+///
+/// # Errors
+/// When the input cannot be read, or a level cannot be written.
+pub fn write_levels(input: &Path, output: &Path, options: &WriteOptions) -> Result<Vec<Level>, RunError> {
+    let paths = (1..=LEVELS)
+        .map(|level| level_file(output, level))
+        .collect::<Result<Vec<_>, _>>()?;
+    let input = scene_of(input);
+    let cloud = read_splats(&input)?;
+    let whole = Splats::from_cloud(&cloud);
+    let render = RenderOptions {
+        antialias: cloud.antialiased,
+        ..RenderOptions::default()
+    };
+    let cameras = compared_cameras(&input, &cloud, &whole);
+    let mut renderer = Renderer::new();
+    let full: Vec<Vec<u8>> = cameras
+        .iter()
+        .map(|camera| picture(&mut renderer, &whole, camera, &render))
+        .collect();
+    let (mut levels, mut last) = (Vec::new(), whole.clone());
+    for (level, path) in (1..).zip(paths) {
+        let count = whole.len().div_ceil(1 << level);
+        last = merged(&last, count);
+        let thinned: Vec<u32> = (0..whole.len() as u32).step_by(1 << level).collect();
+        let mut sums = [0.0; 3];
+        for (camera, full) in cameras.iter().zip(&full) {
+            let k = &camera.intrinsics;
+            let far = Camera {
+                intrinsics: k.scaled(0.5f32.powf(0.5 * level as f32)),
+                ..*camera
+            };
+            let [width, height] = [far.intrinsics.width, far.intrinsics.height];
+            let shrunk = resize_area(full, 3, [k.width, k.height], [width, height]);
+            for (sum, splats) in sums.iter_mut().zip([&last, &whole.gather(&thinned), &whole]) {
+                *sum += psnr(&picture(&mut renderer, splats, &far, &render), &shrunk);
+            }
+        }
+        let [psnr, subsample_psnr, whole_psnr] = sums.map(|sum| sum / cameras.len().max(1) as f64);
+        let merged = GaussianCloud {
+            antialiased: cloud.antialiased,
+            world_from_dataset: cloud.world_from_dataset,
+            ..last.to_cloud()
+        };
+        write_splats_with(&path, &merged, options)?;
+        levels.push(Level {
+            splats: last.len(),
+            bytes: splat_file_size(&path)?,
+            path,
+            psnr,
+            subsample_psnr,
+            whole_psnr,
+        });
+    }
+    Ok(levels)
+}
+
+/// The levels beside the scene in the file `path`, which has `count` splats, in their order; those of another scene are not taken.
+///
+/// # Errors
+/// When a level is there and cannot be read.
+pub fn read_levels(path: &Path, count: usize) -> Result<Vec<Splats>, RunError> {
+    let mut levels = Vec::new();
+    for level in 1..=LEVELS {
+        let Ok(file) = level_file(path, level) else { break };
+        if !file.is_file() {
+            break;
+        }
+        let splats = Splats::from_cloud(&read_splats(&file)?);
+        // Splats that are never seen are not merged, and may leave a few less.
+        let expected = count.div_ceil(1 << level);
+        if splats.len() > expected || splats.len() < expected / 2 {
+            break;
+        }
+        levels.push(splats);
+    }
+    Ok(levels)
+}
+
+/// Some of the training cameras, or cameras around the scene.
+fn compared_cameras(input: &Path, cloud: &GaussianCloud, splats: &Splats) -> Vec<Camera> {
+    match cameras_beside(input, &cloud.world_from_dataset) {
+        Some(cameras) if !cameras.is_empty() => {
+            let step = cameras.len().div_ceil(VIEWS as usize);
+            cameras.into_iter().step_by(step).collect()
+        }
+        _ => orbit(Some(splats), None, VIEWS, Some(SIZE)),
+    }
+}
+
+/// 8 bits, `[H, W, 3]`.
+fn picture(renderer: &mut Renderer, splats: &Splats, camera: &Camera, options: &RenderOptions) -> Vec<u8> {
+    renderer.render(splats, &ViewParams::new(camera), options);
+    let color = renderer.color();
+    let pixels = color.len() / 3;
+    let value = |i: usize| color[i % 3 * pixels + i / 3];
+    (0..3 * pixels)
+        .map(|i| (value(i).clamp(0.0, 1.0) * 255.0).round() as u8)
+        .collect()
+}
+
+/// Of pictures of 8 bits, dB; at most that of a single difference.
+fn psnr(a: &[u8], b: &[u8]) -> f64 {
+    let squares = a.iter().zip(b).map(|(a, b)| u64::from(a.abs_diff(*b)).pow(2));
+    let sum = squares.sum::<u64>().max(1) as f64;
+    10.0 * (255.0 * 255.0 * a.len() as f64 / sum).log10()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use irradia_formats::write_splats;
+    use irradia_scene::Rng;
+
+    #[test]
+    fn levels_have_the_scenes_name_and_are_told_from_those_of_another() {
+        let name = |path: &str| level_file(Path::new(path), 2).map(|path| path.display().to_string());
+        assert_eq!(name("a/b.sog").unwrap(), "a/b.lod2.sog");
+        assert_eq!(name("b.v1.Compressed.PLY").unwrap(), "b.v1.lod2.compressed.ply");
+        assert!(name("meta.json").unwrap_err().to_string().contains("choose .sog"));
+
+        let mut rng = Rng::new(3, 3);
+        let count = 2000;
+        let mut values = |n: usize, low: f32, high: f32| (0..n).map(|_| rng.range(low, high)).collect::<Vec<f32>>();
+        let cloud = GaussianCloud {
+            means: values(3 * count, -1.0, 1.0).as_chunks().0.to_vec(),
+            quats: values(4 * count, 0.1, 1.0).as_chunks().0.to_vec(),
+            log_scales: values(3 * count, -4.0, -3.0).as_chunks().0.to_vec(),
+            opacity_logits: values(count, 0.0, 2.0),
+            sh: values(3 * count, -1.0, 1.0),
+            ..GaussianCloud::default()
+        };
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.ply");
+        write_splats(&path, &cloud).unwrap();
+        let levels = write_levels(&path, &path, &WriteOptions::default()).unwrap();
+        assert_eq!(
+            levels.iter().map(|level| level.splats).collect::<Vec<_>>(),
+            [1000, 500, 250]
+        );
+        for level in &levels {
+            assert!(level.psnr > level.subsample_psnr + 3.0, "{level:?}");
+        }
+        let read = read_levels(&path, count).unwrap();
+        assert_eq!(read.iter().map(Splats::len).collect::<Vec<_>>(), [1000, 500, 250]);
+        assert!(read_levels(&path, 10 * count).unwrap().is_empty(), "of another scene");
+        assert!(read_levels(&folder.path().join("b.ply"), count).unwrap().is_empty());
+    }
+}

@@ -1,0 +1,299 @@
+//! Edited scenes on disk, and trainings that begin with them.
+
+use crate::{begin, dataset, folder, input};
+use glam::{Quat, Vec3};
+use irradia_edit::EditList;
+use irradia_runs::formats::{WriteOptions, read_splats, write_splats};
+use irradia_runs::prelude::*;
+use irradia_runs::scene::{GaussianCloud, Rng, sh};
+use irradia_runs::synth::{SceneName, dataset as traced};
+use irradia_runs::train::event::{Event, Observer, Signal};
+use irradia_runs::{EDITS, Editing};
+use irradia_splat::logit;
+use std::fs;
+use std::path::Path;
+
+fn list(lines: &[&str]) -> EditList {
+    EditList {
+        edits: lines.iter().map(|line| line.parse().expect(line)).collect(),
+        ..EditList::default()
+    }
+}
+
+fn edited(input: &Path, lines: &[&str]) -> Editing {
+    let mut editing = Editing::open(input).expect("a scene");
+    editing.apply(&list(lines)).expect("edits");
+    editing
+}
+
+#[test]
+fn a_folder_gets_the_scene_its_moved_cameras_and_the_edits() {
+    let folder = folder();
+    let mut run = begin(folder.path(), "run", 5);
+    run.train(&mut []).expect("trains");
+    run.finish().expect("finishes");
+    let (path, out) = (folder.path().join("run"), folder.path().join("out"));
+    let editing = edited(&path, &["rotate axis=1,2,0 degrees=40", "move by=0,0,3"]);
+    editing.write(&out, &WriteOptions::default()).expect("writes");
+
+    // The scene and its cameras have moved alike.
+    let (before, after) = (Scene::read(&path).expect("a run"), Scene::read(&out).expect("a folder"));
+    let cameras = |scene: &Scene| scene.cameras.clone().expect("beside it");
+    for (old, new) in cameras(&before).iter().zip(cameras(&after).iter()) {
+        let (a, b) = (before.render(old).color, after.render(new).color);
+        let worst = a
+            .data
+            .iter()
+            .zip(&b.data)
+            .map(|(a, b)| (a - b).abs())
+            .fold(0.0, f32::max);
+        assert!(worst < 2e-3, "{worst}");
+    }
+    let written = EditList::parse(&fs::read_to_string(out.join(EDITS)).expect("a list")).expect("valid");
+    assert_eq!(&written, editing.list());
+
+    // Replayed on the same scene: the same bytes, in any format's file.
+    let again = folder.path().join("again.ply");
+    let mut replayed = Editing::open(&path).expect("a scene");
+    replayed.apply(&written).expect("the same edits");
+    replayed.write(&again, &WriteOptions::default()).expect("writes");
+    assert!(fs::read(&again).unwrap() == fs::read(out.join("scene.ply")).unwrap());
+
+    // What must not be overwritten is not.
+    for (out, words) in [
+        (path.join("scene.ply"), "would be replaced"),
+        (path.clone(), "would be replaced"),
+        (folder.path().join("scene.xyz"), "known extensions"),
+    ] {
+        let error = editing
+            .write(&out, &WriteOptions::default())
+            .expect_err("refused")
+            .to_string();
+        assert!(error.contains(words) && !error.contains('\n'), "{error}");
+    }
+    let error = editing.write_in_place().expect_err("moved").to_string();
+    assert!(error.contains("photographs"), "{error}");
+}
+
+#[test]
+fn what_is_split_off_and_merged_again_is_the_same_scene() {
+    let folder = folder();
+    let mut run = begin(folder.path(), "run", 5);
+    run.train(&mut []).expect("trains");
+    run.finish().expect("finishes");
+    let path = folder.path().join("run");
+    let out = folder.path().join("rest.ply");
+    let editing = edited(&path, &["split name=part half-space point=0,0,0.5 normal=0,0,1"]);
+    let notes = editing.write(&out, &WriteOptions::default()).expect("writes");
+    let part = folder.path().join("part.ply");
+    assert!(
+        part.is_file() && notes.iter().any(|note| note.contains("split off")),
+        "{notes:?}"
+    );
+    let merged = edited(&out, &[&format!("merge file={}", part.display())]);
+    let whole = read_splats(&path.join("scene.ply")).unwrap();
+    assert_eq!(merged.draft().len(), whole.len());
+    let sorted = |cloud: &GaussianCloud| {
+        let mut means = cloud.means.clone();
+        means.sort_by(|a, b| a.partial_cmp(b).expect("finite"));
+        means
+    };
+    assert_eq!(sorted(&merged.draft().cloud), sorted(&whole));
+}
+
+/// Stops after a number of steps.
+struct StopAt(u64);
+
+impl Observer for StopAt {
+    fn on_event(&mut self, event: &Event, _: &Trainer) -> Signal {
+        match event {
+            Event::Step(report) if report.step >= self.0 => Signal::Stop,
+            _ => Signal::Continue,
+        }
+    }
+}
+
+#[test]
+fn a_run_edited_in_place_resumes_with_the_edited_splats() {
+    let folder = folder();
+    let mut run = begin(folder.path(), "run", 12);
+    run.train(&mut [&mut StopAt(6)]).expect("trains");
+    assert!(!run.finish().expect("is saved").complete);
+    let path = folder.path().join("run");
+    let before = Editing::open(&path).expect("a scene").draft().len();
+    let half = "half-space point=0,0,0.6 normal=0,0,1";
+    let editing = edited(
+        &path,
+        &[
+            &format!("delete {half}"),
+            "recolor exposure=0.2 sphere center=0,0,0 radius=0.5",
+        ],
+    );
+    let notes = editing.write_in_place().expect("writes");
+    assert!(notes.iter().any(|note| note.contains("optimiser state")), "{notes:?}");
+    let left = read_splats(&path.join("scene.ply")).unwrap().len();
+    assert!(left < before && left == editing.draft().len());
+    // A second edit is listed behind the first.
+    edited(&path, &["opacity factor=0.9 all"])
+        .write_in_place()
+        .expect("writes");
+    let listed = EditList::parse(&fs::read_to_string(path.join(EDITS)).unwrap()).unwrap();
+    assert_eq!(listed.edits.len(), 3);
+
+    let request = TrainInput::of_run(&path).unwrap().check().unwrap();
+    let mut run = Run::resume_on(request, dataset()).expect("resumes");
+    let state = run.trainer().engine.state();
+    assert_eq!((run.trainer().clock.step, state.len()), (6, left));
+    run.train(&mut []).expect("trains");
+    assert!(run.finish().expect("finishes").complete);
+}
+
+#[test]
+fn a_training_begins_with_the_splats_of_a_scene() {
+    let folder = folder();
+    let mut run = begin(folder.path(), "run", 30);
+    run.train(&mut []).expect("trains");
+    let first = run.finish().expect("finishes").report;
+    let from = TrainInput {
+        from: Some(folder.path().join("run")),
+        ..input(folder.path(), "next", 1)
+    };
+    let mut run = Run::begin_on(from.clone().check().expect("a request"), dataset()).expect("a run");
+    let splats = run.trainer().engine.state().splats.clone();
+    assert_eq!(splats.len(), first.splats as usize);
+    run.train(&mut []).expect("trains");
+    let second = run.finish().expect("finishes").report;
+    assert!(second.psnr > first.psnr - 1.0, "{} after {}", second.psnr, first.psnr);
+
+    let field = TrainInput {
+        recipe: "hashgrid".into(),
+        ..from.clone()
+    };
+    assert!(field.check().unwrap_err().to_string().contains("from"));
+    let missing = TrainInput {
+        from: Some("nowhere.ply".into()),
+        ..from
+    };
+    assert!(
+        Run::begin_on(
+            TrainInput {
+                out: folder.path().join("other"),
+                ..missing
+            }
+            .check()
+            .unwrap(),
+            dataset()
+        )
+        .is_err()
+    );
+    assert!(!folder.path().join("other").exists());
+}
+
+/// Five hundred floaters of five kinds in a trained scene: they go, the scene stays, and held-out views are as good as before.
+#[test]
+fn floaters_planted_in_a_trained_scene_are_removed() {
+    let folder = folder();
+    let options = SynthOptions {
+        scene: SceneName::Room,
+        views: 24,
+        width: 96,
+        height: 72,
+        seed: 2,
+    };
+    let data = traced(&options).expect("options");
+    let request = input(folder.path(), "run", 300).check().expect("a request");
+    let mut run = Run::begin_on(request, data.clone()).expect("a run");
+    run.train(&mut []).expect("trains");
+    let before = run.finish().expect("finishes").report.psnr;
+    let path = folder.path().join("run/scene.ply");
+    let clean = read_splats(&path).unwrap();
+    let cameras = Scene::read(&path).unwrap().cameras.expect("beside it");
+    let planted = planted(&clean, &cameras);
+    write_splats(&path, &planted).unwrap();
+
+    let editing = edited(&path, &["delete floaters"]);
+    let left = &editing.draft().cloud;
+    let found = planted.means[clean.len()..]
+        .iter()
+        .filter(|mean| !left.means.contains(mean))
+        .count();
+    let lost = planted.len() - left.len() - found;
+    assert!(found >= 475, "{found} of 500 found");
+    assert!(lost * 100 <= clean.len(), "{lost} of {} lost", clean.len());
+
+    let psnr = |cloud: &GaussianCloud| {
+        write_splats(&path, cloud).unwrap();
+        let scene = Scene::read(&path).unwrap();
+        let squares = data.test.iter().map(|view| {
+            let view = &data.views[*view];
+            let photo = view.photo.load().expect("in memory");
+            let picture = scene.render(&view.camera).color.rounded_to_8_bits();
+            let square = |(a, b): (&f32, &u8)| (f64::from(*a) - f64::from(*b) / 255.0).powi(2);
+            picture.data.iter().zip(&photo.data).map(square).sum::<f64>() / picture.data.len() as f64
+        });
+        let each: Vec<f64> = squares.map(|square| -10.0 * square.log10()).collect();
+        each.iter().sum::<f64>() / each.len() as f64
+    };
+    let (as_trained, with, after) = (psnr(&clean), psnr(&planted), psnr(left));
+    assert!(
+        (as_trained - before).abs() < 0.5,
+        "the report's own figure: {before}, {as_trained}"
+    );
+    assert!(with < as_trained - 3.0, "{with}");
+    assert!(after >= as_trained - 0.05, "{after:.2} dB after {as_trained:.2} dB");
+}
+
+/// A hundred each: isolated in front of a surface, needles, huge, outside of all views, close to a camera.
+fn planted(clean: &GaussianCloud, cameras: &[Camera]) -> GaussianCloud {
+    let mut cloud = clean.clone();
+    let mut rng = Rng::new(5, 0);
+    let middle = cameras.iter().map(|c| c.pose.position).sum::<Vec3>() / cameras.len() as f32;
+    let mut distances: Vec<f32> = clean
+        .means
+        .iter()
+        .map(|mean| middle.distance(Vec3::from(*mean)))
+        .collect();
+    distances.sort_by(f32::total_cmp);
+    let [unit, far] = [0.3, 0.99].map(|q| distances[(distances.len() as f32 * q) as usize]);
+    let width = 3 * clean.sh_coefficients();
+    for i in 0..500 {
+        let (mean, scales, opacity) = loop {
+            let camera = &cameras[rng.below(cameras.len() as u32) as usize];
+            let k = camera.intrinsics;
+            let pixel = glam::Vec2::new(rng.uniform() * k.width as f32, rng.uniform() * k.height as f32);
+            let (eye, ray) = (camera.pose.position, camera.ray_direction(pixel));
+            let direction = Vec3::new(rng.normal(), rng.normal(), rng.normal()).normalize();
+            let opacity = rng.range(0.3, 0.95);
+            let mut ball = |low: f32, high: f32| [unit * rng.range(low, high); 3];
+            let planted = match i / 100 {
+                0 => (0.5, ball(0.01, 0.03), opacity),
+                1 => (0.5, [0.3 * unit, 0.003 * unit, 0.003 * unit], opacity),
+                2 => (0.3, [3.0 * unit, 2.0 * unit, unit], 0.3 * opacity),
+                3 => (0.0, ball(0.02, 0.05), opacity),
+                _ => (0.1, ball(0.004, 0.02), opacity),
+            };
+            let (along, scales, opacity) = planted;
+            let mean = match along > 0.0 {
+                true => eye + ray * unit * along,
+                false => middle + direction * far * 3.0,
+            };
+            // Isolated means far from everything.
+            let near = clean
+                .means
+                .iter()
+                .any(|other| mean.distance(Vec3::from(*other)) < 5.0 * scales[0]);
+            if i >= 100 || !near {
+                break (mean, scales, opacity);
+            }
+        };
+        let turn = Quat::from_xyzw(rng.normal(), rng.normal(), rng.normal(), rng.normal()).normalize();
+        cloud.means.push(mean.to_array());
+        cloud.quats.push([turn.w, turn.x, turn.y, turn.z]);
+        cloud.log_scales.push(scales.map(f32::ln));
+        cloud.opacity_logits.push(logit(opacity));
+        let mut harmonics = vec![0.0; width];
+        harmonics[..3].fill_with(|| sh::dc_from_color(rng.uniform()));
+        cloud.sh.extend(harmonics);
+    }
+    cloud
+}

@@ -1,0 +1,153 @@
+//! Fewer splats that look alike from afar: pairs are merged into splats of the same mass, mean and covariance, the cheapest first.
+//!
+//! The mass is opacity times the area of the ellipsoid's surface (Kerbl et al. 2024, "A Hierarchical 3D Gaussian Representation",
+//! section 4.1), not times its volume as in [`densify::merge`](crate::densify::merge): two flat splats that are not quite in one plane
+//! would make a thick one of the same volume, and lose their opacity.
+
+use crate::nearest::Nearest;
+use crate::render::ALPHA_MIN;
+use crate::{Splats, eigen, logit};
+use glam::{Mat3, Quat, Vec3};
+use rayon::prelude::*;
+
+/// Neighbours among which a partner is sought.
+const NEIGHBOURS: usize = 9;
+/// Largest opacity of a merged splat.
+const MOST_OPAQUE: f32 = 0.999;
+
+/// A splat as merging sees it.
+#[derive(Clone, Copy)]
+struct Blob {
+    mean: Vec3,
+    covariance: Mat3,
+    mass: f32,
+    /// Colour of degree 0.
+    color: Vec3,
+}
+
+/// `splats` merged until at most `count` are left. Splats that can never be seen are left out first.
+pub fn merged(splats: &Splats, count: usize) -> Splats {
+    let drawn: Vec<u32> = (0..splats.len() as u32)
+        .into_par_iter()
+        .filter(|i| splats.opacity(*i as usize) >= ALPHA_MIN as f32 && is_finite(splats, *i as usize))
+        .collect();
+    let mut left = splats.gather(&drawn);
+    while left.len() > count.max(1) {
+        let blobs: Vec<Blob> = (0..left.len()).into_par_iter().map(|i| blob(&left, i)).collect();
+        let pairs = pairs(&blobs, left.len() - count.max(1));
+        if pairs.is_empty() {
+            break;
+        }
+        left = unite(&left, &blobs, &pairs);
+    }
+    left
+}
+
+fn is_finite(splats: &Splats, i: usize) -> bool {
+    let columns = [&splats.means, &splats.quats, &splats.log_scales];
+    columns
+        .iter()
+        .all(|column| (0..column.count()).all(|c| column.get(c, i).is_finite()))
+}
+
+fn blob(splats: &Splats, i: usize) -> Blob {
+    let q = |c: usize| splats.quats.get(c, i);
+    let rotation = Mat3::from_quat(Quat::from_xyzw(q(1), q(2), q(3), q(0)).normalize());
+    let scales = Vec3::from_array(std::array::from_fn(|c| splats.log_scales.get(c, i).exp()));
+    Blob {
+        mean: Vec3::from(splats.mean(i)),
+        covariance: rotation * Mat3::from_diagonal(scales * scales) * rotation.transpose(),
+        mass: (splats.opacity(i) * area(scales)).max(f32::MIN_POSITIVE),
+        color: Vec3::from_array(std::array::from_fn(|c| splats.sh.get(c, i))),
+    }
+}
+
+/// Surface of an ellipsoid up to a constant factor (Thomsen's approximation): within 1.1 %.
+fn area(scales: Vec3) -> f32 {
+    const P: f32 = 1.6075;
+    let [a, b, c] = scales.to_array();
+    ((a * b).powf(P) + (a * c).powf(P) + (b * c).powf(P)).powf(1.0 / P)
+}
+
+/// Disjoint pairs of neighbours, at most `most`, the cheapest first.
+fn pairs(blobs: &[Blob], most: usize) -> Vec<(u32, u32)> {
+    let positions: Vec<[f32; 3]> = blobs.iter().map(|blob| blob.mean.to_array()).collect();
+    let tree = Nearest::new(&positions);
+    let mut candidates: Vec<(f32, u32, u32)> = (0..blobs.len())
+        .into_par_iter()
+        .flat_map_iter(|i| {
+            let near = tree.of::<NEIGHBOURS>(positions[i]);
+            let others = near.into_iter().map(|(_, other)| other as usize);
+            // Pairs that find each other are there twice, which does no harm.
+            others
+                .filter(move |other| *other != i && *other < blobs.len())
+                .map(move |other| (cost(&blobs[i], &blobs[other]), i.min(other) as u32, i.max(other) as u32))
+        })
+        .collect();
+    candidates.par_sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then((a.1, a.2).cmp(&(b.1, b.2))));
+    let mut taken = vec![false; blobs.len()];
+    let mut pairs = Vec::new();
+    for (_, a, b) in candidates {
+        if pairs.len() == most {
+            break;
+        }
+        if !taken[a as usize] && !taken[b as usize] {
+            taken[a as usize] = true;
+            taken[b as usize] = true;
+            pairs.push((a, b));
+        }
+    }
+    pairs
+}
+
+/// What merging two costs: how far their mass moves (Ward 1963), more where the colours differ.
+fn cost(a: &Blob, b: &Blob) -> f32 {
+    let reduced = a.mass * b.mass / (a.mass + b.mass);
+    reduced * a.mean.distance_squared(b.mean) * (COLOR_FLOOR + a.color.distance_squared(b.color))
+}
+
+/// Squared difference of colours, in coefficients of degree 0, that costs as much again as the distance.
+const COLOR_FLOOR: f32 = 0.1;
+
+/// Both of each pair as one, and the others as they are.
+fn unite(splats: &Splats, blobs: &[Blob], pairs: &[(u32, u32)]) -> Splats {
+    let mut gone = vec![false; splats.len()];
+    pairs.iter().for_each(|(_, b)| gone[*b as usize] = true);
+    let mut united = splats.gather(&[]);
+    united.clone_from(splats);
+    let unions: Vec<(f32, Vec3, Quat, [f32; 3], f32)> = pairs
+        .par_iter()
+        .map(|(a, b)| union(&blobs[*a as usize], &blobs[*b as usize]))
+        .collect();
+    for ((a, b), (part, mean, rotation, log_scales, logit)) in pairs.iter().zip(unions) {
+        let (a, b) = (*a as usize, *b as usize);
+        for c in 0..3 {
+            united.means.set(c, a, mean[c]);
+            united.log_scales.set(c, a, log_scales[c]);
+        }
+        for (c, v) in [rotation.w, rotation.x, rotation.y, rotation.z].into_iter().enumerate() {
+            united.quats.set(c, a, v);
+        }
+        united.opacity_logits.set(0, a, logit);
+        for c in 0..united.sh.count() {
+            let mixed = part * splats.sh.get(c, a) + (1.0 - part) * splats.sh.get(c, b);
+            united.sh.set(c, a, mixed);
+        }
+    }
+    let kept: Vec<u32> = (0..splats.len() as u32).filter(|i| !gone[*i as usize]).collect();
+    united.gather(&kept)
+}
+
+/// Share of `a` in the mass, mean, rotation, ln scales and opacity logit of both as one.
+fn union(a: &Blob, b: &Blob) -> (f32, Vec3, Quat, [f32; 3], f32) {
+    let total = a.mass + b.mass;
+    let part = a.mass / total;
+    let mean = part * a.mean + (1.0 - part) * b.mean;
+    let outer = |d: Vec3| Mat3::from_cols(d * d.x, d * d.y, d * d.z);
+    let covariance =
+        (a.covariance + outer(a.mean - mean)) * part + (b.covariance + outer(b.mean - mean)) * (1.0 - part);
+    let (rotation, variances) = eigen(covariance);
+    let scales = variances.max(Vec3::splat(1e-30)).map(f32::sqrt);
+    let opacity = (total / area(scales)).clamp(1e-4, MOST_OPAQUE);
+    (part, mean, rotation, scales.map(f32::ln).to_array(), logit(opacity))
+}

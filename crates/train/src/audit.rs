@@ -1,0 +1,75 @@
+//! Looks at all training views during a run: which photographs do not fit, and what stands in one of them only.
+
+use crate::event::Event;
+use crate::schedule::plan;
+use crate::trainer::{TrainError, Trainer};
+use crate::transients::{Difference, Hidden};
+use irradia_splat::FramePlanes;
+
+/// Fraction of a run after which misfits are left out.
+const MISFITS_AT: f64 = 0.2;
+/// Fractions of a run after which transients are hidden. After 0.2, surfaces at the border of a scene are not learned yet and are taken for
+/// transients; later ones find the borders of what the first found.
+const TRANSIENTS_AT: [f64; 3] = [0.3, 0.45, 0.6];
+/// Steps of a run for each training view below which nothing is decided: the renders would cost more than a twentieth of it.
+const STEPS_PER_VIEW: usize = 8;
+
+impl Trainer {
+    /// What is due after a step that began at `before`, in steps of the recipe: leaves out photographs, hides parts of them.
+    pub(crate) fn audit(&mut self, before: f64) -> Result<Vec<Event>, TrainError> {
+        let (total, now) = (self.recipe.total_steps() as f64, self.clock.time);
+        let passes = |at: f64| before < at * total && now >= at * total;
+        let mut events = Vec::new();
+        if self.total_steps() < (STEPS_PER_VIEW * self.trained.len()) as u64 {
+            return Ok(events);
+        }
+        if self.recipe.drop_misfits && passes(MISFITS_AT) {
+            let errors = self.training_errors()?;
+            events.extend(self.leave_out_misfits(&errors));
+        }
+        if self.recipe.hide_transients && TRANSIENTS_AT.into_iter().any(passes) {
+            // Where the first look finds nothing, there is nothing.
+            let is_first = passes(TRANSIENTS_AT[0]);
+            if is_first || self.hidden.views() > 0 {
+                self.find_transients()?;
+            }
+            events.extend((is_first && self.hidden.views() > 0).then(|| self.hidden_event()));
+        }
+        Ok(events)
+    }
+
+    /// The error of each training view, and that of its better part.
+    fn training_errors(&mut self) -> Result<Vec<(usize, [f64; 2])>, TrainError> {
+        let plan = plan(&self.recipe, &self.clock);
+        let mut errors = Vec::with_capacity(self.trained.len());
+        self.show_training_views(self.trained.len(), &plan, false, |trainer, view, photo| {
+            errors.push((view, [trainer.error_of_frame(photo), trainer.trimmed_error()]));
+        })?;
+        Ok(errors)
+    }
+
+    /// Hides what only one photograph shows.
+    fn find_transients(&mut self) -> Result<(), TrainError> {
+        let plan = plan(&self.recipe, &self.clock);
+        let mut differences = Vec::with_capacity(self.trained.len());
+        self.show_training_views(self.trained.len(), &plan, true, |trainer, view, photo| {
+            let frame = FramePlanes {
+                color: trainer.sockets.frame_color(&trainer.engine),
+                ..trainer.engine.frame()
+            };
+            let camera = trainer.camera(view);
+            differences.push((view, Difference::new(&frame, photo, &camera, trainer.extent)));
+        })?;
+        self.hidden = Hidden::find(&differences, self.extent, &self.hidden);
+        Ok(())
+    }
+
+    fn hidden_event(&self) -> Event {
+        let (views, share) = (self.hidden.views(), 100.0 * self.hidden.share());
+        let message = format!(
+            "{views} of {} photographs show what the others do not (people, cars, shadows), {share:.0} % of each in the mean; it is hidden from training (--set hide_transients=false shows it)",
+            self.trained.len()
+        );
+        Event::Decided { message }
+    }
+}

@@ -1,0 +1,401 @@
+//! What stands in one photograph and not in the others: people who walk through, cars, the photographer's shadow.
+//!
+//! From time to time all training views are rendered. Where a photograph differs from its frame by a patch of another colour, while
+//! other views that see the same surface agree with theirs, the patch shows something that was only there once, and is hidden from
+//! training from then on. Surfaces that splats have not reached yet differ too, but in all views that see them, and detail averages
+//! out over a block of pixels. Robust losses compare residuals within one photograph (RobustNeRF, Sabour et al. 2023;
+//! SpotLessSplats, Sabour et al. 2024), here they are compared with those of other photographs at the same place: no share of outliers has
+//! to be assumed, and where there are none, nothing is hidden.
+
+use crate::photos::Prepared;
+use glam::{Vec2, Vec3};
+use irradia_scene::{Camera, Intrinsics};
+use irradia_splat::FramePlanes;
+use rayon::prelude::*;
+use std::collections::BTreeMap;
+
+/// Blocks along the longer side of a photograph.
+const BLOCKS: u32 = 48;
+/// Difference of a block's mean colour, sRGB, from which it may show a transient. With 0.08, soft shadows on the wall of fox count as well.
+const LEAST: f32 = 0.2;
+/// Factor over the difference at the same place in other views. A person pasted into 14 of 43 photographs of fox is found whole at 3
+/// or 4, and nothing at all in the photographs without.
+const FACTOR: f32 = 3.0;
+/// The share of the other views that differ less. With the median, unlearned surfaces at the border of the scene count after a fifth of a run.
+const WITNESS_QUANTILE: f32 = 0.75;
+/// Neighbours of a transient's blocks belong to it from this share of both limits.
+const GROW: f32 = 0.4;
+/// Other views that must see a block's surface.
+const MIN_WITNESSES: usize = 3;
+/// Views asked about each place, the nearest ones.
+const WITNESSES: usize = 24;
+/// Depths that differ by less than this fraction are those of the same surface.
+const SAME_DEPTH: f32 = 0.15;
+/// Where a frame is empty, it shows what is this far away, in extents of the scene.
+const FAR: f32 = 1000.0;
+/// Blocks beyond both limits of a transient; smaller ones are left to the mean of the photographs.
+const MIN_BLOCKS: usize = 6;
+/// Largest hidden share of a photograph: beyond, it disagrees as a whole.
+const MOST: f32 = 0.5;
+
+/// A photograph divided into about square blocks. The grid depends on the full size of the photograph only.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+struct Grid {
+    columns: usize,
+    rows: usize,
+}
+
+impl Grid {
+    /// Of photographs with the full-size intrinsics `k`.
+    fn of(k: &Intrinsics) -> Self {
+        let blocks = |side: u32| (BLOCKS * side).div_ceil(k.width.max(k.height)) as usize;
+        Self {
+            columns: blocks(k.width),
+            rows: blocks(k.height),
+        }
+    }
+
+    /// Number of blocks.
+    fn len(self) -> usize {
+        self.columns * self.rows
+    }
+
+    /// First of the `pixels` of a side in the column or row `block` of `blocks`.
+    fn start(block: usize, blocks: usize, pixels: usize) -> usize {
+        (block * pixels).div_ceil(blocks)
+    }
+
+    /// The column or row of `blocks` that contains `pixel` of a side's `pixels`.
+    fn block(pixel: usize, blocks: usize, pixels: usize) -> usize {
+        pixel * blocks / pixels
+    }
+
+    /// The blocks around `block`, and itself.
+    fn around(self, block: usize) -> impl Iterator<Item = usize> {
+        let (column, row) = (block % self.columns, block / self.columns);
+        let near = |at: usize, end: usize| at.saturating_sub(1)..(at + 2).min(end);
+        near(row, self.rows).flat_map(move |r| near(column, self.columns).map(move |c| r * self.columns + c))
+    }
+}
+
+/// How a training view differs from its photograph, block by block.
+pub(crate) struct Difference {
+    /// Of full size.
+    camera: Camera,
+    grid: Grid,
+    /// Largest difference of the mean colour over the channels, beyond that of the whole photograph; NaN where masked.
+    color: Vec<f32>,
+    /// Depth along +Z, world units; NaN where masked.
+    depth: Vec<f32>,
+}
+
+impl Difference {
+    /// Of `frame`, rendered with depth, to `photo`. `camera` is that of the photograph at full size, `extent` that of the scene.
+    pub fn new(frame: &FramePlanes, photo: &Prepared, camera: &Camera, extent: f32) -> Self {
+        let (width, height) = (photo.width as usize, photo.height as usize);
+        let pixels = width * height;
+        let grid = Grid::of(&camera.intrinsics);
+        let block = |i: usize| {
+            let [columns, rows] = [
+                (i % grid.columns, grid.columns, width),
+                (i / grid.columns, grid.rows, height),
+            ]
+            .map(|(at, blocks, side)| Grid::start(at, blocks, side)..Grid::start(at + 1, blocks, side));
+            let (mut color, mut depth, mut alpha, mut count) = ([0.0f32; 3], 0.0, 0.0, 0.0f32);
+            for at in rows.flat_map(|y| columns.clone().map(move |x| y * width + x)) {
+                if photo.mask.as_ref().is_some_and(|mask| mask[at] == 0) {
+                    continue;
+                }
+                for (c, sum) in color.iter_mut().enumerate() {
+                    *sum += f32::from(photo.rgb[3 * at + c]) / 255.0 - frame.color[c * pixels + at];
+                }
+                depth += frame.depth[at];
+                alpha += frame.alpha[at];
+                count += 1.0;
+            }
+            let depth = if alpha >= 0.5 * count {
+                depth / alpha
+            } else {
+                FAR * extent
+            };
+            (color.map(|sum| sum / count), if count > 0.0 { depth } else { f32::NAN })
+        };
+        let blocks: Vec<([f32; 3], f32)> = (0..grid.len()).into_par_iter().map(block).collect();
+        // What the photograph differs by as a whole is its exposure.
+        let whole: [f32; 3] = std::array::from_fn(|c| {
+            let mut values: Vec<f32> = blocks.iter().map(|(color, _)| color[c]).collect();
+            quantile(&mut values, 0.5).unwrap_or(0.0)
+        });
+        let beyond = |(color, _): &([f32; 3], f32)| {
+            let difference = |c: usize| (color[c] - whole[c]).abs();
+            // NaN in one channel is NaN in all, and `max` would drop it.
+            difference(0)
+                + (difference(1) - difference(0))
+                    .max(difference(2) - difference(0))
+                    .max(0.0)
+        };
+        Self {
+            camera: *camera,
+            grid,
+            color: blocks.iter().map(beyond).collect(),
+            depth: blocks.iter().map(|(_, depth)| *depth).collect(),
+        }
+    }
+
+    /// The place that block `i` shows, world.
+    fn place(&self, i: usize) -> Vec3 {
+        let k = &self.camera.intrinsics;
+        let center = |at: usize, blocks: usize, side: u32| (at as f32 + 0.5) / blocks as f32 * side as f32;
+        let x = center(i % self.grid.columns, self.grid.columns, k.width);
+        let y = center(i / self.grid.columns, self.grid.rows, k.height);
+        let in_camera = Vec3::new((x - k.cx) / k.fx, (y - k.cy) / k.fy, 1.0) * self.depth[i];
+        self.camera.pose.world_from_camera(in_camera)
+    }
+
+    /// The block in which this view sees the surface at `place`; `None` out of view and where it sees something else.
+    fn sees(&self, place: Vec3) -> Option<usize> {
+        let (Vec2 { x, y }, depth) = self.camera.project(place)?;
+        let k = &self.camera.intrinsics;
+        if !((0.0..k.width as f32).contains(&x) && (0.0..k.height as f32).contains(&y)) {
+            return None;
+        }
+        let column = Grid::block(x as usize, self.grid.columns, k.width as usize);
+        let row = Grid::block(y as usize, self.grid.rows, k.height as usize);
+        let block = row * self.grid.columns + column;
+        ((self.depth[block] / depth - 1.0).abs() < SAME_DEPTH).then_some(block)
+    }
+}
+
+/// The value below which a share `q` of the numbers among `values` lies.
+fn quantile(values: &mut Vec<f32>, q: f32) -> Option<f32> {
+    values.retain(|v| !v.is_nan());
+    let at = ((values.len() as f32 * q) as usize).min(values.len().saturating_sub(1));
+    (!values.is_empty()).then(|| *values.select_nth_unstable_by(at, f32::total_cmp).1)
+}
+
+/// What is hidden of the training views, by view: whether each block is. Views with nothing hidden are absent.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub(crate) struct Hidden(BTreeMap<usize, Vec<bool>>);
+
+impl Hidden {
+    /// What only one of `views` shows. What is hidden already is no witness.
+    pub fn find(views: &[(usize, Difference)], extent: f32, already: &Self) -> Self {
+        let found = |(view, own): &(usize, Difference)| {
+            let mut others: Vec<(f32, usize)> = views
+                .iter()
+                .enumerate()
+                .filter(|(_, (other, _))| other != view)
+                .map(|(i, (_, other))| (own.camera.pose.distance(&other.camera.pose, extent), i))
+                .collect();
+            others.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
+            others.truncate(WITNESSES);
+            let excess = |i: usize| {
+                let place = own.place(i);
+                let witness = |(_, other): &(f32, usize)| {
+                    let (view, difference) = &views[*other];
+                    let block = difference.sees(place)?;
+                    (!already.contains(*view, block)).then_some(difference.color[block])
+                };
+                let mut seen: Vec<f32> = others.iter().filter_map(witness).collect();
+                if seen.len() < MIN_WITNESSES {
+                    return 0.0;
+                }
+                own.color[i] / LEAST.max(FACTOR * quantile(&mut seen, WITNESS_QUANTILE).unwrap_or(0.0))
+            };
+            let excess: Vec<f32> = (0..own.grid.len()).map(excess).collect();
+            (*view, patches(own.grid, &excess))
+        };
+        let found: Vec<(usize, Vec<bool>)> = views.par_iter().map(found).collect();
+        Self(found.into_iter().filter(|(_, blocks)| blocks.contains(&true)).collect())
+    }
+
+    /// Number of views with something hidden.
+    pub fn views(&self) -> usize {
+        self.0.len()
+    }
+
+    /// Mean hidden share of those views.
+    pub fn share(&self) -> f64 {
+        let share = |blocks: &Vec<bool>| blocks.iter().filter(|hidden| **hidden).count() as f64 / blocks.len() as f64;
+        self.0.values().map(share).sum::<f64>() / self.0.len().max(1) as f64
+    }
+
+    fn contains(&self, view: usize, block: usize) -> bool {
+        self.0.get(&view).is_some_and(|blocks| blocks[block])
+    }
+
+    /// `photo` of `view` without what is hidden of it; `None` if nothing is. `camera` is that of the view at full size.
+    pub fn apply(&self, view: usize, camera: &Camera, photo: &Prepared) -> Option<Prepared> {
+        let blocks = self.0.get(&view)?;
+        let grid = Grid::of(&camera.intrinsics);
+        let (width, height) = (photo.width as usize, photo.height as usize);
+        let mut mask = photo.mask.clone().unwrap_or_else(|| vec![255; width * height]);
+        for (y, row) in mask.chunks_exact_mut(width).enumerate() {
+            let first = Grid::block(y, grid.rows, height) * grid.columns;
+            for (x, value) in row.iter_mut().enumerate() {
+                if blocks[first + Grid::block(x, grid.columns, width)] {
+                    *value = 0;
+                }
+            }
+        }
+        Some(Prepared {
+            mask: Some(mask),
+            ..photo.clone()
+        })
+    }
+
+    /// For a checkpoint: view and number of every hidden block.
+    pub fn to_pairs(&self) -> Vec<u64> {
+        let blocks = |(view, blocks): (&usize, &Vec<bool>)| {
+            let hidden = blocks.iter().enumerate().filter(|(_, hidden)| **hidden);
+            let view = *view as u64;
+            hidden
+                .flat_map(move |(block, _)| [view, block as u64])
+                .collect::<Vec<_>>()
+        };
+        self.0.iter().flat_map(blocks).collect()
+    }
+
+    /// From [`Self::to_pairs`], for views with these full-size cameras; `None` if a view or block does not exist.
+    pub fn from_pairs<'a>(pairs: &[u64], camera: impl Fn(usize) -> Option<&'a Camera>) -> Option<Self> {
+        let mut hidden = BTreeMap::new();
+        let (pairs, []) = pairs.as_chunks() else { return None };
+        for [view, block] in pairs {
+            let view = *view as usize;
+            let blocks = Grid::of(&camera(view)?.intrinsics).len();
+            let blocks = hidden.entry(view).or_insert_with(|| vec![false; blocks]);
+            *blocks.get_mut(*block as usize)? = true;
+        }
+        Some(Self(hidden))
+    }
+}
+
+/// Patches of connected blocks with an `excess` of at least [`GROW`], [`MIN_BLOCKS`] or more of them above 1, and the blocks around them.
+fn patches(grid: Grid, excess: &[f32]) -> Vec<bool> {
+    let mut is_hidden = vec![false; excess.len()];
+    let mut is_visited = vec![false; excess.len()];
+    for seed in 0..excess.len() {
+        if excess[seed] < 1.0 || excess[seed].is_nan() || is_visited[seed] {
+            continue;
+        }
+        is_visited[seed] = true;
+        let (mut patch, mut next) = (vec![seed], 0);
+        while let Some(block) = patch.get(next).copied() {
+            next += 1;
+            for near in grid.around(block) {
+                if excess[near] >= GROW && !is_visited[near] {
+                    is_visited[near] = true;
+                    patch.push(near);
+                }
+            }
+        }
+        if patch.iter().filter(|block| excess[**block] >= 1.0).count() >= MIN_BLOCKS {
+            let all = patch.iter().flat_map(|block| grid.around(*block));
+            all.for_each(|block| is_hidden[block] = true);
+        }
+    }
+    let count = is_hidden.iter().filter(|hidden| **hidden).count();
+    if count as f32 > MOST * excess.len() as f32 {
+        is_hidden.fill(false);
+    }
+    is_hidden
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use irradia_scene::Pose;
+
+    /// Photographs of a grey wall from `count` places side by side, 96 x 48 pixels, and their empty differences.
+    fn wall(count: usize) -> Vec<(usize, Difference)> {
+        let difference = |view: usize| {
+            let pose = Pose::look_at(
+                Vec3::new(0.02 * view as f32, 0.0, 0.0),
+                Vec3::new(0.02 * view as f32, 0.0, 4.0),
+                Vec3::NEG_Y,
+            );
+            let camera = Camera::new(pose, Intrinsics::from_fov_x(96, 48, 1.0));
+            (view, of_frame(&camera, |_, _| 0.5))
+        };
+        (0..count).map(difference).collect()
+    }
+
+    /// The difference of a grey frame 4 units away to a photograph of grey values.
+    fn of_frame(camera: &Camera, value: impl Fn(usize, usize) -> f32) -> Difference {
+        let photo = photo(value);
+        let pixels = photo.rgb.len() / 3;
+        let (color, alpha, depth) = (vec![0.5; 3 * pixels], vec![1.0; pixels], vec![4.0; pixels]);
+        let frame = FramePlanes {
+            color: &color,
+            alpha: &alpha,
+            depth: &depth,
+        };
+        Difference::new(&frame, &photo, camera, 1.0)
+    }
+
+    fn photo(value: impl Fn(usize, usize) -> f32) -> Prepared {
+        let (width, height) = (96, 48);
+        let grey = (0..width * height).map(|i| (255.0 * value(i % width, i / width)).round() as u8);
+        Prepared {
+            width: width as u32,
+            height: height as u32,
+            rgb: grey.flat_map(|v| [v; 3]).collect(),
+            alpha: None,
+            mask: None,
+            background: [0.0; 3],
+        }
+    }
+
+    /// A dark box on the wall.
+    fn person(x: usize, y: usize) -> f32 {
+        if (40..60).contains(&x) && (10..40).contains(&y) {
+            0.1
+        } else {
+            0.5
+        }
+    }
+
+    #[test]
+    fn what_stands_in_one_photograph_is_hidden_and_nothing_else() {
+        let mut views = wall(8);
+        assert_eq!(Hidden::find(&views, 1.0, &Hidden::default()), Hidden::default());
+        let camera = views[3].1.camera;
+        views[3].1 = of_frame(&camera, person);
+        let hidden = Hidden::find(&views, 1.0, &Hidden::default());
+        assert_eq!(hidden.views(), 1);
+        let shown = hidden.apply(3, &camera, &photo(person)).unwrap();
+        let mask = shown.mask.unwrap();
+        for (i, value) in mask.iter().enumerate() {
+            let (x, y) = (i % 96, i / 96);
+            // A block has two pixels; one block around belongs to the patch.
+            let is_near = (38..62).contains(&x) && (8..42).contains(&y);
+            assert_eq!(*value == 0, is_near, "({x}, {y})");
+        }
+        assert!(hidden.apply(2, &camera, &photo(person)).is_none());
+        let again = Hidden::from_pairs(&hidden.to_pairs(), |view| (view == 3).then_some(&camera)).unwrap();
+        assert_eq!(again, hidden);
+        assert!(Hidden::from_pairs(&[4, 0], |view| (view == 3).then_some(&camera)).is_none());
+        assert!(Hidden::from_pairs(&[3, 1 << 40], |_| Some(&camera)).is_none());
+    }
+
+    #[test]
+    fn what_all_photographs_show_or_few_see_is_not_hidden() {
+        let mut views = wall(8);
+        // A surface that splats have not reached: every view differs there.
+        for (_, difference) in &mut views {
+            let camera = difference.camera;
+            *difference = of_frame(&camera, person);
+        }
+        assert_eq!(Hidden::find(&views, 1.0, &Hidden::default()), Hidden::default());
+        // A whole photograph that is darker differs in exposure.
+        let mut views = wall(8);
+        let camera = views[3].1.camera;
+        views[3].1 = of_frame(&camera, |_, _| 0.2);
+        assert_eq!(Hidden::find(&views, 1.0, &Hidden::default()), Hidden::default());
+        // Two witnesses are too few, and so are those that see another surface.
+        views[3].1 = of_frame(&camera, person);
+        assert_eq!(Hidden::find(&views[1..4], 1.0, &Hidden::default()), Hidden::default());
+        views[3].1.depth.fill(2.0);
+        assert_eq!(Hidden::find(&views, 1.0, &Hidden::default()), Hidden::default());
+    }
+}

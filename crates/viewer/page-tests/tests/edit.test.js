@@ -181,6 +181,14 @@ test("turning the scene upright keeps the picture, and views stay in place", asy
   assert.ok(psnr(opened, await picture(page)) > 45, "the camera turns with the scene");
   const up = await get(page, "up");
   assert.ok(up[1] < -0.9999, `up is ${up}`);
+  // A page that opens now sees the same from the same place.
+  const late = await open(browser, server.address, { width: 800, height: 560 });
+  const placed = (page) => page.evaluate(async () => (await import("/page/js/state.js")).state.get("views").map((view) => view.position).flat());
+  const [here, there] = [await placed(page), await placed(late.page)];
+  assert.ok(here.every((v, i) => Math.abs(v - there[i]) < 1e-6));
+  await set(late.page, { drawing: "served", axes: false, tab: "edit", sidebar: true, camera: await get(page, "camera") });
+  await sharp(late.page);
+  assert.ok(psnr(await picture(page), await picture(late.page)) > 50);
   const turned = (await get(page, "views"))[0];
   assert.ok(Math.hypot(...turned.position.map((v, c) => v - first.position[c])) > 1e-3);
   await page.keyboard.press("Control+z");

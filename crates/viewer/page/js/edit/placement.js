@@ -27,6 +27,8 @@ const isRest = ({ scale: factor, rotation, translation }) =>
   Math.abs(factor - 1) < 1e-9 && Math.abs(Math.abs(rotation[0]) - 1) < 1e-12 && length(translation) < 1e-9;
 
 let at = NONE;
+/** Whether a scene has come. */
+let seen = false;
 /** @type {import("../camera.js").View[] | null} */
 let original = null;
 
@@ -37,10 +39,12 @@ state.addEventListener("hello", () => {
 state.addEventListener("scene", () => {
   const to = state.get("scene")?.placement ?? NONE;
   const by = between(at, to);
-  at = to;
+  const isFirst = !seen;
+  [at, seen] = [to, true];
   if (isRest(by)) return;
   placeViews();
-  follow(by);
+  // A page that opens on a scene that was moved has no camera to keep yet.
+  if (!isFirst) follow(by);
 });
 
 function placeViews() {

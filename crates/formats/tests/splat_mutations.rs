@@ -230,7 +230,7 @@ fn fuzz(reader: &str, packing: Packing, parse: Parse, seeds: &[Vec<u8>]) {
 const NORMAL: &[WriteOptions] = &[WriteOptions {
     quality: Quality::Normal,
     spz_version: SpzVersion::V3,
-    palette: None,
+    sog: None,
 }];
 
 #[test]

@@ -124,7 +124,7 @@ fn every_format_round_trips_within_its_precision() {
             let options = WriteOptions {
                 quality,
                 spz_version,
-                palette: None,
+                sog: None,
             };
             let back = round_trip(name, &cloud, options);
             let format = SplatFormat::of(Path::new(name)).unwrap();

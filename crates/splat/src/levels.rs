@@ -151,3 +151,60 @@ fn union(a: &Blob, b: &Blob) -> (f32, Vec3, Quat, [f32; 3], f32) {
     let opacity = (total / area(scales)).clamp(1e-4, MOST_OPAQUE);
     (part, mean, rotation, scales.map(f32::ln).to_array(), logit(opacity))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use irradia_scene::Rng;
+
+    fn flat(splats: &mut Splats, i: usize, at: Vec3, opacity: f32, color: f32) {
+        for c in 0..3 {
+            splats.means.set(c, i, at[c]);
+            splats.log_scales.set(c, i, [0.1f32, 0.1, 0.001][c].ln());
+            splats.sh.set(c, i, color);
+        }
+        splats.quats.set(0, i, 1.0);
+        splats.opacity_logits.set(0, i, logit(opacity));
+    }
+
+    #[test]
+    fn a_merged_splat_has_mean_covariance_and_mass_of_its_parts() {
+        let mut splats = Splats::zeros(3, 0);
+        // Two flat ones that are not quite in one plane, and one far away.
+        flat(&mut splats, 0, Vec3::ZERO, 0.5, 1.0);
+        flat(&mut splats, 1, Vec3::new(0.1, 0.0, 0.01), 0.25, 0.4);
+        flat(&mut splats, 2, Vec3::new(5.0, 0.0, 0.0), 0.9, 1.0);
+        let both = merged(&splats, 2);
+        assert_eq!(both.len(), 2);
+        let one = (0..2).find(|i| both.mean(*i)[0] < 1.0).unwrap();
+        assert!(Vec3::from(both.mean(one)).distance(Vec3::new(0.1, 0.0, 0.01) / 3.0) < 1e-6);
+        assert!((both.sh.get(0, one) - 0.8).abs() < 1e-6);
+        let mass = |splats: &Splats, i: usize| blob(splats, i).mass;
+        let parts = mass(&splats, 0) + mass(&splats, 1);
+        assert!((mass(&both, one) / parts - 1.0).abs() < 1e-3);
+        // A volume would have grown by a factor of 5, and the opacity fallen to 0.1.
+        assert!(both.opacity(one) > 0.5, "{}", both.opacity(one));
+        let spread = blob(&both, one).covariance.x_axis.x;
+        assert!((spread - (0.01 + 0.01 * 2.0 / 9.0)).abs() < 1e-6, "{spread}");
+    }
+
+    #[test]
+    fn merging_reaches_the_count_and_leaves_out_what_cannot_be_drawn() {
+        let mut rng = Rng::new(8, 0);
+        let mut splats = Splats::zeros(1000, 1);
+        for i in 0..1000 {
+            let at = Vec3::new(rng.normal(), rng.normal(), rng.normal());
+            flat(&mut splats, i, at, rng.range(0.1, 0.9), rng.normal());
+        }
+        splats.opacity_logits.set(0, 5, -30.0);
+        splats.means.set(1, 6, f32::NAN);
+        assert_eq!(merged(&splats, 5000).len(), 998);
+        for count in [500, 77, 1] {
+            let few = merged(&splats, count);
+            assert_eq!(few.len(), count);
+            assert!((0..count).all(|i| is_finite(&few, i)));
+        }
+        assert_eq!(merged(&splats, 200), merged(&splats, 200));
+        assert!(merged(&Splats::zeros(0, 0), 3).is_empty());
+    }
+}

@@ -186,8 +186,41 @@ pub struct WriteOptions {
     pub quality: Quality,
     /// The version of SPZ files.
     pub spz_version: SpzVersion,
-    /// Entries of SOG's palette of harmonics, 1 to 65,536; by the quality if `None`.
-    pub palette: Option<usize>,
+    /// How fine the numbers of SOG are; by the quality if `None`.
+    pub sog: Option<SogDetail>,
+}
+
+/// How fine the numbers of SOG are, beyond what the format asks for: coarser ones take fewer bytes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct SogDetail {
+    /// Entries of the palette of harmonics, 2 to 65,536.
+    pub palette: usize,
+    /// Bits of each coordinate of a position, 1 to 16.
+    pub position_bits: u32,
+    /// Bits of each component of a rotation, 1 to 8.
+    pub rotation_bits: u32,
+    /// Numbers of the codebooks of scales and colours, 2 to 256.
+    pub numbers: usize,
+}
+
+impl SogDetail {
+    /// For `count` splats: as fine as can be, but for the palette, which has a power of two below their number.
+    pub fn of(quality: Quality, count: usize) -> Self {
+        let most = match quality {
+            Quality::Low => 4096,
+            Quality::Normal => 16_384,
+            Quality::High => 65_536,
+        };
+        Self {
+            palette: match count {
+                ..=1024 => count,
+                _ => (count.next_power_of_two() / 2).min(most),
+            },
+            position_bits: 16,
+            rotation_bits: 8,
+            numbers: 256,
+        }
+    }
 }
 
 /// A splat scene as read from a file, and what was not.

@@ -69,7 +69,7 @@ pub fn convert(args: &ConvertArgs) -> Result<()> {
             4 => SpzVersion::V4,
             _ => SpzVersion::V3,
         },
-        palette: None,
+        sog: None,
     };
     let conversion = convert_scene(&args.input, &args.output, &options, !args.no_compare)?;
     say(format_args!(

@@ -2,7 +2,7 @@
 //!
 //! What matters is measured ([`irradia_splat::contribution`]). After the removal the scene takes the way through the format twice: first
 //! its harmonics stay as the file holds them, then everything but colours and opacities, and what is still free is trained to make
-//! up for what was rounded. [`Palette`](irradia_formats::WriteOptions::palette) and codebooks hold what came from them exactly, so that
+//! up for what was rounded. SOG's palette and codebooks hold what came from them exactly, so that
 //! the last way loses next to nothing.
 
 mod between;
@@ -41,7 +41,7 @@ pub struct CompactInput {
     pub steps: u64,
     /// How the dataset is read.
     pub reading: Reading,
-    /// How the file is written; a palette whose size is `None` suits the number of splats.
+    /// How the file is written; what is `None` is chosen for the number of splats.
     pub write: WriteOptions,
     /// Random seed.
     pub seed: u64,

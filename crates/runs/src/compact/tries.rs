@@ -3,7 +3,7 @@
 use super::{CompactEvent, CompactInput};
 use crate::convert::in_world;
 use crate::{RunError, Scene, evaluate};
-use irradia_formats::{SplatFormat, WriteOptions, through_format};
+use irradia_formats::{SogDetail, SplatFormat, WriteOptions, through_format};
 use irradia_scene::{Camera, Dataset, GaussianCloud, Similarity};
 use irradia_splat::contribution::{Contributions, contributions};
 use irradia_splat::{SplatState, Splats};
@@ -28,6 +28,13 @@ const JUDGING_VIEWS: usize = 160;
 const SHOWN: f64 = 0.8;
 /// Entries of the palette of harmonics per splat. On fox_colmap with 38,000 splats, 0.1 takes 100 kB more than 0.03, for 0.1 dB.
 const PALETTE: f64 = 0.03;
+/// Steps of SOG that are not seen after the training for them.
+const COARSE: SogDetail = SogDetail {
+    palette: 0,
+    position_bits: 14,
+    rotation_bits: 7,
+    numbers: 128,
+};
 /// Tries of a search for the smallest scene.
 const SEARCHES: u32 = 6;
 /// Neighbouring tries of a search that are not told apart: counts that differ by less than this factor.
@@ -145,12 +152,12 @@ impl<'a> Tries<'a> {
 
     /// How `count` splats are written.
     fn write_options(&self, count: usize) -> WriteOptions {
+        let detail = SogDetail {
+            palette: ((count as f64 * PALETTE) as usize).clamp(64, 65_536),
+            ..COARSE
+        };
         WriteOptions {
-            palette: self
-                .input
-                .write
-                .palette
-                .or(Some(((count as f64 * PALETTE) as usize).clamp(64, 65_536))),
+            sog: self.input.write.sog.or(Some(detail)),
             ..self.input.write
         }
     }

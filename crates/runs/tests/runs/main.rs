@@ -1,5 +1,6 @@
 //! The library as a program uses it: requests, runs, observers, and scenes.
 
+mod compact;
 mod edits;
 mod every_recipe;
 mod pose;

@@ -88,6 +88,36 @@ for (const [name, make] of [["a trained scene", trained], ["random splats", () =
   });
 }
 
+test("a flight plays by itself, ends at a touch and plays again at the press of its button", async () => {
+  const html = join(scratch, "flight.html");
+  run("convert", random(4000), join(scratch, "plain.html"));
+  run("share", random(4000), "-o", html, "--path", "orbit");
+  const { page, problems } = await open(pathToFileURL(html).href, { offline: true, reducedMotion: "reduce" });
+  const position = () => page.evaluate(() => /** @type {any} */ (window).irradia.camera().position);
+  const moves = async () => {
+    const before = await position();
+    await page.waitForTimeout(400);
+    return Math.hypot(...(await position()).map((v, i) => v - before[i])) > 1e-4;
+  };
+  const button = page.locator("#play");
+  assert.equal(await moves(), false, "it plays although little motion is preferred");
+  await button.click();
+  assert.equal(await moves(), true);
+  assert.equal(await button.getAttribute("aria-pressed"), "true");
+  await page.screenshot({ path: join(OUT, "shared_flight.png") });
+  await page.mouse.click(300, 180);
+  assert.equal(await moves(), false, "a touch does not end it");
+  assert.equal(await button.textContent(), "Play");
+  assert.deepEqual(problems, []);
+  const other = await browser.newContext({ viewport: SIZE });
+  const opened = await other.newPage();
+  await opened.goto(pathToFileURL(html).href);
+  await opened.waitForFunction(() => document.getElementById("play")?.getAttribute("aria-pressed") === "true", null, { timeout: 60000 });
+  const plain = await other.newPage();
+  await plain.goto(pathToFileURL(join(scratch, "plain.html")).href);
+  assert.equal(await plain.locator("#play").isVisible(), false);
+});
+
 test("a page that is too large loses harmonics, then splats, and says so", async () => {
   const html = join(scratch, "small.html");
   const said = run("share", random(4000), "-o", html, "--max", "150kB");

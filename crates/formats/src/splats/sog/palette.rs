@@ -23,14 +23,14 @@ const LANES: usize = 16;
 pub(super) struct Codebook(pub [f32; 256]);
 
 impl Codebook {
-    /// The best numbers for `values`; what is not finite is ignored.
-    pub fn of(values: &[f32]) -> Self {
+    /// The best `count` numbers, 2 to 256, for `values`; what is not finite is ignored.
+    pub fn of(values: &[f32], count: usize) -> Self {
         let finite = || values.iter().copied().filter(|v| v.is_finite());
         let (low, high) = finite().fold((f32::MAX, f32::MIN), |(low, high), v| (low.min(v), high.max(v)));
         if low >= high {
             return Self([if low == high { low } else { 0.0 }; 256]);
         }
-        if let Some(exact) = Self::exact(finite()) {
+        if let Some(exact) = Self::exact(finite(), count) {
             return exact;
         }
         let scale = (BINS - 1) as f64 / (f64::from(high) - f64::from(low));
@@ -41,17 +41,17 @@ impl Codebook {
             bin.1 += f64::from(v);
         }
         bins.retain(|(count, _)| *count > 0);
-        let mut numbers = Self::first(&bins, low.into(), high.into());
+        let mut numbers = Self::first(&bins, low.into(), high.into(), count);
         for _ in 0..ROUNDS_OF_NUMBERS {
             let mut sums = [(0u64, 0f64); 256];
             let mut nearest = 0;
-            for (count, sum) in &bins {
-                let mean = sum / *count as f64;
+            for (members, sum) in &bins {
+                let mean = sum / *members as f64;
                 // Bins increase, and so does the nearest number.
-                while nearest < 255 && mean - numbers[nearest] > numbers[nearest + 1] - mean {
+                while nearest < count - 1 && mean - numbers[nearest] > numbers[nearest + 1] - mean {
                     nearest += 1;
                 }
-                sums[nearest].0 += count;
+                sums[nearest].0 += members;
                 sums[nearest].1 += sum;
             }
             for (number, (count, sum)) in numbers.iter_mut().zip(sums) {
@@ -61,17 +61,17 @@ impl Codebook {
             }
             numbers.sort_unstable_by(f64::total_cmp);
         }
-        Self(std::array::from_fn(|i| numbers[i] as f32))
+        Self(std::array::from_fn(|i| numbers[i.min(count - 1)] as f32))
     }
 
-    /// The numbers of `values` if there are at most 256.
-    fn exact(values: impl Iterator<Item = f32>) -> Option<Self> {
-        let mut distinct: Vec<f32> = Vec::with_capacity(257);
+    /// The numbers of `values` if there are at most `count`.
+    fn exact(values: impl Iterator<Item = f32>, count: usize) -> Option<Self> {
+        let mut distinct: Vec<f32> = Vec::with_capacity(count + 1);
         for value in values {
             if let Err(at) = distinct.binary_search_by(|known| known.total_cmp(&value)) {
                 distinct.insert(at, value);
             }
-            if distinct.len() > 256 {
+            if distinct.len() > count {
                 return None;
             }
         }
@@ -80,9 +80,9 @@ impl Codebook {
         Some(Self(std::array::from_fn(|i| distinct[i])))
     }
 
-    /// 256 numbers to begin with: where the cube root of the density has its quantiles, which is the best there is for many numbers
+    /// Numbers to begin with: where the cube root of the density has its quantiles, which is the best there is for many numbers
     /// (Panter and Dite 1951).
-    fn first(bins: &[(u64, f64)], low: f64, high: f64) -> Vec<f64> {
+    fn first(bins: &[(u64, f64)], low: f64, high: f64, count: usize) -> Vec<f64> {
         let mut density = [0u64; DENSITY_BINS];
         let width = (high - low) / DENSITY_BINS as f64;
         for (count, sum) in bins {
@@ -91,17 +91,17 @@ impl Codebook {
         }
         let weights = density.map(|count| (count as f64).cbrt());
         let total: f64 = weights.iter().sum();
-        let mut numbers = Vec::with_capacity(256);
+        let mut numbers = Vec::with_capacity(count);
         let mut below = 0.0;
         for (i, weight) in weights.into_iter().enumerate() {
-            let quantile = |count: usize| (count as f64 + 0.5) / 256.0 * total;
-            while numbers.len() < 256 && quantile(numbers.len()) <= below + weight {
+            let quantile = |found: usize| (found as f64 + 0.5) / count as f64 * total;
+            while numbers.len() < count && quantile(numbers.len()) <= below + weight {
                 let part = (quantile(numbers.len()) - below) / weight;
                 numbers.push(low + (i as f64 + part) * width);
             }
             below += weight;
         }
-        numbers.resize(256, high);
+        numbers.resize(count, high);
         numbers
     }
 
@@ -336,13 +336,13 @@ mod tests {
     #[test]
     fn few_numbers_are_kept_and_many_are_near() {
         let few: Vec<f32> = (0..1000).map(|i| [-7.0, 0.25, 3.5][i % 3]).collect();
-        let codebook = Codebook::of(&few);
+        let codebook = Codebook::of(&few, 256);
         assert!(few.iter().all(|v| codebook.0[usize::from(codebook.index(*v))] == *v));
         let mut rng = Rng::new(4, 1);
         let many: Vec<f32> = (0..50_000)
             .map(|_| (0..6).map(|_| rng.uniform()).sum::<f32>() - 3.0)
             .collect();
-        let codebook = Codebook::of(&many);
+        let codebook = Codebook::of(&many, 256);
         assert!(codebook.0.is_sorted());
         let squares: f64 = many
             .iter()
@@ -355,8 +355,8 @@ mod tests {
             "{}",
             squares / many.len() as f64
         );
-        assert_eq!(Codebook::of(&[f32::NAN]).0, [0.0; 256]);
-        assert_eq!(Codebook::of(&[2.0, f32::INFINITY]).0, [2.0; 256]);
+        assert_eq!(Codebook::of(&[f32::NAN], 256).0, [0.0; 256]);
+        assert_eq!(Codebook::of(&[2.0, f32::INFINITY], 256).0, [2.0; 256]);
     }
 
     #[test]
@@ -382,9 +382,12 @@ mod tests {
         assert!((0..5000).all(|i| zeros(palette.labels[i].into()) == (i % 2 == 0)));
         // Numbers nearer to each other than the bins of the histogram.
         let near: Vec<f32> = (0..200).map(|i| 1.0 + i as f32 * 1e-6).chain([1000.0]).collect();
-        let codebook = Codebook::of(&near);
+        let codebook = Codebook::of(&near, 256);
         assert!(near.iter().all(|v| codebook.0[usize::from(codebook.index(*v))] == *v));
-        assert_eq!(Codebook::of(&[-1.0, 0.01, 2.0]).with_zero().0[..3], [-1.0, 0.0, 2.0]);
+        assert_eq!(
+            Codebook::of(&[-1.0, 0.01, 2.0], 256).with_zero().0[..3],
+            [-1.0, 0.0, 2.0]
+        );
     }
 
     #[test]

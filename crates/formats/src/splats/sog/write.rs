@@ -1,8 +1,8 @@
 use super::palette::{Codebook, Palette};
 use super::{LARGEST_W, META, ROW};
-use crate::splats::quantize::{byte, opacity_byte, smallest_three};
+use crate::splats::quantize::{opacity_byte, smallest_three};
 use crate::splats::rows::{bounds, encode_rows, morton_order};
-use crate::splats::{Quality, WriteOptions};
+use crate::splats::{SogDetail, WriteOptions};
 use crate::zip::Writer;
 use image_webp::{ColorType, EncoderParams, WebPEncoder};
 use irradia_scene::{GaussianCloud, sh};
@@ -32,6 +32,8 @@ pub(crate) fn write(out: &mut dyn Write, cloud: &GaussianCloud, options: &WriteO
 /// When an image cannot be encoded: more than 16,384 pixels a side.
 pub(crate) fn encode(cloud: &GaussianCloud, options: &WriteOptions) -> io::Result<Files> {
     let count = cloud.len();
+    let detail = options.sog.unwrap_or_else(|| SogDetail::of(options.quality, count));
+    let (position_bits, rotation_bits) = (detail.position_bits.clamp(1, 16), detail.rotation_bits.clamp(1, 8));
     let width = 3 * cloud.sh_coefficients();
     let order = morton_order(&cloud.means);
     // Sides are multiples of four, as other writers make them.
@@ -49,15 +51,15 @@ pub(crate) fn encode(cloud: &GaussianCloud, options: &WriteOptions) -> io::Resul
     let steps = |i: usize, c: usize| {
         let extent = f64::from(high[c]) - f64::from(low[c]);
         let t = (f64::from(logarithm(cloud.means[i][c])) - f64::from(low[c])) / extent.max(f64::MIN_POSITIVE);
-        ((t * 65535.0).round() as u16).to_le_bytes()
+        (rounded(t * 65535.0, 16 - position_bits, 65535) as u16).to_le_bytes()
     };
-    let scales = Codebook::of(cloud.log_scales.as_flattened());
+    let scales = Codebook::of(cloud.log_scales.as_flattened(), detail.numbers.clamp(2, 256));
     let colors: Vec<f32> = cloud
         .sh
         .chunks_exact(width)
         .flat_map(|sh| [sh[0], sh[1], sh[2]])
         .collect();
-    let colors = Codebook::of(&colors);
+    let colors = Codebook::of(&colors, detail.numbers.clamp(2, 256));
     let dc = |i: usize, c: usize| cloud.sh[i * width + c];
     let mut images = vec![
         image("means_l.webp", 3, &|i, pixel| {
@@ -71,7 +73,13 @@ pub(crate) fn encode(cloud: &GaussianCloud, options: &WriteOptions) -> io::Resul
         }),
         image("quats.webp", 4, &|i, pixel| {
             let (largest, others) = smallest_three(cloud.quats[i]);
-            let others = others.map(|v| byte((v * std::f32::consts::FRAC_1_SQRT_2 + 0.5) * 255.0));
+            let others = others.map(|v| {
+                rounded(
+                    f64::from(v * std::f32::consts::FRAC_1_SQRT_2 + 0.5) * 255.0,
+                    8 - rotation_bits,
+                    255,
+                ) as u8
+            });
             pixel[..3].copy_from_slice(&others);
             pixel[3] = LARGEST_W + largest as u8;
         }),
@@ -99,11 +107,8 @@ pub(crate) fn encode(cloud: &GaussianCloud, options: &WriteOptions) -> io::Resul
             .par_iter()
             .flat_map_iter(|i| cloud.sh[*i as usize * width + 3..][..rest].iter().copied())
             .collect();
-        let most = options
-            .palette
-            .map_or_else(|| palette_size(count, options.quality), |most| most.clamp(2, 65_536));
-        let palette = Palette::of(&vectors, rest, most);
-        let codebook = Codebook::of(&palette.entries);
+        let palette = Palette::of(&vectors, rest, detail.palette.clamp(2, 65_536));
+        let codebook = Codebook::of(&palette.entries, 256);
         let codebook = match palette
             .entries
             .chunks_exact(rest)
@@ -149,17 +154,11 @@ fn shortest(value: f32) -> f64 {
     value.to_string().parse().unwrap_or(f64::from(value))
 }
 
-/// Entries of the palette: a power of two below the number of splats.
-fn palette_size(count: usize, quality: Quality) -> usize {
-    let most = match quality {
-        Quality::Low => 4096,
-        Quality::Normal => 16_384,
-        Quality::High => 65_536,
-    };
-    match count {
-        ..=1024 => count,
-        _ => (count.next_power_of_two() / 2).min(most),
-    }
+/// `value` at the nearest multiple of `2^bits` up to `most`: the lowest bits are zero, and take no bytes.
+fn rounded(value: f64, bits: u32, most: u32) -> u32 {
+    let step = f64::from(1u32 << bits);
+    let value = ((value / step).round() * step).max(0.0) as u32;
+    value.min(most >> bits << bits)
 }
 
 /// An image in lossless WebP, the smaller of two encodings: differences from the neighbours suit what is smooth, plain values indices.

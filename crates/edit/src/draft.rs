@@ -14,6 +14,8 @@ pub struct Draft {
     pub hidden: Selection,
     /// Splats that are not selected.
     pub locked: Selection,
+    /// Splats that the last edit was made of.
+    pub last: Selection,
 }
 
 impl Draft {
@@ -29,6 +31,7 @@ impl Draft {
             cameras,
             hidden: Selection::none(n),
             locked: Selection::none(n),
+            last: Selection::none(n),
         }
     }
 

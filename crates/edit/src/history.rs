@@ -107,6 +107,7 @@ struct Undo {
     cameras: Option<Vec<Camera>>,
     hidden: Selection,
     locked: Selection,
+    last: Selection,
 }
 
 impl Undo {
@@ -135,6 +136,7 @@ impl Undo {
             cameras: matches!(change, Change::TransformScene(_)).then(|| draft.cameras.clone()),
             hidden: draft.hidden.clone(),
             locked: draft.locked.clone(),
+            last: draft.last.clone(),
         }
     }
 
@@ -177,6 +179,7 @@ impl Undo {
         cloud.world_from_dataset = self.world_from_dataset;
         draft.hidden = self.hidden;
         draft.locked = self.locked;
+        draft.last = self.last;
         if let Some(cameras) = self.cameras {
             draft.cameras = cameras;
         }

@@ -89,7 +89,7 @@ pub fn apply(draft: &mut Draft, edit: &Edit, open: Open) -> Result<Applied, Edit
 /// An edit of which nothing can fail any more.
 pub(crate) struct Plan {
     edit: Edit,
-    selected: usize,
+    selection: Selection,
     pub(crate) change: Change,
 }
 
@@ -121,7 +121,7 @@ impl Plan {
             (_, None) => Selection::all(n),
         };
         let is_scene = edit.select.is_none();
-        let selected = selection.count();
+        let of = selection.clone();
         let transformed = |transform: Transform, selection: Selection| match is_scene {
             _ if transform.is_identity() => Change::Nothing,
             true => Change::TransformScene(transform),
@@ -225,13 +225,19 @@ impl Plan {
                 "the scene would have {grown} splats, at most 4294967294 are possible"
             )));
         }
-        Ok(Self { edit, selected, change })
+        Ok(Self {
+            edit,
+            selection: of,
+            change,
+        })
     }
 
     pub fn carry_out(self, draft: &mut Draft) -> Applied {
         let n = draft.len();
         let mut provenance = Provenance::identity(n);
         let (mut moved, mut split) = (None, None);
+        let selected = self.selection.count();
+        draft.last = self.selection;
         match self.change {
             Change::Remove(selection) => provenance = remove(draft, selection),
             Change::Split(selection, name) => {
@@ -265,6 +271,7 @@ impl Plan {
                 append(&mut draft.cloud, &cloud);
                 draft.hidden.append(new.len());
                 draft.locked.append(new.len());
+                draft.last = Selection::of(n + new.len(), |i| i >= n);
                 provenance = Provenance {
                     sources: Some((0..n as u32).chain(new.iter().copied()).collect()),
                     changed: Selection::of(n + new.len(), |i| i >= n),
@@ -279,7 +286,7 @@ impl Plan {
         Applied {
             edit: self.edit,
             provenance,
-            selected: self.selected,
+            selected,
             moved,
             split,
         }
@@ -301,6 +308,7 @@ fn remove(draft: &mut Draft, selection: Selection) -> Provenance {
     draft.cloud = gather(&draft.cloud, &kept);
     draft.hidden = draft.hidden.gather(&kept);
     draft.locked = draft.locked.gather(&kept);
+    draft.last = Selection::none(kept.len());
     Provenance {
         changed: Selection::none(kept.len()),
         sources: Some(kept),

@@ -159,6 +159,9 @@ pub enum Shape {
         #[serde(default, skip_serializing_if = "Option::is_none")]
         margin: Option<f64>,
     },
+    /// What the edit before was made of; of a duplicate the copies, of what was removed nothing. It lets a selection that was moved be
+    /// turned as well.
+    Last {},
     /// What is not selected so far. Always of mode add.
     Invert {},
     /// What is selected so far, and all splats closer to it than a distance. Always of mode add.
@@ -277,7 +280,7 @@ impl SelectStep {
             ));
         }
         match &self.shape {
-            Shape::All {} | Shape::Invert {} => Ok(()),
+            Shape::All {} | Shape::Last {} | Shape::Invert {} => Ok(()),
             Shape::Box {
                 center,
                 size,

@@ -11,6 +11,9 @@ export const shader = async (name) => text(name);
 
 export const orderWorker = () => new Worker(URL.createObjectURL(new Blob([text("order.js")], { type: "text/javascript" })));
 
+/** A shared page has no selection. @returns {Promise<Uint8Array | null>} */
+export const openMask = async () => null;
+
 /** The scene in compact form. @param {AbortSignal} signal */
 export async function openSplats(signal) {
   const packed = view.file ? (await fetch(view.file, { signal })).body : new Blob(decoded(text("splats"))).stream();

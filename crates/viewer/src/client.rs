@@ -3,14 +3,14 @@
 use crate::desk::{Out, SEATS, Task};
 use crate::live::Known;
 use crate::message::Request;
-use crate::serve::Shared;
+use crate::serve::{Shared, downloads};
 use crate::subject::Edition;
 use axum::extract::ws::{CloseFrame, Message, WebSocket};
 use irradia_train::model::Model;
 use serde_json::{Value, json};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
-use tokio::sync::mpsc;
+use tokio::sync::{mpsc, watch};
 use tokio::time::{MissedTickBehavior, interval, timeout};
 
 /// Messages that wait for a page.
@@ -62,9 +62,13 @@ pub(crate) async fn serve(mut socket: WebSocket, shared: Arc<Shared>) {
     let (mut version, mut reported) = (0, Value::Null);
     let mut news = interval(NEWS);
     news.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    let mut edits = shared.subject.editing.as_ref().ok().map(|editing| editing.watch());
     let mut allowance = Allowance::new();
     if !send(&mut socket, Message::text(hello(&shared).to_string())).await {
         return;
+    }
+    if let Some(edits) = &mut edits {
+        edits.mark_changed();
     }
     loop {
         tokio::select! {
@@ -94,6 +98,14 @@ pub(crate) async fn serve(mut socket: WebSocket, shared: Arc<Shared>) {
                     return;
                 }
             }
+            Some(told) = changed(&mut edits) => {
+                // The scene first: the selection is one of its splats.
+                for text in fresh_scene(&shared, &mut version).iter().chain([&*told]) {
+                    if !send(&mut socket, Message::text(text.to_string())).await {
+                        return;
+                    }
+                }
+            }
             _ = news.tick() => {
                 let mut told = Vec::new();
                 if let Some(live) = &shared.subject.live {
@@ -103,10 +115,7 @@ pub(crate) async fn serve(mut socket: WebSocket, shared: Arc<Shared>) {
                         reported = report;
                     }
                 }
-                if let Some(edition) = shared.subject.edition().filter(|edition| edition.version != version) {
-                    version = edition.version;
-                    told.push(scene(&edition));
-                }
+                told.extend(fresh_scene(&shared, &mut version));
                 for text in told {
                     if !send(&mut socket, Message::text(text.to_string())).await {
                         return;
@@ -115,6 +124,26 @@ pub(crate) async fn serve(mut socket: WebSocket, shared: Arc<Shared>) {
             }
         }
     }
+}
+
+/// What is told of editing, when it changes; never if there is nothing to edit.
+async fn changed(edits: &mut Option<watch::Receiver<Arc<Value>>>) -> Option<Arc<Value>> {
+    if let Some(edits) = edits
+        && edits.changed().await.is_ok()
+    {
+        return Some(edits.borrow_and_update().clone());
+    }
+    std::future::pending().await
+}
+
+/// The scene, if its splats are others than those of `version`, which is updated.
+fn fresh_scene(shared: &Shared, version: &mut u64) -> Option<Value> {
+    let edition = shared.subject.edition()?;
+    if edition.splats_version == *version {
+        return None;
+    }
+    *version = edition.splats_version;
+    Some(scene(&edition))
 }
 
 /// Whether the page took `message` in time.
@@ -194,6 +223,19 @@ fn handle(shared: &Shared, seat: u64, message: Message, allowance: &mut Allowanc
                 live.act(action);
             }
         }
+        Request::Edit(request) => {
+            let refused = match &subject.editing {
+                Err(why) => Some((*why).to_owned()),
+                Ok(editing) => match request.check() {
+                    Err(error) => Some(error.to_string()),
+                    Ok(()) if editing.ask(seat, request) => None,
+                    Ok(()) => Some("too many edits wait: wait for the last ones".to_owned()),
+                },
+            };
+            if let Some(why) = refused {
+                desk.tell(seat, json!({ "tell": "problem", "text": why }).to_string());
+            }
+        }
         Request::Unit { metres } => {
             let kept = subject.folder.as_ref().map(|folder| folder.set_metres_per_unit(metres));
             let told = match kept {
@@ -222,6 +264,8 @@ fn hello(shared: &Shared) -> Value {
         "metres": subject.folder.as_ref().and_then(|folder| folder.metres_per_unit()),
         "keeps_unit": subject.folder.is_some(),
         "warnings": subject.warnings,
+        "editing": { "works": subject.editing.is_ok(), "why": subject.editing.as_ref().err() },
+        "formats": downloads().map(|(name, format)| json!({ "name": name, "format": format.to_string() })).collect::<Value>(),
         "scene": edition.as_ref().map(scene),
     })
 }
@@ -231,6 +275,7 @@ fn scene(edition: &Edition) -> Value {
     let scene = edition.scene();
     let outlook = scene.outlook();
     let k = outlook.intrinsics;
+    let rotation = edition.placement.rotation;
     let (kind, count, sh_degree) = match &scene.model {
         Model::Splats { splats, residual: None } => {
             ("splats", splats.len(), scene.options.sh_degree.min(splats.sh_degree()))
@@ -240,7 +285,12 @@ fn scene(edition: &Edition) -> Value {
     };
     json!({
         "tell": "scene",
-        "version": edition.version,
+        "version": edition.splats_version,
+        "placement": {
+            "scale": edition.placement.scale,
+            "rotation": [rotation.w, rotation.x, rotation.y, rotation.z],
+            "translation": edition.placement.translation.to_array(),
+        },
         "step": edition.step(),
         "kind": kind,
         "count": count,

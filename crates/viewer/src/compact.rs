@@ -28,9 +28,14 @@ pub(crate) const fn band_bytes(degree: u32) -> usize {
 
 /// `splats` in compact form, with bands up to `degree`, the `most` important of them. Splats that can never be seen are left out.
 pub(crate) fn compact(splats: &Splats, degree: u32, most: usize) -> Vec<u8> {
-    let degree = degree.min(splats.sh_degree());
     let mut order = by_importance(splats);
     order.truncate(most);
+    compact_in_order(splats, degree, &order)
+}
+
+/// The splats `order` in compact form, with bands up to `degree`.
+pub(crate) fn compact_in_order(splats: &Splats, degree: u32, order: &[u32]) -> Vec<u8> {
+    let degree = degree.min(splats.sh_degree());
     let band = band_bytes(degree);
     let mut bytes = vec![0; HEADER + order.len() * (CORE + band)];
     bytes[..4].copy_from_slice(b"IRS1");

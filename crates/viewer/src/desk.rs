@@ -348,6 +348,7 @@ mod tests {
             background: None,
             clip: None,
             view: None,
+            highlight: false,
         }
     }
 

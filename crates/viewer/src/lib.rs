@@ -15,6 +15,7 @@
 //! | `subject.rs`, `views.rs`, `live.rs` | what is looked at: a scene, its photographs, a training |
 //! | `desk.rs`, `pace.rs`, `draw.rs` | who wants which picture, when it is drawn, at which size |
 //! | `paint.rs`, `palette.rs` | a camera's picture: colours, depth, normals, counts, ellipses, errors |
+//! | `editing/` | selections and edits of a finished scene, which all pages share |
 //! | `compact.rs`, `importance.rs` | splats as they travel to a browser that draws them itself, most important first |
 //! | `share.rs` | a scene as one page, or a folder for a web server |
 //! | `listen.rs`, `guard.rs`, `serve.rs`, `page.rs` | addresses, who may talk to us, and what is answered |
@@ -27,6 +28,7 @@ mod client;
 mod compact;
 mod desk;
 mod draw;
+mod editing;
 mod error;
 mod guard;
 mod importance;

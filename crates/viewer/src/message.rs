@@ -2,11 +2,16 @@
 //! little endian), the header, a JPEG.
 
 use glam::{Quat, Vec3};
+use irradia_edit::{Edit, EditError, Operation, SelectStep};
 use irradia_scene::{Camera, Intrinsics, Pose};
 use serde::{Deserialize, Serialize};
 
-/// Largest message accepted from a page, bytes: a request takes a few hundred.
-pub const MAX_REQUEST: usize = 16 << 10;
+/// Largest message accepted from a page, bytes: a lasso of [`MAX_POINTS`] takes that much, other requests a few hundred.
+pub const MAX_REQUEST: usize = 64 << 10;
+/// Corners of a polygon and points of a stroke.
+pub const MAX_POINTS: usize = 2000;
+/// Steps of one request to select.
+const MAX_STEPS: usize = 8;
 /// Largest side of a picture, pixels.
 pub const MAX_SIDE: u32 = 4096;
 /// Largest number of pixels of a picture; larger windows get a smaller picture, scaled by the browser.
@@ -59,6 +64,8 @@ pub struct RawShot {
     clip: Option<[[f32; 3]; 2]>,
     #[serde(default)]
     view: Option<usize>,
+    #[serde(default)]
+    highlight: bool,
 }
 
 /// A picture that a page wants.
@@ -76,6 +83,8 @@ pub struct Shot {
     pub clip: Option<[[f32; 3]; 2]>,
     /// The view whose photograph errors are measured against.
     pub view: Option<usize>,
+    /// Whether selected splats are tinted.
+    pub highlight: bool,
 }
 
 impl RawShot {
@@ -105,6 +114,7 @@ impl RawShot {
             background: self.background,
             clip: self.clip,
             view: self.view,
+            highlight: self.highlight,
         })
     }
 }
@@ -161,6 +171,107 @@ pub enum Request {
         /// Metres per world unit.
         metres: f64,
     },
+    /// Edit the scene.
+    #[serde(untagged)]
+    Edit(EditRequest),
+}
+
+/// A request of a page that edits. Positions and lengths are those of the world in which the page draws.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(tag = "do", rename_all = "snake_case")]
+pub enum EditRequest {
+    /// Change what is selected.
+    Select {
+        /// A request of the same gesture as the one before replaces it.
+        #[serde(default)]
+        gesture: u64,
+        /// Whether what was selected before is forgotten.
+        #[serde(default)]
+        replace: bool,
+        /// Made one after the other.
+        steps: Vec<SelectStep>,
+    },
+    /// Select nothing.
+    Deselect,
+    /// Edit what is selected.
+    Edit {
+        /// A request of the same gesture as the one before replaces it.
+        #[serde(default)]
+        gesture: u64,
+        /// The whole scene instead.
+        #[serde(default)]
+        whole: bool,
+        /// What is done.
+        edit: Operation,
+    },
+    /// Undo the last selection or edit.
+    Undo,
+    /// Make it again.
+    Redo,
+    /// Undo or make again until the first of the list are made.
+    Go {
+        /// Their number.
+        at: usize,
+    },
+    /// Show the scene as it was opened, or as it is.
+    Compare {
+        /// As it was.
+        before: bool,
+    },
+    /// Write list and scene beside the scene's file.
+    Save,
+}
+
+impl EditRequest {
+    /// By which requests replace each other.
+    pub fn gesture(&self) -> Option<u64> {
+        match self {
+            Self::Select { gesture, .. } | Self::Edit { gesture, .. } => Some(*gesture).filter(|gesture| *gesture != 0),
+            _ => None,
+        }
+    }
+
+    /// Whether every number is in range, and nothing names a file.
+    ///
+    /// # Errors
+    /// One line that names the number.
+    pub fn check(&self) -> Result<(), EditError> {
+        match self {
+            Self::Select { steps, .. } => {
+                if !(1..=MAX_STEPS).contains(&steps.len()) {
+                    return Err(EditError::Selection(format!(
+                        "a page selects in 1 to {MAX_STEPS} steps at once"
+                    )));
+                }
+                if steps.iter().any(|step| points(step) > MAX_POINTS) {
+                    return Err(EditError::Selection(format!(
+                        "a page draws at most {MAX_POINTS} points at once"
+                    )));
+                }
+                steps.iter().try_for_each(SelectStep::check)
+            }
+            Self::Edit {
+                edit: Operation::Merge { .. },
+                ..
+            } => Err(EditError::Selection("a page merges no files".to_owned())),
+            Self::Edit { whole, edit, .. } => {
+                let edit = Edit {
+                    op: edit.clone(),
+                    select: (!whole).then(Vec::new),
+                };
+                edit.check()
+            }
+            _ => Ok(()),
+        }
+    }
+}
+
+/// Points that a step draws.
+fn points(step: &SelectStep) -> usize {
+    match &step.shape {
+        irradia_edit::Shape::Polygon { points, .. } | irradia_edit::Shape::Brush { points, .. } => points.len(),
+        _ => 0,
+    }
 }
 
 /// Header of a picture.
@@ -221,6 +332,8 @@ pub struct PickedSplat {
     pub opacity: f32,
     /// sRGB, as seen from here.
     pub color: [f32; 3],
+    /// sRGB, without what depends on the direction.
+    pub base: [f32; 3],
     /// Along the camera's +Z, world units.
     pub depth: f32,
     /// Share of the pixel's colour.

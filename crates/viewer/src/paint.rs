@@ -1,5 +1,6 @@
 //! The picture of a camera: colours, depth, alpha, normals, counts, ellipses, or the error against a photograph.
 
+use crate::editing::placed;
 use crate::importance::by_importance;
 use crate::message::{Mode, Picked, PickedSplat, Shot};
 use crate::pace::Detail;
@@ -8,7 +9,6 @@ use crate::subject::Edition;
 use crate::views::SeenView;
 use glam::{Vec2, Vec3};
 use irradia_field::{Field, render_view};
-use irradia_runs::Scene;
 use irradia_scene::{Camera, Intrinsics, Photo, sh};
 use irradia_splat::render::Shape;
 use irradia_splat::{RenderOptions, Renderer, Splats};
@@ -48,11 +48,19 @@ struct Planes {
 pub(crate) struct Painter {
     renderer: Renderer,
     /// The most important splats of a version, most important first.
-    most: Option<(u64, Splats)>,
-    /// Splats that differ from the scene's: clipped, or coloured by their normals.
+    most: Option<Most>,
+    /// Splats that differ from the scene's: clipped, selected, or coloured by their normals.
     altered: Option<(Alteration, Splats)>,
     /// The last photograph that was read, by its view.
     photo: Option<(usize, Arc<Photo>)>,
+}
+
+struct Most {
+    /// Of the splats.
+    version: u64,
+    /// Their indices in the scene.
+    order: Vec<u32>,
+    splats: Splats,
 }
 
 #[derive(Clone, Copy, PartialEq)]
@@ -62,6 +70,8 @@ struct Alteration {
     most: bool,
     clip: Option<[[f32; 3]; 2]>,
     normals: bool,
+    /// Whether selected splats are tinted.
+    highlight: bool,
 }
 
 impl Painter {
@@ -71,7 +81,7 @@ impl Painter {
             || self
                 .most
                 .as_ref()
-                .is_some_and(|(version, _)| *version == edition.version)
+                .is_some_and(|most| most.version == edition.splats_version)
         {
             return;
         }
@@ -79,7 +89,11 @@ impl Painter {
             let count = (splats.len() as f32 * Detail::MOST_SPLATS).ceil() as usize;
             let mut order = by_importance(splats);
             order.truncate(count);
-            (edition.version, splats.gather(&order))
+            Most {
+                version: edition.splats_version,
+                splats: splats.gather(&order),
+                order,
+            }
         });
     }
 
@@ -110,8 +124,8 @@ impl Painter {
                     first: few.map_or(usize::MAX, |_| (detail.splats * splats.len() as f32) as usize),
                     ..options
                 };
-                let splats = few.map_or(splats.as_ref(), |(_, splats)| splats);
-                let altered = self.altered(edition, splats, few.is_some(), shot, &camera);
+                let splats = few.map_or(splats.as_ref(), |most| &most.splats);
+                let altered = self.altered(edition, splats, few.map(|most| &most.order[..]), shot, &camera);
                 let splats = altered.as_ref().map_or(splats, |(_, splats)| splats);
                 let residual = residual.as_deref().filter(|_| mode != Mode::Normals);
                 render_splats(splats, residual, &mut self.renderer, &camera, &options);
@@ -132,26 +146,35 @@ impl Painter {
         })
     }
 
-    /// The splats to draw instead of the scene's, made for this camera.
+    /// The splats to draw instead of the scene's, made for this camera; `order` if they are the most important ones.
     fn altered(
         &mut self,
         edition: &Edition,
         splats: &Splats,
-        most: bool,
+        order: Option<&[u32]>,
         shot: &Shot,
         camera: &Camera,
     ) -> Option<(Alteration, Splats)> {
+        let has_colors = matches!(shot.mode, Mode::Color | Mode::Ellipses | Mode::Rings | Mode::Points);
+        let selected = edition.selected.as_deref().filter(|_| shot.highlight && has_colors);
         let alteration = Alteration {
             version: edition.version,
-            most,
+            most: order.is_some(),
             clip: shot.clip,
             normals: shot.mode == Mode::Normals,
+            highlight: selected.is_some(),
         };
-        if alteration.clip.is_none() && !alteration.normals {
+        if alteration.clip.is_none() && !alteration.normals && !alteration.highlight {
             return None;
         }
         let kept = self.altered.take().filter(|(kept, _)| *kept == alteration);
-        let (_, mut altered) = kept.unwrap_or_else(|| (alteration, alter(splats, &alteration)));
+        let (_, mut altered) = kept.unwrap_or_else(|| {
+            let mut altered = alter(splats, &alteration);
+            if let Some(selected) = selected {
+                tint(&mut altered, |i| selected[order.map_or(i, |order| order[i] as usize)]);
+            }
+            (alteration, altered)
+        });
         if alteration.normals {
             face(&mut altered, camera.pose.position);
         }
@@ -232,13 +255,15 @@ impl Painter {
         Some(photo)
     }
 
-    /// PSNR of `scene` against the photograph of `view`, dB; `None` if there is none.
-    pub fn score(&mut self, scene: &Scene, view: &SeenView) -> Option<f64> {
+    /// PSNR of the scene against the photograph of `view`, dB; `None` if there is none.
+    pub fn score(&mut self, edition: &Edition, view: &SeenView) -> Option<f64> {
+        let scene = edition.scene();
         let photo = view.photo.as_ref()?.load().ok()?;
-        let k = &view.camera.intrinsics;
+        let camera = placed(&view.camera, &edition.placement);
+        let k = &camera.intrinsics;
         let truth = photo.resized(k.width, k.height);
         let (truth, mask) = (truth.over(scene.options.background), truth.mask);
-        let frame = scene.model.render(&mut self.renderer, &view.camera, &scene.options);
+        let frame = scene.model.render(&mut self.renderer, &camera, &scene.options);
         let render = frame.color.to_u8();
         let (mut sum, mut count) = (0u64, 0u64);
         for (i, (a, b)) in render.chunks_exact(3).zip(truth.chunks_exact(3)).enumerate() {
@@ -271,9 +296,10 @@ impl Painter {
                 let altered = self.altered(
                     edition,
                     splats,
-                    false,
+                    None,
                     &Shot {
                         mode: Mode::Color,
+                        highlight: false,
                         ..*shot
                     },
                     &shot.camera,
@@ -326,6 +352,7 @@ fn picked_splat(splats: &Splats, hit: &irradia_splat::render::Hit, of: usize) ->
         scales,
         opacity: splats.opacity(i),
         color: hit.color.map(|c| c.min(1.0)),
+        base: std::array::from_fn(|c| sh::color_from_dc(splats.sh.get(c, i))),
         depth: hit.depth,
         weight: hit.weight,
     }
@@ -375,6 +402,22 @@ fn alter(splats: &Splats, alteration: &Alteration) -> Splats {
         }
     }
     altered
+}
+
+/// Mixes the colour of selected splats with [`palette::SELECTED`], as `project.frag` does.
+fn tint(splats: &mut Splats, is_selected: impl Fn(usize) -> bool + Sync) {
+    const SHARE: f32 = palette::SELECTED_SHARE;
+    let n = splats.len();
+    let selected: Vec<usize> = (0..n).into_par_iter().filter(|i| is_selected(*i)).collect();
+    for plane in 0..splats.sh.count() {
+        let values = splats.sh.plane_mut(plane);
+        for i in &selected {
+            values[*i] *= 1.0 - SHARE;
+            if let Some(target) = palette::SELECTED.get(plane) {
+                values[*i] += SHARE * sh::dc_from_color(*target);
+            }
+        }
+    }
 }
 
 /// Turns normals, kept as harmonics of degree 0, towards the camera at `center`.

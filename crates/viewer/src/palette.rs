@@ -23,6 +23,10 @@ const HEAT: [[f32; 3]; 5] = [
     [1.0, 0.98, 0.85],
 ];
 
+/// The colour in which selected splats are tinted, sRGB, and its share.
+pub const SELECTED: [f32; 3] = [1.0, 0.72, 0.0];
+pub const SELECTED_SHARE: f32 = 0.6;
+
 fn between(anchors: &[[f32; 3]], value: f32) -> [f32; 3] {
     // NaN becomes 0.
     let at = value.clamp(0.0, 1.0).max(0.0) * (anchors.len() - 1) as f32;

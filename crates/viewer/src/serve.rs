@@ -1,23 +1,27 @@
 //! What is answered: the page's files, photographs, splats, and the socket. No path of a request names a file.
 
-use crate::compact::compact;
+use crate::compact::compact_in_order;
 use crate::desk::Desk;
 use crate::draw::encode;
+use crate::editing::stem_of;
 use crate::guard::{Entry, Guard, TOKEN};
+use crate::importance::by_importance;
 use crate::message::MAX_REQUEST;
 use crate::notices::Notices;
-use crate::subject::Subject;
+use crate::subject::{Edition, Subject};
 use crate::{client, page};
 use axum::Router;
 use axum::body::{Body, Bytes};
 use axum::extract::{Path, Request, State, WebSocketUpgrade};
 use axum::http::header::{
-    CACHE_CONTROL, CONTENT_SECURITY_POLICY, CONTENT_TYPE, REFERRER_POLICY, SET_COOKIE, X_CONTENT_TYPE_OPTIONS,
+    CACHE_CONTROL, CONTENT_DISPOSITION, CONTENT_SECURITY_POLICY, CONTENT_TYPE, REFERRER_POLICY, SET_COOKIE,
+    X_CONTENT_TYPE_OPTIONS,
 };
 use axum::http::{HeaderValue, StatusCode};
 use axum::middleware::{Next, from_fn_with_state};
 use axum::response::{IntoResponse, Response};
 use axum::routing::get;
+use irradia_runs::formats::{SplatFormat, encode_splats};
 use irradia_scene::Photo;
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -41,6 +45,8 @@ pub(crate) struct Shared {
     pub notices: Arc<Notices>,
     /// The compact splats of a version.
     splats: Mutex<Option<(u64, Bytes)>>,
+    /// The splats of a version, most important first.
+    order: Mutex<Option<(u64, Arc<Vec<u32>>)>>,
     thumbnails: Mutex<HashMap<usize, Bytes>>,
     /// Photographs that may be decoded at once.
     decoding: Semaphore,
@@ -56,10 +62,24 @@ impl Shared {
             guard,
             notices,
             splats: Mutex::default(),
+            order: Mutex::default(),
             thumbnails: Mutex::default(),
             decoding: Semaphore::new(2),
             packing: Semaphore::new(1),
         }
+    }
+}
+
+impl Shared {
+    /// The splats of a version, most important first.
+    fn order(&self, edition: &Edition) -> Option<Arc<Vec<u32>>> {
+        let mut kept = self.order.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some((_, order)) = kept.as_ref().filter(|(version, _)| *version == edition.splats_version) {
+            return Some(order.clone());
+        }
+        let order = Arc::new(by_importance(edition.scene().model.splats()?));
+        *kept = Some((edition.splats_version, order.clone()));
+        Some(order)
     }
 }
 
@@ -73,6 +93,8 @@ pub(crate) fn router(shared: Arc<Shared>) -> Router {
             get(|Path(name): Path<String>| async move { page_file(&name) }),
         )
         .route("/splats", get(splats))
+        .route("/selection/{version}", get(selection))
+        .route("/download/{format}", get(download))
         .route(
             "/view/{view}/photo",
             get(|app: App, Path(view): Path<usize>| photo(app, view, None)),
@@ -136,17 +158,91 @@ async fn splats(State(shared): App) -> Response {
     let packed = tokio::task::spawn_blocking(move || {
         let edition = worker.subject.edition()?;
         let mut kept = worker.splats.lock().unwrap_or_else(PoisonError::into_inner);
-        if let Some((_, bytes)) = kept.as_ref().filter(|(version, _)| *version == edition.version) {
+        if let Some((_, bytes)) = kept.as_ref().filter(|(version, _)| *version == edition.splats_version) {
             return Some(bytes.clone());
         }
         let scene = edition.scene();
-        let bytes = Bytes::from(compact(scene.model.splats()?, scene.options.sh_degree, usize::MAX));
-        *kept = Some((edition.version, bytes.clone()));
+        let order = worker.order(&edition)?;
+        let bytes = Bytes::from(compact_in_order(scene.model.splats()?, scene.options.sh_degree, &order));
+        *kept = Some((edition.splats_version, bytes.clone()));
         Some(bytes)
     });
     match packed.await {
         Ok(Some(bytes)) => ([(CONTENT_TYPE, "application/octet-stream")], Body::from(bytes)).into_response(),
         _ => StatusCode::NOT_FOUND.into_response(),
+    }
+}
+
+/// Which splats are selected, a bit each in the order of the compact splats of a version, if that is the newest.
+async fn selection(State(shared): App, Path(version): Path<u64>) -> Response {
+    let packed = tokio::task::spawn_blocking(move || {
+        let edition = shared
+            .subject
+            .edition()
+            .filter(|edition| edition.splats_version == version)?;
+        let order = shared.order(&edition)?;
+        let mut bits = vec![0u8; order.len().div_ceil(8)];
+        if let Some(selected) = &edition.selected {
+            for (at, _) in order.iter().enumerate().filter(|(_, i)| selected[**i as usize]) {
+                bits[at / 8] |= 1 << (at % 8);
+            }
+        }
+        Some(bits)
+    });
+    match packed.await {
+        Ok(Some(bits)) => ([(CONTENT_TYPE, "application/octet-stream")], bits).into_response(),
+        _ => StatusCode::NOT_FOUND.into_response(),
+    }
+}
+
+/// The formats in which a scene can be downloaded, by the name that a request gives: the end of a file's name without its dot.
+pub(crate) fn downloads() -> impl Iterator<Item = (&'static str, SplatFormat)> {
+    let formats = SplatFormat::ALL.into_iter();
+    let files = formats.filter(|format| *format != SplatFormat::SogFolder);
+    files.map(|format| (format.suffix().trim_start_matches('.'), format))
+}
+
+/// The edited scene as a file of a format, or the list of edits.
+async fn download(State(shared): App, Path(name): Path<String>) -> Response {
+    let known = downloads().find(|(known, _)| *known == name);
+    let is_list = name == "edits.toml";
+    if shared.subject.editing.is_err() || (known.is_none() && !is_list) {
+        return StatusCode::NOT_FOUND.into_response();
+    }
+    let Ok(_permit) = shared.packing.acquire().await else {
+        return StatusCode::SERVICE_UNAVAILABLE.into_response();
+    };
+    let worker = shared.clone();
+    let written = tokio::task::spawn_blocking(move || -> Result<(String, Vec<u8>), String> {
+        let editing = worker.subject.editing.as_ref().map_err(|why| (*why).to_owned())?;
+        let stem: String = stem_of(&editing.source)
+            .chars()
+            .map(|c| {
+                if c.is_ascii_alphanumeric() || "-_".contains(c) {
+                    c
+                } else {
+                    '_'
+                }
+            })
+            .collect();
+        let Some((end, format)) = known else {
+            return Ok((format!("{stem}.edits.toml"), editing.list().into_bytes()));
+        };
+        let cloud = editing.cloud().map_err(|error| error.to_string())?;
+        let bytes = encode_splats(format, &cloud, &Default::default()).map_err(|error| error.to_string())?;
+        Ok((format!("{stem}.{end}"), bytes))
+    });
+    match written.await {
+        Ok(Ok((name, bytes))) => {
+            let disposition = format!("attachment; filename=\"{name}\"");
+            let headers = [
+                (CONTENT_TYPE, "application/octet-stream"),
+                (CONTENT_DISPOSITION, disposition.as_str()),
+            ];
+            (headers, Body::from(bytes)).into_response()
+        }
+        Ok(Err(why)) => (StatusCode::INTERNAL_SERVER_ERROR, why).into_response(),
+        Err(_) => StatusCode::INTERNAL_SERVER_ERROR.into_response(),
     }
 }
 

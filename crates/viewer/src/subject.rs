@@ -1,8 +1,10 @@
 //! What is looked at: a scene that stays, or the state of a training.
 
 use crate::ViewerError;
+use crate::editing::Editing;
 use crate::live::{Live, Watcher};
 use crate::views::Views;
+use irradia_edit::Transform;
 use irradia_runs::{Reading, Run, RunFolder, Scene, Snapshot, TrainInput, scene_of};
 use irradia_scene::Dataset;
 use irradia_splat::Splats;
@@ -17,6 +19,12 @@ use std::sync::{Arc, Mutex, PoisonError};
 pub(crate) struct Edition {
     /// Counts up from 1.
     pub version: u64,
+    /// The first version with these splats: a selection changes `version` alone.
+    pub splats_version: u64,
+    /// Whether each splat is selected; `None` if none is.
+    pub selected: Option<Arc<Vec<bool>>>,
+    /// How the scene was moved by edits, and with it what stands in it, such as the cameras of views.
+    pub placement: Transform,
     held: Held,
 }
 
@@ -27,6 +35,16 @@ enum Held {
 }
 
 impl Edition {
+    fn of_scene(scene: Scene) -> Self {
+        Self {
+            version: 1,
+            splats_version: 1,
+            selected: None,
+            placement: Transform::IDENTITY,
+            held: Held::Scene(Arc::new(scene)),
+        }
+    }
+
     /// The scene.
     pub fn scene(&self) -> &Scene {
         match &self.held {
@@ -56,6 +74,8 @@ pub struct Subject {
     edition: Mutex<Option<Edition>>,
     /// Omissions, one line each.
     pub warnings: Vec<String>,
+    /// The session that edits, or why there is none.
+    pub(crate) editing: Result<Editing, &'static str>,
 }
 
 impl Subject {
@@ -92,16 +112,21 @@ impl Subject {
         let recipe = folder
             .as_ref()
             .and_then(|folder| std::fs::read_to_string(folder.file("recipe.toml")).ok());
+        let editing = match &scene.model {
+            Model::Splats { splats, residual: None } => Ok(Editing::new(file, splats.len())),
+            Model::Splats { .. } => {
+                Err("Splats with a residual field cannot be edited: their colours are in the field.")
+            }
+            Model::Field(_) => Err("A radiance field has no splats to edit."),
+        };
         Ok(Self {
             title: title(path),
             views,
+            editing,
             live: None,
             folder,
             recipe,
-            edition: Mutex::new(Some(Edition {
-                version: 1,
-                held: Held::Scene(Arc::new(scene)),
-            })),
+            edition: Mutex::new(Some(Edition::of_scene(scene))),
             warnings,
         })
     }
@@ -131,13 +156,11 @@ impl Subject {
         Self {
             title: title(path),
             views: Views::of_dataset(&Arc::new(dataset), None),
+            editing: Err("A dataset has no splats to edit: these are its points."),
             live: None,
             folder: None,
             recipe: None,
-            edition: Mutex::new(Some(Edition {
-                version: 1,
-                held: Held::Scene(Arc::new(scene)),
-            })),
+            edition: Mutex::new(Some(Edition::of_scene(scene))),
             warnings,
         }
     }
@@ -150,6 +173,7 @@ impl Subject {
         let subject = Self {
             title: title(run.folder().path()),
             views: Views::of_dataset(&trainer.dataset, Some(&cameras)),
+            editing: Err("A scene can be edited when its training has finished: open it with irradia view."),
             live: Some(live.clone()),
             folder: Some(run.folder().clone()),
             recipe: Some(trainer.recipe.to_toml()),
@@ -159,14 +183,31 @@ impl Subject {
         (subject, Watcher::new(live))
     }
 
+    /// Shows another `scene`, if there is one, and which splats are selected, if any are.
+    pub(crate) fn show(&self, scene: Option<Scene>, placement: Transform, selected: Option<Arc<Vec<bool>>>) {
+        let mut edition = self.edition.lock().unwrap_or_else(PoisonError::into_inner);
+        let Some(edition) = edition.as_mut() else { return };
+        edition.version += 1;
+        edition.placement = placement;
+        edition.selected = selected;
+        if let Some(scene) = scene {
+            edition.splats_version = edition.version;
+            edition.held = Held::Scene(Arc::new(scene));
+        }
+    }
+
     /// The newest version, if there is one: a training has none before its first step.
     pub(crate) fn edition(&self) -> Option<Edition> {
         let mut edition = self.edition.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(snapshot) = self.live.as_ref().and_then(|live| live.newest()) {
             let known = edition.as_ref().and_then(Edition::step);
             if known != Some(snapshot.step) {
+                let version = edition.as_ref().map_or(1, |old| old.version + 1);
                 *edition = Some(Edition {
-                    version: edition.as_ref().map_or(1, |old| old.version + 1),
+                    version,
+                    splats_version: version,
+                    selected: None,
+                    placement: Transform::IDENTITY,
                     held: Held::Snapshot(snapshot),
                 });
             }

@@ -1,11 +1,13 @@
 //! The running server.
 
 use crate::draw::draw;
+use crate::editing::work;
 use crate::guard::{Guard, TOKEN, random_token};
 use crate::listen::{Listen, accept, open_browser, reachable};
 use crate::notices::{Notices, Tell};
 use crate::serve::{Shared, router};
 use crate::{Subject, ViewerError};
+use serde_json::json;
 use std::io;
 use std::sync::Arc;
 use std::thread::{self, JoinHandle};
@@ -92,16 +94,27 @@ impl Viewer {
             let shared = shared.clone();
             move || pool.install(|| draw(&shared.subject, &shared.desk))
         };
+        let editing = {
+            // With the program's own pool: only scenes at rest are edited.
+            let shared = shared.clone();
+            move || {
+                let Ok(editing) = &shared.subject.editing else { return };
+                let tell = |seat, line: &str| {
+                    let told = json!({ "tell": "problem", "text": line });
+                    shared.desk.tell(seat, told.to_string());
+                };
+                work(editing, &shared.subject, &tell, &|| shared.desk.wake());
+            }
+        };
+        let begin = |name: &str, run: Box<dyn FnOnce() + Send>| {
+            let thread = thread::Builder::new().name(name.into());
+            thread.spawn(run).map_err(refused)
+        };
         let viewer = Self {
             threads: vec![
-                thread::Builder::new()
-                    .name("serve".into())
-                    .spawn(serving)
-                    .map_err(refused)?,
-                thread::Builder::new()
-                    .name("draw".into())
-                    .spawn(drawing)
-                    .map_err(refused)?,
+                begin("serve", Box::new(serving))?,
+                begin("draw", Box::new(drawing))?,
+                begin("edit", Box::new(editing))?,
             ],
             shared,
             address,
@@ -150,6 +163,9 @@ impl Viewer {
 impl Drop for Viewer {
     fn drop(&mut self) {
         self.shared.desk.close();
+        if let Ok(editing) = &self.shared.subject.editing {
+            editing.close();
+        }
         self.closing.notify_one();
         for thread in self.threads.drain(..) {
             let _ = thread.join();

@@ -55,6 +55,7 @@ pub(crate) fn select_among(
 fn evaluate(draft: &Draft, shape: &Shape) -> Result<Selection, EditError> {
     Ok(match shape {
         Shape::All {} => Selection::all(draft.len()),
+        Shape::Last {} => draft.last.clone(),
         Shape::Box { .. } | Shape::Sphere { .. } | Shape::HalfSpace { .. } => region::inside(draft, shape),
         Shape::Color { .. } | Shape::Opacity { .. } | Shape::Size { .. } | Shape::Elongation { .. } => {
             region::like(draft, shape)

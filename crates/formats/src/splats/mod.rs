@@ -304,6 +304,24 @@ fn parse(format: SplatFormat, bytes: &[u8]) -> Result<GaussianCloud, Malformed> 
     }
 }
 
+/// The bytes of a splat file. A folder of images is one archive.
+///
+/// # Errors
+/// When the format cannot hold the cloud.
+///
+/// # Panics
+/// When the cloud's columns have unequal lengths: a bug in the caller.
+pub fn encode_splats(format: SplatFormat, cloud: &GaussianCloud, options: &WriteOptions) -> io::Result<Vec<u8>> {
+    assert!(cloud.is_consistent(), "the columns of the cloud have unequal lengths");
+    let prepared = match format.is_lossless() {
+        true => Cow::Borrowed(cloud),
+        false => prepared(cloud, &mut Vec::new()),
+    };
+    let mut bytes = Vec::new();
+    encode(format, &mut bytes, &prepared, options)?;
+    Ok(bytes)
+}
+
 /// `cloud` as it is after it was written and read again, and the bytes that this takes. A folder of images is taken as one archive.
 ///
 /// # Errors
@@ -316,14 +334,8 @@ pub fn through_format(
     cloud: &GaussianCloud,
     options: &WriteOptions,
 ) -> Result<(GaussianCloud, usize), FormatError> {
-    assert!(cloud.is_consistent(), "the columns of the cloud have unequal lengths");
     let name = Path::new(format.suffix());
-    let prepared = match format.is_lossless() {
-        true => Cow::Borrowed(cloud),
-        false => prepared(cloud, &mut Vec::new()),
-    };
-    let mut bytes = Vec::new();
-    encode(format, &mut bytes, &prepared, options).map_err(|source| FormatError::Write {
+    let bytes = encode_splats(format, cloud, options).map_err(|source| FormatError::Write {
         path: name.to_owned(),
         source,
     })?;

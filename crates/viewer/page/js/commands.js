@@ -1,6 +1,7 @@
 // What the page can do, with its keys: the toolbar, the keyboard and the help sheet use this list.
 
 import { connection } from "./connection.js";
+import { session } from "./edit/session.js";
 import { path } from "./path.js";
 import { shareAddress } from "./share.js";
 import { state } from "./state.js";
@@ -32,6 +33,14 @@ export const train = (action) => connection.send({ do: "train", action });
 
 /** @param {"measure" | "inspect"} tool */
 const toggleTool = (tool) => state.set({ tool: state.get("tool") === tool ? "none" : tool, ...(tool === "measure" && { measured: [] }) });
+
+/** @param {import("./edit/tools.js").Tool} tool */
+const toggleEditTool = (tool) => state.set({ tab: "edit", sidebar: true, tool: state.get("tool") === tool ? "none" : tool });
+
+/** Deletes the selection, if there is one. */
+const remove = () => {
+  if (state.get("editing")?.selected) session.edit({ op: "delete" });
+};
 
 /** Puts the address of the present view on the clipboard. */
 export async function share() {
@@ -87,6 +96,19 @@ export const COMMANDS = {
     { keys: " ", name: "Play the path", run: () => path.dispatchEvent(new Event("toggle")) },
     { keys: "p", name: "Pause or resume the training", run: () => train(state.get("train")?.phase === "paused" ? "resume" : "pause") },
   ],
+  Edit: [
+    { keys: "Ctrl+z", name: "Undo", run: () => session.undo() },
+    { keys: "Ctrl+Shift+z", name: "Redo", run: () => session.redo() },
+    { keys: "Ctrl+y", name: "", run: () => session.redo() },
+    { keys: "r", name: "Select by a rectangle", run: () => toggleEditTool("rectangle") },
+    { keys: "n", name: "Select with the lasso", run: () => toggleEditTool("lasso") },
+    { keys: "j", name: "Select with the brush", run: () => toggleEditTool("brush") },
+    { keys: "Ctrl+a", name: "Select all", run: () => session.select([{ shape: "all" }], "replace") },
+    { keys: "Ctrl+i", name: "Invert the selection", run: () => session.select([{ shape: "invert" }], "add") },
+    { keys: "Ctrl+d", name: "Select nothing", run: () => session.deselect() },
+    { keys: "Delete", name: "Delete the selection", run: remove },
+    { keys: "Backspace", name: "", run: remove },
+  ],
   Page: [
     { keys: "b", name: "Show or hide the panel", run: () => state.set({ sidebar: !state.get("sidebar") }) },
     { keys: "t", name: "Dark or light", run: toggleTheme },
@@ -98,10 +120,13 @@ export const COMMANDS = {
 
 addEventListener("keydown", (event) => {
   const target = /** @type {HTMLElement} */ (event.target);
-  if (event.ctrlKey || event.metaKey || event.altKey || target.matches("input:not([type=range]):not([type=checkbox]), select, dialog *")) return;
+  if (event.altKey || target.matches("input:not([type=range]):not([type=checkbox]), select, dialog *")) return;
   if (event.key === " " && target.matches("button, [role=button]")) return;
-  const command = Object.values(COMMANDS).flat().find(({ keys }) => keys === event.key);
-  if (!command) return;
+  const held = event.ctrlKey || event.metaKey ? (event.shiftKey ? "Ctrl+Shift+" : "Ctrl+") : "";
+  const key = held ? held + event.key.toLowerCase() : event.key;
+  const command = Object.values(COMMANDS).flat().find(({ keys }) => keys === key);
+  // Keys of editing are the browser's where there is nothing to edit.
+  if (!command || (COMMANDS.Edit.includes(command) && !session.works)) return;
   event.preventDefault();
   command.run();
 });

@@ -80,6 +80,9 @@ class Connection extends EventTarget {
       case "score":
         state.set({ scores: new Map(state.get("scores")).set(told.view, told.psnr) });
         break;
+      case "editing":
+        state.set({ editing: told });
+        break;
       case "unit":
         state.set({ metres: told.metres });
         break;

@@ -13,7 +13,7 @@ class Help extends HTMLElement {
   connectedCallback() {
     const group = (/** @type {string} */ name, /** @type {[string, string][]} */ rows) =>
       el("div", {}, el("h2", { textContent: name }), el("div", { className: "keys" }, ...rows.flatMap(([key, text]) => [el("kbd", { textContent: key }), el("span", { textContent: text })])));
-    const named = (/** @type {string} */ key) => ({ " ": "Space", Escape: "Esc" })[key] ?? key.toUpperCase();
+    const named = (/** @type {string} */ key) => ({ " ": "Space", Escape: "Esc", Delete: "Del" })[key] ?? key.replaceAll("+", " ").toUpperCase();
     const groups = Object.entries(COMMANDS).map(([name, commands]) =>
       group(name, commands.filter(({ name }) => name).map(({ keys, name }) => [named(keys), name])));
     const close = el("button", { type: "button", textContent: "Close", className: "primary", onclick: () => dialog.close() });

@@ -51,7 +51,8 @@ class Hud extends HTMLElement {
     });
     state.watch(["tool", "measured", "metres"], () => {
       const [a, b] = state.get("measured");
-      const text = { none: "", inspect: "Click a splat; Escape ends", measure: "Click two points on surfaces; Escape ends" }[state.get("tool")];
+      const hints = /** @type {Record<string, string>} */ ({ inspect: "Click a splat; Escape ends", measure: "Click two points on surfaces; Escape ends" });
+      const text = hints[state.get("tool")] ?? "";
       tool.textContent = state.get("tool") === "measure" && a && b ? distanceText(length(subtract(a, b))) : text;
       tool.hidden = !text;
     });

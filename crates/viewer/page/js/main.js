@@ -7,6 +7,7 @@ import "./sidebar.js";
 import "./timeline.js";
 import "./help.js";
 import "./commands.js";
+import "./edit/placement.js";
 import { connection } from "./connection.js";
 import { homeOf } from "./navigation.js";
 import { sharedValues } from "./share.js";

@@ -3,6 +3,7 @@
 import { connection } from "./connection.js";
 import { forward } from "./camera.js";
 import { add, axes, clamp, cross, dot, length, lookAt, mix, multiply, normalize, rotate, scale, slerp, subtract, turn, unit } from "./math.js";
+import { isEditTool } from "./edit/tools.js";
 import { state } from "./state.js";
 
 /** @typedef {import("./camera.js").Camera} Camera */
@@ -31,10 +32,12 @@ export class Navigation {
   flight = null;
   last = 0;
 
-  /** @param {HTMLElement} element @param {(x: number, y: number) => Promise<any>} pick at pixels of the element */
-  constructor(element, pick) {
+  /** @param {HTMLElement} element @param {(x: number, y: number) => Promise<any>} pick at pixels of the element
+   * @param {(event: PointerEvent) => boolean} claimed whether a pointer is for something else */
+  constructor(element, pick, claimed) {
     this.element = element;
     this.pick = pick;
+    this.claimed = claimed;
     element.addEventListener("pointerdown", (event) => this.down(event));
     element.addEventListener("pointermove", (event) => this.move(event));
     for (const kind of ["pointerup", "pointercancel"]) {
@@ -50,7 +53,9 @@ export class Navigation {
 
   /** @param {PointerEvent} event */
   down(event) {
-    if (state.get("tool") !== "none" && event.button === 0) return;
+    if (this.claimed(event)) return;
+    const tool = state.get("tool");
+    if ((tool === "measure" || tool === "inspect") && event.button === 0) return;
     this.element.setPointerCapture(event.pointerId);
     this.element.focus({ preventScroll: true });
     this.pointers.set(event.pointerId, { x: event.clientX, y: event.clientY });
@@ -69,7 +74,8 @@ export class Navigation {
       const now = { x: event.clientX, y: event.clientY };
       this.dolly(Math.log(apart(now) / Math.max(apart(before), 1)));
       this.pan(dx / 2, dy / 2);
-    } else if (event.buttons & 6 || event.shiftKey) {
+    } else if (event.buttons & (isEditTool(state.get("tool")) ? 4 : 6) || event.shiftKey) {
+      // The left button of a selection tool is taken: the right one turns.
       this.pan(dx, dy);
     } else {
       this.turn(dx, dy);
@@ -219,6 +225,7 @@ export class Navigation {
 
   /** @param {MouseEvent} event */
   async setPivot(event) {
+    if (isEditTool(state.get("tool"))) return;
     const picked = await this.pick(event.offsetX, event.offsetY);
     if (!picked?.point) return;
     const camera = state.get("camera");

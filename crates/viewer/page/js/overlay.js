@@ -10,7 +10,8 @@ import { state } from "./state.js";
 /** @typedef {import("./math.js").Vec3} Vec3 */
 
 export const AXIS_COLORS = ["#e5736f", "#6cc08b", "#6ea8fe"];
-const EDGES = [[0, 1], [1, 2], [2, 3], [3, 0], [4, 5], [5, 6], [6, 7], [7, 4], [0, 4], [1, 5], [2, 6], [3, 7]];
+/** Pairs of corners of a box: around its lower face, around its upper one, between them. */
+export const EDGES = [[0, 1], [1, 2], [2, 3], [3, 0], [4, 5], [5, 6], [6, 7], [7, 4], [0, 4], [1, 5], [2, 6], [3, 7]];
 
 /** Size of a drawn camera, as a share of the scene's radius. */
 const FRUSTUM = 0.09;
@@ -28,7 +29,7 @@ export function drawOverlay(context, camera, k, pixel) {
   for (const { view, index } of seenFrusta(camera)) {
     drawFrustum(draw, view, FRUSTUM * size, colorOf(view.trained, state.get("scores").get(index)), view.photo ? thumbnails.get(index) : null);
   }
-  if (state.get("axes") && inside === null) {
+  if (state.get("axes") && inside === null && !(state.get("tab") === "edit" && state.get("editing")?.selected)) {
     const pivot = state.get("pivot");
     const reach = 0.06 * length(subtract(pivot, camera.position));
     for (const [i, color] of AXIS_COLORS.entries()) {
@@ -102,7 +103,7 @@ function colorOf(trained, psnr) {
 }
 
 /** @param {Draw} draw @param {Vec3} a @param {Vec3} b */
-function line({ context, camera, k, near }, a, b) {
+export function line({ context, camera, k, near }, a, b) {
   let [from, to] = [toCamera(camera, a), toCamera(camera, b)];
   if (from[2] < near && to[2] < near) return;
   if (from[2] < near) [from, to] = [to, from];

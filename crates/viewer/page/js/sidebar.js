@@ -4,10 +4,11 @@ import "./panels/display.js";
 import "./panels/views.js";
 import "./panels/training.js";
 import "./panels/path.js";
+import "./panels/edit.js";
 import { el } from "./dom.js";
 import { state } from "./state.js";
 
-const TABS = [["display", "Scene"], ["views", "Views"], ["training", "Training"], ["path", "Path"]];
+const TABS = [["display", "Scene"], ["views", "Views"], ["training", "Training"], ["path", "Path"], ["edit", "Edit"]];
 
 class Sidebar extends HTMLElement {
   connectedCallback() {

@@ -5,6 +5,9 @@ import { connection } from "./connection.js";
 import { el } from "./dom.js";
 import { LocalRenderer } from "./local/renderer.js";
 import { Navigation } from "./navigation.js";
+import { drawEditing } from "./edit/overlay.js";
+import { Pointer } from "./edit/pointer.js";
+import { isEditTool } from "./edit/tools.js";
 import { drawOverlay, frustumAt, thumbnails } from "./overlay.js";
 import { path } from "./path.js";
 import { state } from "./state.js";
@@ -23,7 +26,8 @@ const DENSITY = 2;
 const BLINK = 700;
 
 /** What lines and layout depend on, beside the camera. @type {(keyof import("./state.js").Values)[]} */
-const LINES = ["pivot", "view", "views", "frusta", "axes", "clip", "measured", "metres", "scores", "compare", "tab", "scene", "sidebar"];
+const LINES = ["pivot", "view", "views", "frusta", "axes", "clip", "measured", "metres", "scores", "compare", "tab", "scene", "sidebar",
+  "tool", "editing", "region", "transform", "selectMode", "brush", "highlight"];
 
 export class Stage extends HTMLElement {
   /** What is on the screen now. @type {{ camera: Camera, k: Intrinsics, header: Header | null } | null} */
@@ -57,9 +61,11 @@ export class Stage extends HTMLElement {
     this.prepend(this.served, this.localCanvas, this.photo, this.overlay, this.handle, this.empty);
     const local = new LocalRenderer(this.localCanvas, () => (this.dirty = true), (problem) => state.set({ problem }));
     this.local = local;
-    this.navigation = new Navigation(this.overlay, (x, y) => this.pickAt(x, y));
+    const pointer = new Pointer(this, this.overlay);
+    this.pointer = pointer;
+    this.navigation = new Navigation(this.overlay, (x, y) => this.pickAt(x, y), (event) => pointer.claims(event));
     new ResizeObserver(() => this.resize()).observe(this);
-    for (const key of /** @type {const} */ (["camera", "view", "mode", "background", "clip", "drawing", "compare", "scene"])) {
+    for (const key of /** @type {const} */ (["camera", "view", "mode", "background", "clip", "drawing", "compare", "scene", "highlight"])) {
       state.addEventListener(key, () => (this.dirty = true));
     }
     const touch = () => (this.stale = true);
@@ -67,8 +73,12 @@ export class Stage extends HTMLElement {
     // The lines over a served picture have its camera: its arrival renews them. A canvas renewed 60 times a second costs half a core
     // where the browser composes without a GPU.
     state.addEventListener("camera", () => (this.stale ||= this.drawsLocally));
-    for (const source of [this, path, thumbnails]) for (const kind of ["drawing", "change", "load"]) source.addEventListener(kind, touch);
+    for (const source of [this, path, thumbnails, pointer]) for (const kind of ["drawing", "change", "load"]) source.addEventListener(kind, touch);
     state.addEventListener("scene", () => local.load(state.get("scene")));
+    state.addEventListener("editing", () => {
+      local.select(state.get("editing")?.mask ?? 0);
+      this.dirty ||= this.drawsLocally;
+    });
     state.watch(["view", "compare", "views"], () => this.showPhoto());
     state.watch(["tool"], () => this.classList.toggle("picking", state.get("tool") !== "none"));
     state.watch(["connection", "scene"], () => this.tellEmpty());
@@ -133,7 +143,26 @@ export class Stage extends HTMLElement {
       view: state.get("view"),
       background: background && rgb(background),
       clip: state.get("clip"),
+      highlight: state.get("highlight"),
     };
+  }
+
+  /** The camera of the present shot. */
+  get wanted() {
+    const { width, height, fx, fy, cx, cy } = this.shot();
+    return { camera: state.get("camera"), k: { width, height, fx, fy, cx, cy } };
+  }
+
+  /** What is on the screen: over a served picture its own camera, so that lines and picture move together.
+   * @returns {{ camera: Camera, k: Intrinsics } | null} */
+  get seen() {
+    if (!this.drawsLocally) return this.shown;
+    return this.local?.k ? { camera: state.get("camera"), k: this.local.k } : null;
+  }
+
+  /** The picture's pixels per CSS pixel. */
+  get pixel() {
+    return this.shot().width / this.frameRect.width;
   }
 
   /** @param {number} now */
@@ -213,33 +242,40 @@ export class Stage extends HTMLElement {
   drawOverlay() {
     const context = this.overlay?.getContext("2d");
     if (!context || !this.overlay) return;
-    // Over a served picture its own camera, so that lines and picture move together.
-    const shown = this.drawsLocally ? { camera: state.get("camera"), k: this.local?.k } : this.shown;
+    const shown = this.seen;
     context.setTransform(1, 0, 0, 1, 0, 0);
     context.clearRect(0, 0, this.overlay.width, this.overlay.height);
-    if (!shown?.k) return;
+    if (!shown) return;
     const rect = this.frameRect;
     const density = this.density ?? 1;
     const factor = rect.width / shown.k.width;
     context.setTransform(density * factor, 0, 0, density * factor, rect.left * density, rect.top * density);
     drawOverlay(context, shown.camera, shown.k, 1 / factor);
+    const near = 0.01 * (state.get("scene")?.radius ?? 1);
+    if (this.pointer && state.get("tab") === "edit") drawEditing({ context, near, ...shown }, 1 / factor, this.pointer);
   }
 
   /** @param {number} x @param {number} y CSS pixels on the stage @returns {Promise<any>} */
   async pickAt(x, y) {
     const rect = this.frameRect;
-    const shot = this.shot();
-    return connection.pick(shot, ((x - rect.left) / rect.width) * shot.width, ((y - rect.top) / rect.height) * shot.height);
+    return this.pickPixel([(x - rect.left) * this.pixel, (y - rect.top) * this.pixel]);
+  }
+
+  /** @param {readonly [number, number]} at pixels of the picture @returns {Promise<any>} */
+  pickPixel([x, y]) {
+    return connection.pick(this.shot(), x, y);
   }
 
   /** @param {MouseEvent} event */
   async useTool(event) {
     const tool = state.get("tool");
     if (tool === "none") {
+      if (this.pointer?.over) return;
       const still = Math.hypot(event.clientX - this.pressed.x, event.clientY - this.pressed.y) < 4;
       if (still) this.enterFrustum(event.offsetX, event.offsetY);
       return;
     }
+    if (isEditTool(tool)) return;
     const picked = await this.pickAt(event.offsetX, event.offsetY);
     if (tool === "inspect") state.set({ picked });
     if (tool === "measure" && picked?.point) {
@@ -250,8 +286,8 @@ export class Stage extends HTMLElement {
 
   /** Enters the view whose camera is drawn at a point of the stage. @param {number} x @param {number} y */
   enterFrustum(x, y) {
-    const shown = this.drawsLocally ? { camera: state.get("camera"), k: this.local?.k } : this.shown;
-    if (!shown?.k) return;
+    const shown = this.seen;
+    if (!shown) return;
     const rect = this.frameRect;
     const factor = shown.k.width / rect.width;
     const index = frustumAt(shown.camera, shown.k, (x - rect.left) * factor, (y - rect.top) * factor, 14 * factor);

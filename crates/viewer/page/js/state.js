@@ -6,7 +6,7 @@
 
 /** What the server says of the scene.
  * @typedef {{ version: number, step: number | null, kind: string, count: number, sh_degree: number, travels: boolean,
- *   antialias: boolean, background: Vec3, center: Vec3, up: Vec3, radius: number, height: number, fov: number }} Scene */
+ *   placement: import("./edit/placement.js").Placement, antialias: boolean, background: Vec3, center: Vec3, up: Vec3, radius: number, height: number, fov: number }} Scene */
 
 /**
  * @typedef {object} Values
@@ -28,7 +28,15 @@
  * @property {string} tab
  * @property {string} theme
  * @property {number} speed factor on the speed of flying
- * @property {"none" | "measure" | "inspect"} tool
+ * @property {"none" | "measure" | "inspect" | import("./edit/tools.js").Tool} tool
+ * @property {import("./edit/session.js").Mode} selectMode
+ * @property {number} brush radius, CSS pixels
+ * @property {boolean} visibleOnly whether tools select only what the picture shows
+ * @property {boolean} highlight whether selected splats are tinted
+ * @property {"none" | "move" | "rotate" | "scale"} transform
+ * @property {import("./edit/shapes.js").Region | null} region
+ * @property {{ color: Vec3, mode: import("./edit/session.js").Mode } | null} dropped the colour under the eyedropper
+ * @property {import("./edit/session.js").Editing | null} editing
  * @property {Vec3[]} measured
  * @property {number | null} metres per world unit
  * @property {object | null} picked
@@ -40,7 +48,7 @@
  */
 
 /** Values that are kept from visit to visit. */
-const KEPT = ["drawing", "navigation", "frusta", "axes", "sidebar", "tab", "theme", "speed"];
+const KEPT = ["drawing", "navigation", "frusta", "axes", "sidebar", "tab", "theme", "speed", "brush", "visibleOnly"];
 const STORE = "irradia-viewer";
 
 class State extends EventTarget {
@@ -51,7 +59,8 @@ class State extends EventTarget {
       scene: null, views: [], camera: { position: [0, 0, -3], rotation: [1, 0, 0, 0], fov: 0.9 }, pivot: [0, 0, 0], up: [0, -1, 0],
       view: null, mode: "color", drawing: "auto", navigation: "orbit", background: null, clip: null, compare: "none",
       frusta: false, axes: true, sidebar: innerWidth > 720, tab: "display", theme: "", speed: 1, tool: "none", measured: [],
-      metres: null, picked: null, train: null, hello: null, scores: new Map(), connection: "connecting", problem: null,
+      metres: null, selectMode: "replace", brush: 24, visibleOnly: false, highlight: true, transform: "none", region: null, dropped: null,
+      editing: null, picked: null, train: null, hello: null, scores: new Map(), connection: "connecting", problem: null,
     };
     try {
       const kept = JSON.parse(localStorage.getItem(STORE) ?? "{}");

@@ -7,6 +7,8 @@ precision highp usampler2D;
 
 uniform usampler2D u_cores; // [rows, 1024 * 2]
 uniform usampler2D u_bands; // [rows, 1024 * degree]
+uniform usampler2D u_selected; // [rows, 1024], 1 if selected
+uniform bool u_highlight; // whether selected splats are tinted
 uniform int u_degree;
 uniform int u_count;
 uniform mat3 u_rotation; // camera from world
@@ -23,6 +25,8 @@ layout(location = 0) out uvec4 place; // centre x, y; the two axes of the ellips
 layout(location = 1) out uvec4 look; // red, green; blue, opacity; reach, pixels per world unit; depth
 
 const float DILATION = 0.3;
+const vec3 SELECTED = vec3(1.0, 0.72, 0.0); // as in crates/viewer/src/palette.rs
+const float SELECTED_SHARE = 0.6;
 const float C1 = 0.4886025119029199;
 
 // The 16, 32 or 48 bytes of a splat's higher bands, fetched once: a fetch for each byte takes a third longer.
@@ -124,6 +128,7 @@ void main() {
   vec2 center = u_focal * x.xy / x.z + u_principal;
 
   if (u_degree > 0) color += harmonics(at.x, at.y, normalize(mean - u_position));
+  if (u_highlight && texelFetch(u_selected, at, 0).x != 0u) color = mix(color, SELECTED, SELECTED_SHARE);
   color = max(color, 0.0);
   float reach = sqrt(2.0 * log(255.0 * opacity));
   place = uvec4(floatBitsToUint(center), packHalf2x16(clamp(direction * sqrt(large), -6e4, 6e4)),

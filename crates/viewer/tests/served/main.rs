@@ -1,5 +1,6 @@
 //! The server as its clients see it, good and bad ones.
 
 mod client;
+mod editing;
 mod live;
 mod security;

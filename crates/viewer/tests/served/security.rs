@@ -6,18 +6,21 @@ use irradia_scene::GaussianCloud;
 use irradia_viewer::{Listen, Subject, Viewer};
 use std::io::{ErrorKind, Read, Write};
 use std::net::{SocketAddr, TcpStream};
+use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 use tempfile::TempDir;
 
-/// A viewer of three splats, and the lines that it told.
-struct Served {
+/// A viewer, and the lines that it told.
+pub struct Served {
     viewer: Viewer,
     told: Arc<Mutex<Vec<String>>>,
-    _folder: TempDir,
+    scene: PathBuf,
+    _folder: Option<TempDir>,
 }
 
-fn serve(host: &str) -> Served {
+/// A viewer of three splats.
+pub fn serve(host: &str) -> Served {
     let folder = tempfile::tempdir().expect("a folder");
     let ply = folder.path().join("scene.ply");
     let cloud = GaussianCloud {
@@ -31,26 +34,39 @@ fn serve(host: &str) -> Served {
         world_from_dataset: Default::default(),
     };
     write_splats(&ply, &cloud).expect("written");
-    let subject = Subject::open(&ply, None, &Default::default()).expect("a scene");
-    let told = Arc::new(Mutex::new(Vec::new()));
-    let tell = {
-        let told = told.clone();
-        move |line: &str| told.lock().expect("no panic").push(line.to_owned())
-    };
-    let listen = Listen {
-        host: host.to_owned(),
-        port: 0,
-        open: false,
-    };
-    let viewer = Viewer::start(subject, &listen, Box::new(tell)).expect("a server");
     Served {
-        viewer,
-        told,
-        _folder: folder,
+        _folder: Some(folder),
+        ..Served::of(&ply, host)
     }
 }
 
 impl Served {
+    /// A viewer of `scene`.
+    pub fn of(scene: &Path, host: &str) -> Self {
+        let subject = Subject::open(scene, None, &Default::default()).expect("a scene");
+        let told = Arc::new(Mutex::new(Vec::new()));
+        let tell = {
+            let told = told.clone();
+            move |line: &str| told.lock().expect("no panic").push(line.to_owned())
+        };
+        let listen = Listen {
+            host: host.to_owned(),
+            port: 0,
+            open: false,
+        };
+        Self {
+            viewer: Viewer::start(subject, &listen, Box::new(tell)).expect("a server"),
+            told,
+            scene: scene.to_owned(),
+            _folder: None,
+        }
+    }
+
+    /// Its file.
+    pub fn scene(&self) -> &Path {
+        &self.scene
+    }
+
     fn address(&self) -> SocketAddr {
         address_of(self.viewer.address())
     }
@@ -70,11 +86,11 @@ impl Served {
         String::from_utf8_lossy(&answer).into_owned()
     }
 
-    fn host(&self) -> String {
+    pub fn host(&self) -> String {
         format!("Host: {}", self.address())
     }
 
-    fn status(&self, target: &str, headers: &[&str]) -> u32 {
+    pub fn status(&self, target: &str, headers: &[&str]) -> u32 {
         let answer = self.ask(target, headers);
         let status = answer.split_whitespace().nth(1).and_then(|status| status.parse().ok());
         status.unwrap_or_else(|| panic!("no status: {answer:?}"))
@@ -90,12 +106,12 @@ impl Served {
             .count()
     }
 
-    fn socket(&self) -> Socket {
+    pub fn socket(&self) -> Socket {
         Socket::open(self.address())
     }
 
     /// A page still gets a picture.
-    fn draws(&self) {
+    pub fn draws(&self) {
         let mut page = self.socket();
         page.send(1, SHOT.as_bytes());
         let started = Instant::now();

@@ -5,5 +5,12 @@ export const shader = async (name) => (await fetch(`page/shaders/${name}${locati
 
 export const orderWorker = () => new Worker(`page/js/local/order.js${location.search}`, { type: "module" });
 
+/** Which splats of a version are selected, a bit each in the order of the compact form; null if they are not known yet.
+ * @param {number} version @returns {Promise<Uint8Array | null>} */
+export async function openMask(version) {
+  const response = await fetch(`selection/${version}${location.search}`);
+  return response.ok ? new Uint8Array(await response.arrayBuffer()) : null;
+}
+
 /** The scene in compact form. @param {AbortSignal} signal */
 export const openSplats = (signal) => fetch(`splats${location.search}`, { signal });

@@ -1,7 +1,7 @@
 // Draws splats with WebGL2: one pass projects every splat into a texture, another blends a quad for each, farthest first.
 
 import { axes } from "../math.js";
-import { openSplats, orderWorker, shader } from "./assets.js";
+import { openMask, openSplats, orderWorker, shader } from "./assets.js";
 import { readSplats } from "./stream.js";
 
 /** @typedef {import("../camera.js").Camera} Camera */
@@ -18,6 +18,10 @@ const SHAPES = ["color", "ellipses", "rings", "points"];
 const REST = 100;
 /** Milliseconds of a moving picture. */
 const BUDGET = 33;
+/** Milliseconds for which a newer version may be awaited whole. */
+const PATIENCE = 1500;
+/** Milliseconds until a selection that came before its splats is asked for again. */
+const RETRY = 100;
 
 export class LocalRenderer {
   works = false;
@@ -43,6 +47,12 @@ export class LocalRenderer {
   sharp = false;
   busy = false;
   generation = 0;
+  /** The selection to show, and the one that is shown. */
+  mask = 0;
+  masked = 0;
+  /** Whether some version has been shown whole, and when the present one began to arrive. */
+  complete = false;
+  beganAt = 0;
   sortMilliseconds = 0;
   drawn = 0;
 
@@ -82,6 +92,44 @@ export class LocalRenderer {
     gl.bindVertexArray(null);
   }
 
+  /** Shows a selection by its number, 0 for none. @param {number} mask */
+  select(mask) {
+    this.mask = mask;
+    this.fetchMask();
+  }
+
+  /** Fetches the selection once all splats are here. */
+  async fetchMask() {
+    const gl = this.gl;
+    if (!gl || !this.selected || this.masked === this.mask || this.fetching || this.loaded < this.total) return;
+    this.fetching = true;
+    const [mask, generation] = [this.mask, this.generation];
+    try {
+      const bits = mask ? await openMask(this.version) : new Uint8Array(0);
+      if (bits && generation === this.generation) {
+        const bytes = new Uint8Array(ROW * Math.max(1, Math.ceil(this.total / ROW)));
+        for (let i = 0; i < this.total && i < 8 * bits.length; i += 1) bytes[i] = (bits[i >> 3] >> (i & 7)) & 1;
+        gl.bindTexture(gl.TEXTURE_2D, this.selected);
+        gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, ROW, bytes.length / ROW, gl.RED_INTEGER, gl.UNSIGNED_BYTE, bytes);
+        this.masked = mask;
+        this.redraw();
+      }
+    } catch (error) {
+      this.report(String(error));
+      this.masked = mask;
+    }
+    this.fetching = false;
+    if (this.masked !== this.mask) setTimeout(() => this.fetchMask(), RETRY);
+  }
+
+  /** Paints the same picture again. */
+  redraw() {
+    this.changedAt = performance.now();
+    this.sharp = false;
+    this.fresh = true;
+    this.dirty();
+  }
+
   /** Loads a version of the scene, once local drawing is wanted. @param {import("../state.js").Scene | null} scene */
   load(scene) {
     this.scene = scene;
@@ -114,9 +162,11 @@ export class LocalRenderer {
       this.dirty();
       throw new Error("there are more splats than this browser can draw");
     }
-    for (const texture of [this.cores, this.bands, this.place, this.look, this.order]) if (texture) gl.deleteTexture(texture);
+    for (const texture of [this.cores, this.bands, this.selected, this.place, this.look, this.order]) if (texture) gl.deleteTexture(texture);
     this.cores = texture(gl, 2 * ROW, rows);
     this.bands = texture(gl, Math.max(1, degree) * ROW, degree ? rows : 1);
+    this.selected = texture(gl, ROW, rows, gl.R8UI);
+    this.masked = 0;
     this.place = texture(gl, ROW, rows);
     this.look = texture(gl, ROW, rows);
     this.order = texture(gl, ROW, rows, gl.R32UI);
@@ -125,6 +175,8 @@ export class LocalRenderer {
     gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, this.place, 0);
     gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT1, gl.TEXTURE_2D, this.look, 0);
     gl.drawBuffers([gl.COLOR_ATTACHMENT0, gl.COLOR_ATTACHMENT1]);
+    this.complete ||= this.total > 0 && this.loaded === this.total;
+    this.beganAt = performance.now();
     [this.loaded, this.total, this.degree, this.drawn] = [0, count, degree, 0];
     this.generation += 1;
     this.worker?.postMessage({ reserve: count });
@@ -150,6 +202,7 @@ export class LocalRenderer {
     this.sharp = false;
     this.sort();
     this.dirty();
+    this.fetchMask();
   }
 
   /** @param {Camera} camera @param {Intrinsics} k @param {any} shot */
@@ -195,6 +248,8 @@ export class LocalRenderer {
   draw(now) {
     const gl = this.gl;
     if (!gl || !this.wanted || !this.k || !this.target || !this.projecting || this.sharp) return false;
+    // A newer version replaces the picture when it is whole: half of it would flicker at each edit.
+    if (this.loaded < this.total && this.complete && now < this.beganAt + PATIENCE) return false;
     const moving = now - this.changedAt < REST || this.busy;
     if (moving && !this.fresh && this.painted === this.wanted) return false;
     const started = performance.now();
@@ -218,7 +273,7 @@ export class LocalRenderer {
     const scene = this.scene;
     const [width, height] = [Math.max(1, Math.round(k.width * share)), Math.max(1, Math.round(k.height * share))];
     if (this.canvas.width !== width || this.canvas.height !== height) [this.canvas.width, this.canvas.height] = [width, height];
-    this.project(gl, wanted.camera, { ...k, width, height, fx: (k.fx * width) / k.width, fy: (k.fy * height) / k.height, cx: (k.cx * width) / k.width, cy: (k.cy * height) / k.height }, wanted.shot.clip);
+    this.project(gl, wanted.camera, { ...k, width, height, fx: (k.fx * width) / k.width, fy: (k.fy * height) / k.height, cx: (k.cx * width) / k.width, cy: (k.cy * height) / k.height }, wanted.shot.clip, Boolean(wanted.shot.highlight));
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     gl.viewport(0, 0, width, height);
     const [r, g, b] = wanted.shot.background ?? scene?.background ?? [0, 0, 0];
@@ -237,14 +292,15 @@ export class LocalRenderer {
     this.wanted = { camera, shot: this.wanted?.shot ?? {} };
     this.k = k;
     this.sort();
-    this.project(gl, camera, k, null);
+    this.project(gl, camera, k, null, false);
     gl.bindFramebuffer(gl.FRAMEBUFFER, to);
     gl.viewport(x, y, width, height);
     this.blend(gl, width, height, 0);
   }
 
-  /** @param {WebGL2RenderingContext} gl @param {Camera} camera @param {Intrinsics} k @param {[Vec3, Vec3] | null} clip */
-  project(gl, camera, k, clip) {
+  /** @param {WebGL2RenderingContext} gl @param {Camera} camera @param {Intrinsics} k @param {[Vec3, Vec3] | null} clip
+   * @param {boolean} highlight whether selected splats are tinted */
+  project(gl, camera, k, clip, highlight) {
     const projecting = this.projecting;
     if (!projecting || !this.total) return;
     const [x, y, z] = axes(camera.rotation);
@@ -255,6 +311,8 @@ export class LocalRenderer {
     gl.useProgram(projecting.program);
     bind(gl, 0, this.cores, at("u_cores"));
     bind(gl, 1, this.bands, at("u_bands"));
+    bind(gl, 2, this.selected, at("u_selected"));
+    gl.uniform1i(at("u_highlight"), this.masked && highlight ? 1 : 0);
     gl.uniform1i(at("u_degree"), this.degree ?? 0);
     gl.uniform1i(at("u_count"), this.loaded);
     // Column by column: the camera's axes are the rows of camera from world.

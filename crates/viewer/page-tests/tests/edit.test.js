@@ -1,0 +1,256 @@
+// Editing in the page: tools, handles, undo, files. What the page does is what the program does with the list it saved.
+
+import assert from "node:assert/strict";
+import { join } from "node:path";
+import { cpSync, existsSync, readFileSync, readdirSync } from "node:fs";
+import { after, before, test } from "node:test";
+import { OUT, browse, get, open, picture, psnr, run, scratch, serve, set, sharp, stopAll, until } from "./harness.js";
+import { dataset, trained } from "./scenes.js";
+
+/** @type {import("playwright-core").Browser} */
+let browser;
+before(async () => (browser = await browse()));
+after(async () => {
+  stopAll();
+  await browser.close();
+});
+
+/** A copy of the run, so that what is saved disturbs no other test. @param {string} name */
+function copy(name) {
+  const out = join(scratch, name);
+  if (!existsSync(out)) cpSync(trained(), out, { recursive: true });
+  return out;
+}
+
+/** Waits until the server has done what was asked, and its picture is here. @param {(editing: any) => boolean} holds */
+async function edited(page, holds) {
+  const end = Date.now() + 120000;
+  for (;;) {
+    const editing = await get(page, "editing");
+    if (editing && !editing.busy && holds(editing)) break;
+    if (Date.now() > end) throw new Error(`it never held: ${holds} of ${JSON.stringify(editing)}`);
+    await page.waitForTimeout(30);
+  }
+  await page.waitForTimeout(150);
+  await sharp(page);
+}
+
+/** Drags along points, as shares of the stage. */
+async function drag(page, points, modifiers = []) {
+  const box = await page.locator("irr-stage .overlay").boundingBox();
+  const at = ([x, y]) => [box.x + x * box.width, box.y + y * box.height];
+  for (const key of modifiers) await page.keyboard.down(key);
+  await page.mouse.move(...at(points[0]));
+  await page.mouse.down();
+  for (const point of points.slice(1)) await page.mouse.move(...at(point), { steps: 6 });
+  await page.mouse.up();
+  for (const key of modifiers) await page.keyboard.up(key);
+}
+
+const LASSO = [[0.35, 0.3], [0.65, 0.3], [0.68, 0.6], [0.5, 0.7], [0.33, 0.6], [0.35, 0.32]];
+
+test("a lasso, a brush and a deletion; undo, save and download agree with the program", async () => {
+  const scene = copy("edited");
+  const server = await serve("view", scene, "--port", "0");
+  const { page, problems } = await open(browser, server.address);
+  const other = await open(browser, server.address, { width: 500, height: 400 });
+  await set(page, { drawing: "served", axes: false });
+  await page.getByRole("tab", { name: "Edit" }).click();
+  await sharp(page);
+  const opened = await picture(page);
+
+  await page.getByRole("button", { name: "Lasso" }).click();
+  await drag(page, LASSO);
+  await edited(page, (e) => e.selected > 0);
+  const lassoed = (await get(page, "editing")).selected;
+  const tinted = await picture(page);
+  assert.ok(psnr(opened, tinted) < 35, "the selection is seen");
+  await page.screenshot({ path: join(OUT, "edit-1440-dark.png") });
+  await page.getByRole("button", { name: "Brush" }).click();
+  await drag(page, [[0.5, 0.3], [0.5, 0.6]], ["Alt"]);
+  await edited(page, (e) => e.at === 2);
+  const selected = (await get(page, "editing")).selected;
+  assert.ok(selected > 0 && selected < lassoed, "Alt takes away");
+  await until(other.page, async (selected) => (await import("/page/js/state.js")).state.get("editing").selected === selected, selected);
+
+  await page.keyboard.press("Delete");
+  await edited(page, (e) => e.at === 3 && e.selected === 0);
+  const deleted = await picture(page);
+  assert.ok(psnr(opened, deleted) < 30, "the picture has changed");
+  await page.keyboard.press("Control+z");
+  await page.keyboard.press("Control+z");
+  await page.keyboard.press("Control+z");
+  await edited(page, (e) => e.at === 0);
+  assert.equal(psnr(opened, await picture(page)), Infinity, "undone to the bit");
+  for (let i = 0; i < 3; i += 1) await page.keyboard.press("Control+Shift+z");
+  await edited(page, (e) => e.at === 3);
+  assert.equal(psnr(deleted, await picture(page)), Infinity, "made again");
+  await page.getByRole("button", { name: "Before" }).click();
+  await edited(page, (e) => e.before);
+  assert.equal(psnr(opened, await picture(page)), Infinity, "as it was");
+  await page.getByRole("button", { name: "Before" }).click();
+  await edited(page, (e) => !e.before);
+
+  await page.getByRole("button", { name: "Save" }).click();
+  await edited(page, (e) => Boolean(e.saved));
+  assert.ok(existsSync(join(scene, "edits.toml")) && existsSync(join(scene, "scene.edited.ply")));
+  assert.match(readFileSync(join(scene, "edits.toml"), "utf8"), /op = "delete"/);
+  // The program makes the same scene of the list, and the page shows it as the same picture.
+  const replayed = join(scratch, "replayed.ply");
+  run("edit", join(scene, "scene.ply"), "-o", replayed, "--edits", join(scene, "edits.toml"));
+  assert.deepEqual(readFileSync(replayed), readFileSync(join(scene, "scene.edited.ply")));
+  const again = await serve("view", replayed, "--port", "0");
+  const shown = await open(browser, again.address);
+  await set(shown.page, { drawing: "served", axes: false, tab: "edit", camera: await get(page, "camera") });
+  await sharp(shown.page);
+  assert.ok(psnr(deleted, await picture(shown.page)) > 35);
+  await again.stop();
+
+  await page.getByLabel("Format of the download").selectOption("compressed.ply");
+  const [file] = await Promise.all([page.waitForEvent("download"), page.getByRole("button", { name: "Download" }).click()]);
+  const packed = join(scratch, file.suggestedFilename());
+  assert.equal(file.suggestedFilename(), "scene.compressed.ply");
+  await file.saveAs(packed);
+  run("convert", packed, join(scratch, "unpacked.ply"));
+  assert.deepEqual([...problems, ...other.problems], []);
+  await server.stop();
+});
+
+test("handles move what is selected, which stays selected, and a region is pulled", async () => {
+  const server = await serve("view", copy("moved"), "--port", "0");
+  const { page, problems } = await open(browser, server.address, { width: 1100, height: 760 });
+  await set(page, { drawing: "served", axes: false, tab: "edit", sidebar: true });
+  await page.getByRole("button", { name: "Rectangle" }).click();
+  await drag(page, [[0.4, 0.4], [0.6, 0.6]]);
+  await edited(page, (e) => e.selected > 0);
+  const { selected, box } = await get(page, "editing");
+  await page.getByRole("button", { name: "Rectangle" }).click();
+  await page.getByRole("group", { name: "Handles" }).getByRole("button", { name: "Move" }).click();
+  await sharp(page);
+  const middle = await page.evaluate(async (box) => {
+    const stage = document.querySelector("irr-stage");
+    const { project } = await import("/page/js/camera.js");
+    const at = project(stage.seen.camera, stage.seen.k, box[0].map((v, c) => (v + box[1][c]) / 2));
+    return [at[0] / stage.seen.k.width, at[1] / stage.seen.k.height];
+  }, box);
+  await drag(page, [middle, [middle[0] + 0.1, middle[1]]]);
+  await edited(page, (e) => e.at === 2);
+  const moved = await get(page, "editing");
+  assert.equal(moved.selected, selected, "the same splats");
+  assert.ok(Math.hypot(...moved.box[0].map((v, c) => v - box[0][c])) > 0.01);
+  await page.getByRole("group", { name: "Handles" }).getByRole("button", { name: "Scale" }).click();
+  await drag(page, [[middle[0] + 0.1, middle[1]], [middle[0] + 0.15, middle[1] - 0.05]]);
+  await edited(page, (e) => e.at === 3);
+  const scaled = await get(page, "editing");
+  assert.equal(scaled.selected, selected);
+  const size = (box) => Math.hypot(...box[1].map((v, c) => v - box[0][c]));
+  assert.ok(size(scaled.box) > 1.05 * size(moved.box));
+
+  // Sliders: one entry of the list for all moves of a slider.
+  await page.getByLabel("Exposure").fill("1");
+  await page.getByLabel("Exposure").fill("2");
+  await edited(page, (e) => e.at === 4);
+  assert.match((await get(page, "editing")).entries[3].text, /^Recolour/);
+  await page.getByLabel("Exposure").fill("0.5");
+  await edited(page, (e) => !e.busy);
+  assert.equal((await get(page, "editing")).total, 4);
+
+  await page.getByRole("button", { name: "Box" }).click();
+  await edited(page, (e) => e.at === 5);
+  const before = (await get(page, "editing")).selected;
+  await set(page, { region: { ...(await get(page, "region")), half: [9, 9, 9] } });
+  await edited(page, (e) => e.selected > before);
+  assert.equal((await get(page, "editing")).at, 5, "one entry while it is pulled");
+  await page.getByRole("button", { name: "Split off" }).click();
+  await edited(page, (e) => e.at === 6);
+  await page.keyboard.press("Control+z");
+  await edited(page, (e) => e.at === 5 && e.selected > 0);
+  assert.deepEqual(problems, []);
+  await server.stop();
+});
+
+test("turning the scene upright keeps the picture, and views stay in place", async () => {
+  const server = await serve("view", copy("upright"), "--port", "0");
+  const { page, problems } = await open(browser, server.address, { width: 800, height: 560 });
+  await set(page, { drawing: "served", axes: false, tab: "edit", sidebar: true });
+  await sharp(page);
+  const opened = await picture(page);
+  const first = (await get(page, "views"))[0];
+  await page.getByRole("button", { name: "This view's up" }).click();
+  await edited(page, (e) => e.at === 1);
+  assert.ok(psnr(opened, await picture(page)) > 45, "the camera turns with the scene");
+  const up = await get(page, "up");
+  assert.ok(up[1] < -0.9999, `up is ${up}`);
+  // A page that opens now sees the same from the same place.
+  const late = await open(browser, server.address, { width: 800, height: 560 });
+  const placed = (page) => page.evaluate(async () => (await import("/page/js/state.js")).state.get("views").map((view) => view.position).flat());
+  const [here, there] = [await placed(page), await placed(late.page)];
+  assert.ok(here.every((v, i) => Math.abs(v - there[i]) < 1e-6));
+  await set(late.page, { drawing: "served", axes: false, tab: "edit", sidebar: true, camera: await get(page, "camera") });
+  await sharp(late.page);
+  assert.ok(psnr(await picture(page), await picture(late.page)) > 50);
+  const turned = (await get(page, "views"))[0];
+  assert.ok(Math.hypot(...turned.position.map((v, c) => v - first.position[c])) > 1e-3);
+  await page.keyboard.press("Control+z");
+  await edited(page, (e) => e.at === 0);
+  assert.ok(psnr(opened, await picture(page)) > 60);
+  assert.deepEqual(problems, []);
+  await server.stop();
+});
+
+test("a page that draws itself shows the selection and the edit", async () => {
+  const local = await browse({ webgl: true });
+  const server = await serve("view", copy("local"), "--port", "0");
+  const { page, problems } = await open(local, server.address, { width: 800, height: 560 });
+  await set(page, { drawing: "local", axes: false, tab: "edit", sidebar: true });
+  await sharp(page);
+  const opened = await picture(page);
+  await page.getByRole("button", { name: "Rectangle" }).click();
+  await drag(page, [[0.4, 0.4], [0.6, 0.6]]);
+  await until(page, () => document.querySelector("irr-stage").local.masked > 0);
+  await sharp(page);
+  const tinted = await picture(page);
+  assert.ok(psnr(opened, tinted) < 35);
+  await set(page, { drawing: "served" });
+  await sharp(page);
+  assert.ok(psnr(tinted, await picture(page)) > 35, "here as on the server");
+  await set(page, { drawing: "local" });
+  await page.keyboard.press("Delete");
+  await edited(page, (e) => e.at === 2);
+  await until(page, () => document.querySelector("irr-stage").local.complete && document.querySelector("irr-stage").local.masked === 0);
+  await sharp(page);
+  const deleted = await picture(page);
+  assert.ok(psnr(opened, deleted) < 30);
+  await set(page, { drawing: "served" });
+  await sharp(page);
+  assert.ok(psnr(deleted, await picture(page)) > 35, "here as on the server");
+  assert.deepEqual(problems, []);
+  await server.stop();
+  await local.close();
+});
+
+test("what cannot be edited says so, and the panel fits a telephone", async () => {
+  const server = await serve("view", dataset(), "--port", "0");
+  const { page } = await open(browser, server.address, { width: 500, height: 400 });
+  await set(page, { tab: "edit", sidebar: true });
+  await page.getByText("A dataset has no splats to edit").waitFor();
+  assert.equal(await page.getByRole("button", { name: "Lasso" }).count(), 0);
+  await server.stop();
+
+  const scene = await serve("view", copy("small"), "--port", "0");
+  for (const theme of ["dark", "light"]) {
+    const small = await open(browser, scene.address, { width: 360, height: 740, theme });
+    await set(small.page, { tab: "edit", sidebar: true });
+    await small.page.getByRole("button", { name: "Lasso" }).click();
+    await drag(small.page, LASSO);
+    await edited(small.page, (e) => e.selected > 0);
+    await small.page.screenshot({ path: join(OUT, `edit-360-${theme}.png`) });
+    const wide = await small.page.evaluate(() => [...document.querySelectorAll("irr-edit-panel *")].filter((e) => e.getBoundingClientRect().right > innerWidth + 0.5).map((e) => e.outerHTML.slice(0, 80)));
+    assert.deepEqual(wide, [], "nothing is cut off");
+    const unnamed = await small.page.evaluate(() => [...document.querySelectorAll("irr-edit-panel button, irr-edit-panel input, irr-edit-panel select")]
+      .filter((e) => !e.textContent?.trim() && !e.getAttribute("aria-label") && !/** @type {any} */ (e).labels?.length).map((e) => e.outerHTML.slice(0, 80)));
+    assert.deepEqual(unnamed, [], "everything has a name");
+  }
+  await scene.stop();
+  assert.ok(readdirSync(OUT).includes("edit-360-dark.png"));
+});

@@ -1,0 +1,103 @@
+// The editing session, which all pages share: what this page asks of it. What it answers is in `state.editing`.
+
+import { connection } from "../connection.js";
+import { state } from "../state.js";
+
+/** @typedef {import("../math.js").Vec3} Vec3 */
+/** One entry of the list. @typedef {{ kind: "select" | "edit", text: string }} Entry */
+/** What the server says of the session: how many splats are selected, of how many, and the box around nearly all of them; the list, of which the
+ * first `at` entries are made, from number `first` on; the gesture of the last one made.
+ * @typedef {{ selected: number, of: number, hidden: number, locked: number, box: [Vec3, Vec3] | null, at: number, first: number,
+ *   total: number, entries: Entry[], gesture: number, before: boolean, busy: boolean, mask: number, saved: string | null }} Editing */
+/** How a shape changes the selection. @typedef {"replace" | "add" | "subtract" | "intersect"} Mode */
+
+class Session {
+  /** Gestures of two pages differ. */
+  gestures = Math.floor(Math.random() * 2 ** 30) * 2 ** 20;
+  /** The last one that this page has sent. */
+  newest = 0;
+  /** @type {Map<string, number>} */
+  held = new Map();
+
+  /** A number for what belongs together, such as the moves of one slider: a request with the gesture of the last entry replaces it. */
+  gesture() {
+    return (this.gestures += 1);
+  }
+
+  /** The gesture of a control, a new one if something else has been done since. @param {string} name */
+  live(name) {
+    const known = this.held.get(name) ?? 0;
+    const gesture = known && known === this.newest ? known : this.gesture();
+    this.held.set(name, gesture);
+    return gesture;
+  }
+
+  /** The next use of a control is a new gesture. @param {string} name */
+  renew(name) {
+    this.held.delete(name);
+  }
+
+  /** Whether the last entry of the list is of a control. @param {string} name */
+  isLive(name) {
+    const known = this.held.get(name);
+    return Boolean(known) && known === this.newest && (known === state.get("editing")?.gesture || this.pending);
+  }
+
+  /** Whether the answer to the newest request is still on its way. */
+  pending = false;
+
+  /** @param {object} request */
+  send(request) {
+    this.newest = /** @type {{ gesture?: number }} */ (request).gesture ?? 0;
+    this.pending = true;
+    connection.send(request);
+  }
+
+  /** Of several shapes, all but the first change what is selected so far. @param {object[]} shapes as crate `edit` names them, in the
+   * page's coordinates @param {Mode} mode @param {number} [gesture] */
+  select(shapes, mode, gesture = this.gesture()) {
+    const first = mode === "replace" ? "add" : mode;
+    const steps = shapes.map((shape, i) => ({ mode: i ? "add" : first, ...shape }));
+    this.send({ do: "select", gesture, replace: mode === "replace", steps });
+  }
+
+  deselect() {
+    if (state.get("editing")?.selected) this.send({ do: "deselect" });
+  }
+
+  /** @param {object} op as crate `edit` names it, in the page's coordinates @param {boolean} [whole] the scene, not what is selected
+   * @param {number} [gesture] */
+  edit(op, whole = false, gesture = this.gesture()) {
+    this.send({ do: "edit", gesture, whole, edit: op });
+  }
+
+  undo() {
+    this.send({ do: "undo" });
+  }
+
+  redo() {
+    this.send({ do: "redo" });
+  }
+
+  /** To after the first `at` entries of the list. @param {number} at */
+  go(at) {
+    this.send({ do: "go", at });
+  }
+
+  /** Shows the scene as it was opened, or as it is now. @param {boolean} before */
+  compare(before) {
+    connection.send({ do: "compare", before });
+  }
+
+  save() {
+    connection.send({ do: "save" });
+  }
+
+  /** Whether the scene can be edited. */
+  get works() {
+    return state.get("hello")?.editing?.works === true;
+  }
+}
+
+export const session = new Session();
+state.addEventListener("editing", () => (session.pending &&= state.get("editing")?.busy === true));

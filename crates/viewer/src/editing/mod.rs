@@ -1,0 +1,139 @@
+//! Editing from the pages: one session on a finished scene of splats, which all pages share. What they ask for waits in a queue; a
+//! thread of its own does it, shows the scene that results and tells every page.
+
+mod save;
+mod session;
+mod work;
+mod world;
+
+use crate::message::EditRequest;
+use irradia_edit::{Draft, EditError, EditList};
+use irradia_runs::formats::{FormatError, read_splats};
+use irradia_scene::GaussianCloud;
+use serde_json::Value;
+use std::collections::VecDeque;
+use std::path::PathBuf;
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use tokio::sync::watch;
+
+pub(crate) use save::stem_of;
+pub(crate) use work::work;
+pub(crate) use world::placed;
+
+/// Requests that wait.
+const WAITING: usize = 64;
+
+/// Why a request of a page is not fulfilled.
+#[derive(Debug, thiserror::Error)]
+pub(crate) enum EditingError {
+    #[error(transparent)]
+    Edit(#[from] EditError),
+    #[error(transparent)]
+    Format(#[from] FormatError),
+}
+
+#[derive(Default)]
+struct Queue {
+    waiting: VecDeque<(u64, EditRequest)>,
+    closing: bool,
+}
+
+/// The scene as it is edited, and the list of edits.
+type Current = (Arc<Draft>, Arc<EditList>);
+
+pub(crate) struct Editing {
+    /// The file of the scene.
+    pub source: PathBuf,
+    queue: Mutex<Queue>,
+    asked: Condvar,
+    /// What the pages are told.
+    told: watch::Sender<Arc<Value>>,
+    /// `None` before the first request.
+    current: Mutex<Option<Current>>,
+}
+
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+impl Editing {
+    /// Of the scene in the file `source`, which has so many splats.
+    pub fn new(source: PathBuf, splats: usize) -> Self {
+        Self {
+            source,
+            queue: Mutex::default(),
+            asked: Condvar::new(),
+            told: watch::Sender::new(Arc::new(work::untouched(splats))),
+            current: Mutex::default(),
+        }
+    }
+
+    /// What the pages are told, now and at every change.
+    pub fn watch(&self) -> watch::Receiver<Arc<Value>> {
+        self.told.subscribe()
+    }
+
+    fn tell(&self, told: Value) {
+        self.told.send_replace(Arc::new(told));
+    }
+
+    /// Adds a request of a page, in place of a waiting one of the same gesture. Whether there was room.
+    pub fn ask(&self, seat: u64, request: EditRequest) -> bool {
+        let mut queue = lock(&self.queue);
+        let last = queue.waiting.back().and_then(|(_, last)| last.gesture());
+        if last.is_some() && last == request.gesture() {
+            queue.waiting.pop_back();
+        }
+        if queue.waiting.len() >= WAITING {
+            return false;
+        }
+        queue.waiting.push_back((seat, request));
+        drop(queue);
+        self.asked.notify_all();
+        true
+    }
+
+    /// Waits for the next request; `None` when closing.
+    fn next(&self) -> Option<(u64, EditRequest)> {
+        let mut queue = lock(&self.queue);
+        loop {
+            if queue.closing {
+                return None;
+            }
+            if let Some(next) = queue.waiting.pop_front() {
+                return Some(next);
+            }
+            queue = self.asked.wait(queue).unwrap_or_else(PoisonError::into_inner);
+        }
+    }
+
+    pub fn close(&self) {
+        lock(&self.queue).closing = true;
+        self.asked.notify_all();
+    }
+
+    fn keep(&self, draft: &Arc<Draft>, list: EditList) {
+        *lock(&self.current) = Some((draft.clone(), Arc::new(list)));
+    }
+
+    fn current(&self) -> Option<Current> {
+        lock(&self.current).clone()
+    }
+
+    /// The splats to write.
+    ///
+    /// # Errors
+    /// When nothing has been edited, and the file of the scene cannot be read any more.
+    pub fn cloud(&self) -> Result<GaussianCloud, FormatError> {
+        match self.current() {
+            Some((draft, _)) => Ok(draft.shown()),
+            None => read_splats(&self.source),
+        }
+    }
+
+    /// The list of edits as TOML.
+    pub fn list(&self) -> String {
+        self.current()
+            .map_or_else(|| EditList::default().to_toml(), |(_, list)| list.to_toml())
+    }
+}

@@ -1,0 +1,93 @@
+//! Writes the list of edits and the scene beside the file that was opened, which is never replaced.
+
+use super::EditingError;
+use super::session::Session;
+use irradia_runs::RunFolder;
+use irradia_runs::formats::{write_atomic, write_splats};
+use std::path::{Path, PathBuf};
+
+/// Where a session has been saved.
+#[derive(Clone, Debug)]
+pub(super) struct Saved {
+    list: PathBuf,
+    scene: PathBuf,
+    parts: usize,
+}
+
+impl Saved {
+    /// In words.
+    pub fn line(&self) -> String {
+        let name = |path: &Path| {
+            path.file_name()
+                .map(|name| name.to_string_lossy().into_owned())
+                .unwrap_or_default()
+        };
+        let parts = match self.parts {
+            0 => String::new(),
+            1 => " and a part".to_owned(),
+            count => format!(" and {count} parts"),
+        };
+        format!("saved {} and {}{parts}", name(&self.list), name(&self.scene))
+    }
+}
+
+/// The name of a scene's file without its format; of a folder of images that of the folder.
+pub(crate) fn stem_of(source: &Path) -> String {
+    let path = match source.file_name().is_some_and(|name| name == "meta.json") {
+        true => source.parent().unwrap_or(source),
+        false => source,
+    };
+    let name = path
+        .file_name()
+        .map(|name| name.to_string_lossy().into_owned())
+        .unwrap_or_default();
+    let stem = name.split('.').next().unwrap_or_default();
+    if stem.is_empty() {
+        "scene".to_owned()
+    } else {
+        stem.to_owned()
+    }
+}
+
+/// Writes the list, the scene and the scenes that were split off; to the same files as before if the session was saved.
+pub(super) fn save(session: &Session, source: &Path, before: Option<&Saved>) -> Result<Saved, EditingError> {
+    let stem = stem_of(source);
+    let folder = match source.file_name().is_some_and(|name| name == "meta.json") {
+        true => source.parent().and_then(Path::parent),
+        false => source.parent(),
+    };
+    let folder = folder.unwrap_or(Path::new(""));
+    let is_run = RunFolder::containing(source).is_some();
+    let names = |number: usize| {
+        let end = if number == 1 {
+            String::new()
+        } else {
+            format!("-{number}")
+        };
+        let list = if is_run {
+            format!("edits{end}.toml")
+        } else {
+            format!("{stem}.edits{end}.toml")
+        };
+        (folder.join(list), folder.join(format!("{stem}.edited{end}.ply")))
+    };
+    let (list, scene) = match before {
+        Some(before) => (before.list.clone(), before.scene.clone()),
+        None => (1..)
+            .map(names)
+            .find(|(list, scene)| !list.exists() && !scene.exists())
+            .expect("some number is free"),
+    };
+    let parts = session.parts()?;
+    write_splats(&scene, &session.draft().shown())?;
+    for (name, part) in &parts {
+        write_splats(&scene.with_extension(format!("{name}.ply")), part)?;
+    }
+    let text = session.list().to_toml();
+    write_atomic(&list, |out| out.write_all(text.as_bytes()))?;
+    Ok(Saved {
+        list,
+        scene,
+        parts: parts.len(),
+    })
+}

@@ -1,0 +1,634 @@
+//! A scene with a list of what was done to it: selections and edits, of which the first are made.
+
+use super::world::{operation_to_dataset, placement, step_to_dataset};
+use irradia_edit::{
+    Draft, Edit, EditError, EditList, Mode, Operation, SelectStep, Selection, Shape, Transform, apply, floater_scores,
+    open_nothing, select,
+};
+use irradia_scene::{GaussianCloud, Similarity};
+use std::sync::Arc;
+
+/// Bytes of earlier states that are kept, so that an undo is at once; beyond them it makes the edits again.
+const KEPT_BYTES: usize = 1 << 30;
+/// Entries of the list. A selection may take 60 kB.
+const MOST_ENTRIES: usize = 20_000;
+/// Numbers of all selections in the list.
+const MOST_POINTS: usize = 8_000_000;
+
+/// What was done.
+#[derive(Clone, Debug)]
+enum Deed {
+    Select {
+        steps: Vec<SelectStep>,
+        replace: bool,
+    },
+    Deselect,
+    /// An edit with everything that was found written out, and how it moved the whole scene.
+    Edit(Edit, Option<Transform>),
+}
+
+#[derive(Clone, Debug)]
+struct Entry {
+    /// Entries of the same gesture replace each other.
+    gesture: u64,
+    text: String,
+    deed: Deed,
+}
+
+/// A state after a number of edits.
+struct Kept {
+    edits: usize,
+    draft: Arc<Draft>,
+}
+
+pub(crate) struct Session {
+    entries: Vec<Entry>,
+    /// Number of entries that are made.
+    at: usize,
+    draft: Arc<Draft>,
+    /// The scene as it was opened, then newer states, oldest first.
+    kept: Vec<Kept>,
+    /// How the present selection came about.
+    steps: Vec<SelectStep>,
+    selected: Arc<Selection>,
+    /// How much each splat of a state is a floater.
+    scores: Option<(Arc<Draft>, Vec<f32>)>,
+}
+
+/// An entry as pages list it.
+pub(crate) struct Listed<'a> {
+    pub is_edit: bool,
+    pub text: &'a str,
+}
+
+impl Session {
+    /// Nothing done to a scene.
+    pub fn new(draft: Draft) -> Self {
+        let draft = Arc::new(draft);
+        Self {
+            entries: Vec::new(),
+            at: 0,
+            selected: Arc::new(Selection::none(draft.len())),
+            kept: vec![Kept {
+                edits: 0,
+                draft: draft.clone(),
+            }],
+            draft,
+            steps: Vec::new(),
+            scores: None,
+        }
+    }
+
+    pub fn draft(&self) -> &Arc<Draft> {
+        &self.draft
+    }
+
+    /// The scene as it was opened.
+    pub fn original(&self) -> &Arc<Draft> {
+        &self.kept[0].draft
+    }
+
+    /// Of [`Self::draft`].
+    pub fn selected(&self) -> &Arc<Selection> {
+        &self.selected
+    }
+
+    /// Number of entries that are made.
+    pub fn at(&self) -> usize {
+        self.at
+    }
+
+    /// All entries, those undone included.
+    pub fn entries(&self) -> impl ExactSizeIterator<Item = Listed<'_>> {
+        self.entries.iter().map(|entry| Listed {
+            is_edit: matches!(entry.deed, Deed::Edit(..)),
+            text: &entry.text,
+        })
+    }
+
+    /// The gesture of the entry made last; 0 if there is none.
+    pub fn gesture(&self) -> u64 {
+        self.at.checked_sub(1).map_or(0, |last| self.entries[last].gesture)
+    }
+
+    fn edits(&self) -> impl Iterator<Item = &Edit> {
+        self.entries[..self.at].iter().filter_map(|entry| match &entry.deed {
+            Deed::Edit(edit, _) => Some(edit),
+            _ => None,
+        })
+    }
+
+    /// The edits that are made.
+    pub fn list(&self) -> EditList {
+        EditList {
+            edits: self.edits().cloned().collect(),
+            ..EditList::default()
+        }
+    }
+
+    /// From the world of the scene as it was opened to the present one.
+    pub fn placement(&self) -> Transform {
+        let moved = self.entries[..self.at].iter().filter_map(|entry| match &entry.deed {
+            Deed::Edit(_, moved) => moved.as_ref(),
+            _ => None,
+        });
+        let moved = moved.fold(Transform::IDENTITY, |all, next| all.then(next));
+        placement(&self.original().cloud.world_from_dataset, &moved, self.world())
+    }
+
+    fn world(&self) -> &Similarity {
+        &self.draft.cloud.world_from_dataset
+    }
+
+    /// Selects; `steps` are in the world of the draft.
+    ///
+    /// # Errors
+    /// When they cannot be evaluated, or there is nothing to subtract from or to intersect with.
+    pub fn select(&mut self, gesture: u64, replace: bool, mut steps: Vec<SelectStep>) -> Result<(), EditError> {
+        self.has_room(&steps)?;
+        let world = *self.world();
+        steps.iter_mut().for_each(|step| step_to_dataset(step, &world));
+        self.in_place_of(gesture, |session| {
+            let before = if replace { Vec::new() } else { session.steps.clone() };
+            if before.is_empty() && steps.first().is_none_or(|step| step.mode != Mode::Add) {
+                return Err(EditError::Selection("nothing is selected to take away from".to_owned()));
+            }
+            let all = [&before[..], &steps].concat();
+            let selected = session.evaluate(&all, before.len())?;
+            let text = select_text(&steps, replace);
+            session.push(gesture, text, Deed::Select { steps, replace });
+            (session.steps, session.selected) = (all, Arc::new(selected));
+            Ok(())
+        })
+    }
+
+    /// What `steps` select, of which the first `known` give the present selection.
+    fn evaluate(&mut self, steps: &[SelectStep], known: usize) -> Result<Selection, EditError> {
+        let is_simple = |step: &SelectStep| {
+            !matches!(
+                step.shape,
+                Shape::Invert {} | Shape::Grow { .. } | Shape::Connected { .. }
+            )
+        };
+        if !steps[known..].iter().all(is_simple) {
+            return select(&self.draft, steps);
+        }
+        // A hundred strokes of a brush are not evaluated again for each further one.
+        let mut selected = match known {
+            0 => Selection::none(self.draft.len()),
+            _ => (*self.selected).clone(),
+        };
+        for step in &steps[known..] {
+            let alone = self.alone(&step.shape)?;
+            match step.mode {
+                Mode::Add => selected.add(&alone),
+                Mode::Subtract => selected.subtract(&alone),
+                Mode::Intersect => selected.intersect(&alone),
+            }
+        }
+        Ok(selected)
+    }
+
+    /// What a shape selects.
+    fn alone(&mut self, shape: &Shape) -> Result<Selection, EditError> {
+        let Shape::Floaters { score } = shape else {
+            return select(&self.draft, &[SelectStep::add(shape.clone())]);
+        };
+        // A slider of the least score asks for the same scores, which take seconds.
+        let kept = self.scores.take().filter(|(draft, _)| Arc::ptr_eq(draft, &self.draft));
+        let (draft, scores) = kept.unwrap_or_else(|| {
+            let scores = floater_scores(&self.draft);
+            (self.draft.clone(), scores.iter().map(|scores| scores.score()).collect())
+        });
+        let least = score.unwrap_or(1.0) as f32;
+        let mut selected = Selection::of(draft.len(), |i| scores[i] >= least);
+        selected.subtract(&draft.hidden);
+        selected.subtract(&draft.locked);
+        self.scores = Some((draft, scores));
+        Ok(selected)
+    }
+
+    /// Selects nothing.
+    pub fn deselect(&mut self) {
+        if self.steps.is_empty() {
+            return;
+        }
+        self.push(0, "Deselect".to_owned(), Deed::Deselect);
+        (self.steps, self.selected) = (Vec::new(), Arc::new(Selection::none(self.draft.len())));
+    }
+
+    /// Makes an edit of the selection, or of the `whole` scene; `op` is in the world of the draft.
+    ///
+    /// # Errors
+    /// When nothing is selected, or the edit is not possible; nothing has changed then.
+    pub fn edit(&mut self, gesture: u64, whole: bool, mut op: Operation) -> Result<(), EditError> {
+        self.has_room(&[])?;
+        operation_to_dataset(&mut op, self.world());
+        self.in_place_of(gesture, |session| {
+            if !whole && session.selected.is_empty() {
+                return Err(EditError::Selection("nothing is selected".to_owned()));
+            }
+            if let Operation::Split { name } = &mut op {
+                let parts = session
+                    .edits()
+                    .filter(|edit| matches!(edit.op, Operation::Split { .. }));
+                *name = format!("part-{}", parts.count() + 1);
+            }
+            let edit = Edit {
+                op,
+                select: (!whole).then(|| session.steps.clone()),
+            };
+            let mut draft = (*session.draft).clone();
+            let applied = apply(&mut draft, &edit, &open_nothing)?;
+            let text = edit_text(&applied.edit.op, applied.selected, session.draft.len(), draft.len());
+            session.push(gesture, text, Deed::Edit(applied.edit, applied.moved));
+            session.set_draft(Arc::new(draft));
+            session.steps = session.steps_at(session.at);
+            session.selected = Arc::new(select(&session.draft, &session.steps)?);
+            Ok(())
+        })
+    }
+
+    fn has_room(&self, steps: &[SelectStep]) -> Result<(), EditError> {
+        let points = |steps: &[SelectStep]| steps.iter().map(points_of).sum::<usize>();
+        let all: usize = self
+            .entries
+            .iter()
+            .map(|entry| match &entry.deed {
+                Deed::Select { steps, .. } => points(steps),
+                Deed::Edit(edit, _) => points(edit.select.as_deref().unwrap_or_default()),
+                Deed::Deselect => 0,
+            })
+            .sum();
+        if self.entries.len() >= MOST_ENTRIES || all + points(steps) > MOST_POINTS {
+            let message = "the list of edits is full: save the scene and open what was saved";
+            return Err(EditError::Scene(message.to_owned()));
+        }
+        Ok(())
+    }
+
+    /// Does `next` instead of the last entry if that is of the same gesture; if it fails, the last entry stays.
+    fn in_place_of(
+        &mut self,
+        gesture: u64,
+        next: impl FnOnce(&mut Self) -> Result<(), EditError>,
+    ) -> Result<(), EditError> {
+        let replaces = gesture != 0 && self.at == self.entries.len() && self.gesture() == gesture;
+        if !replaces {
+            return next(self);
+        }
+        self.go(self.at - 1)?;
+        let outcome = next(self);
+        if outcome.is_err() {
+            self.go(self.at + 1)?;
+        }
+        outcome
+    }
+
+    fn push(&mut self, gesture: u64, text: String, deed: Deed) {
+        let edits = self.edits().count();
+        self.kept.retain(|kept| kept.edits <= edits);
+        self.entries.truncate(self.at);
+        self.entries.push(Entry { gesture, text, deed });
+        self.at += 1;
+    }
+
+    /// Sets the state after the present edits, and keeps it.
+    fn set_draft(&mut self, draft: Arc<Draft>) {
+        let edits = self.edits().count();
+        self.draft = draft.clone();
+        if self.kept.iter().all(|kept| kept.edits != edits) {
+            self.kept.push(Kept { edits, draft });
+            self.kept.sort_unstable_by_key(|kept| kept.edits);
+        }
+        let bytes = |kept: &[Kept]| kept.iter().map(|kept| bytes_of(&kept.draft.cloud)).sum::<usize>();
+        // The opened scene and the last two states stay.
+        while self.kept.len() > 3 && bytes(&self.kept) > KEPT_BYTES {
+            self.kept.remove(1);
+        }
+    }
+
+    /// The steps of the selection after the first `at` entries.
+    fn steps_at(&self, at: usize) -> Vec<SelectStep> {
+        let mut steps = Vec::new();
+        for entry in &self.entries[..at] {
+            match &entry.deed {
+                Deed::Select { steps: more, replace } => {
+                    if *replace {
+                        steps.clear();
+                    }
+                    steps.extend_from_slice(more);
+                }
+                Deed::Deselect => steps.clear(),
+                Deed::Edit(edit, _) => {
+                    steps.clear();
+                    if edit.select.is_some() && leaves_selection(&edit.op) {
+                        steps.push(SelectStep::add(Shape::Last {}));
+                    }
+                }
+            }
+        }
+        steps
+    }
+
+    /// Undoes or makes again until the first `at` entries are made.
+    ///
+    /// # Errors
+    /// Those of the edits, which have been made before.
+    pub fn go(&mut self, at: usize) -> Result<(), EditError> {
+        let at = at.min(self.entries.len());
+        let before = self.edits().count();
+        self.at = at;
+        let edits = self.edits().count();
+        if edits != before {
+            let nearest = self.kept.iter().rfind(|kept| kept.edits <= edits);
+            let (mut made, mut draft) =
+                nearest.map_or((0, self.original().clone()), |kept| (kept.edits, kept.draft.clone()));
+            let again: Vec<Edit> = self.edits().skip(made).cloned().collect();
+            for edit in again {
+                apply(Arc::make_mut(&mut draft), &edit, &open_nothing)?;
+                made += 1;
+            }
+            debug_assert_eq!(made, edits);
+            self.set_draft(draft);
+        }
+        let steps = self.steps_at(at);
+        self.selected = Arc::new(self.evaluate(&steps, 0)?);
+        self.steps = steps;
+        Ok(())
+    }
+
+    /// The scenes that were split off, with their names.
+    ///
+    /// # Errors
+    /// Those of the edits, which have been made before.
+    pub fn parts(&self) -> Result<Vec<(String, GaussianCloud)>, EditError> {
+        let mut parts = Vec::new();
+        let edits: Vec<&Edit> = self.edits().collect();
+        let Some(last) = edits
+            .iter()
+            .rposition(|edit| matches!(edit.op, Operation::Split { .. }))
+        else {
+            return Ok(parts);
+        };
+        let mut draft = (**self.original()).clone();
+        for edit in &edits[..=last] {
+            parts.extend(apply(&mut draft, edit, &open_nothing)?.split);
+        }
+        Ok(parts)
+    }
+}
+
+/// Whether the splats of a selection are still there to go on with.
+fn leaves_selection(op: &Operation) -> bool {
+    matches!(
+        op,
+        Operation::Move { .. }
+            | Operation::Rotate { .. }
+            | Operation::Scale { .. }
+            | Operation::Duplicate { .. }
+            | Operation::Recolor { .. }
+            | Operation::Opacity { .. }
+    )
+}
+
+/// Numbers that a step takes.
+fn points_of(step: &SelectStep) -> usize {
+    match &step.shape {
+        Shape::Polygon { points, .. } | Shape::Brush { points, .. } => 16 + 2 * points.len(),
+        _ => 16,
+    }
+}
+
+fn bytes_of(cloud: &GaussianCloud) -> usize {
+    4 * cloud.len() * (11 + 3 * cloud.sh_coefficients())
+}
+
+/// A selection in the list.
+fn select_text(steps: &[SelectStep], replace: bool) -> String {
+    let Some(first) = steps.first() else {
+        return String::new();
+    };
+    let connected = steps.iter().find(|step| matches!(step.shape, Shape::Connected { .. }));
+    let named = &connected.unwrap_or(first).shape;
+    let name = match named {
+        Shape::All {} => "All",
+        Shape::Box { .. } => "Box",
+        Shape::Sphere { .. } => "Sphere",
+        Shape::HalfSpace { .. } => "Half-space",
+        Shape::Polygon { .. } => "Outline",
+        Shape::Brush { .. } => "Brush",
+        Shape::Color { .. } => "Colour",
+        Shape::Opacity { .. } => "Opacity",
+        Shape::Size { .. } => "Size",
+        Shape::Elongation { .. } => "Elongation",
+        Shape::Views { .. } => "Views",
+        Shape::Clusters { .. } => "Clusters",
+        Shape::Floaters { .. } => "Floaters",
+        Shape::Subject { .. } => "Subject",
+        Shape::Invert {} => "Invert",
+        Shape::Grow { .. } => "Grow",
+        Shape::Connected { .. } => "Connected",
+        Shape::Last {} => "Last",
+    };
+    match (replace, first.mode) {
+        (false, Mode::Add) if !matches!(named, Shape::Invert {} | Shape::Grow { .. } | Shape::Connected { .. }) => {
+            format!("+ {name}")
+        }
+        (_, Mode::Subtract) => format!("− {name}"),
+        (_, Mode::Intersect) => format!("∩ {name}"),
+        _ => name.to_owned(),
+    }
+}
+
+/// An edit of `selected` splats in the list.
+fn edit_text(op: &Operation, selected: usize, before: usize, after: usize) -> String {
+    let verb = match op {
+        Operation::Delete {} => return format!("Delete {}", before - after),
+        Operation::Keep {} => return format!("Keep {after}"),
+        Operation::Reduce { .. } => return format!("Reduce to {after}"),
+        Operation::Upright { .. } => return "Set upright".to_owned(),
+        Operation::SetLength { .. } => return "Set scale".to_owned(),
+        Operation::Merge { .. } => return "Merge".to_owned(),
+        Operation::Split { name } => return format!("Split off {name}"),
+        Operation::Show {} => return "Show all".to_owned(),
+        Operation::Unlock {} => return "Unlock all".to_owned(),
+        Operation::Move { .. } => "Move",
+        Operation::Rotate { .. } => "Rotate",
+        Operation::Scale { .. } => "Scale",
+        Operation::Duplicate { .. } => "Duplicate",
+        Operation::Recolor { .. } => "Recolour",
+        Operation::Opacity { .. } => "Opacity of",
+        Operation::Hide {} => "Hide",
+        Operation::Lock {} => "Lock",
+    };
+    format!("{verb} {selected}")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Splats at 0, 1, .. along x, in a world of half the dataset's unit.
+    fn session(n: usize) -> Session {
+        let draft = Draft::new(
+            GaussianCloud {
+                means: (0..n).map(|i| [i as f32, 0.0, 0.0]).collect(),
+                quats: vec![[1.0, 0.0, 0.0, 0.0]; n],
+                log_scales: vec![[-2.0; 3]; n],
+                opacity_logits: vec![1.0; n],
+                sh: vec![0.3; 3 * n],
+                world_from_dataset: Similarity {
+                    scale: 2.0,
+                    center: glam::DVec3::new(10.0, 0.0, 0.0),
+                },
+                ..GaussianCloud::default()
+            },
+            Vec::new(),
+        );
+        Session::new(draft)
+    }
+
+    fn ball(x: f64, radius: f64) -> Vec<SelectStep> {
+        vec![SelectStep::add(Shape::Sphere {
+            center: [x, 0.0, 0.0],
+            radius,
+        })]
+    }
+
+    fn selected(session: &Session) -> Vec<u32> {
+        session.selected().indices()
+    }
+
+    fn xs(session: &Session) -> Vec<f32> {
+        session.draft().cloud.means.iter().map(|mean| mean[0]).collect()
+    }
+
+    /// What the saved list makes of the scene as it was opened.
+    fn replayed(session: &Session) -> Draft {
+        let list = EditList::parse(&session.list().to_toml()).expect("a list");
+        let mut draft = (**session.original()).clone();
+        for edit in &list.edits {
+            apply(&mut draft, edit, &open_nothing).expect("possible");
+        }
+        draft
+    }
+
+    #[test]
+    fn a_selection_that_was_moved_is_moved_on_and_the_list_says_the_same() {
+        let mut session = session(6);
+        session.select(1, true, ball(1.0, 1.2)).expect("a ball");
+        assert_eq!(selected(&session), [0, 1, 2]);
+        // Onto splats that are not selected.
+        session
+            .edit(2, false, Operation::Move { by: [3.0, 0.0, 0.0] })
+            .expect("moved");
+        session
+            .edit(3, false, Operation::Move { by: [0.0, 1.0, 0.0] })
+            .expect("moved");
+        assert_eq!(
+            (selected(&session), xs(&session)),
+            (vec![0, 1, 2], vec![3.0, 4.0, 5.0, 3.0, 4.0, 5.0])
+        );
+        session
+            .edit(4, false, Operation::Duplicate { by: [0.0; 3] })
+            .expect("copied");
+        assert_eq!(selected(&session), [6, 7, 8], "the copies");
+        session
+            .edit(5, false, Operation::Move { by: [1.0, 0.0, 0.0] })
+            .expect("moved");
+        assert_eq!(replayed(&session), **session.draft());
+    }
+
+    #[test]
+    fn every_position_of_the_list_is_reached_from_every_other_one_and_a_gesture_is_one_entry() {
+        let mut session = session(8);
+        let mut states = vec![(session.draft().clone(), session.selected().clone())];
+        let mut then = |session: &Session| states.push((session.draft().clone(), session.selected().clone()));
+        session.select(1, true, ball(2.0, 1.2)).expect("a ball");
+        then(&session);
+        session.select(2, false, ball(6.0, 0.5)).expect("another");
+        then(&session);
+        for exposure in [0.3, 0.7, 1.0] {
+            let op = Operation::Recolor {
+                exposure,
+                temperature: 0.0,
+                tint: 0.0,
+                saturation: 1.0,
+                contrast: 1.0,
+            };
+            session.edit(3, false, op).expect("brighter");
+        }
+        then(&session);
+        session.edit(4, false, Operation::Delete {}).expect("deleted");
+        then(&session);
+        session
+            .edit(
+                5,
+                true,
+                Operation::Scale {
+                    factor: 2.0,
+                    about: None,
+                },
+            )
+            .expect("scaled");
+        then(&session);
+        assert_eq!((session.at(), session.entries().len(), states.len()), (5, 5, 6));
+        for forget in [false, true] {
+            for at in [0, 5, 3, 1, 4, 2, 5, 0] {
+                if forget {
+                    session.kept.truncate(1);
+                }
+                session.go(at).expect("made before");
+                assert_eq!(
+                    (&**session.draft(), &**session.selected()),
+                    (&*states[at].0, &*states[at].1),
+                    "{at}"
+                );
+            }
+        }
+        session.select(9, true, ball(0.0, 0.5)).expect("a ball");
+        assert_eq!(session.entries().len(), 1, "what was undone is forgotten");
+    }
+
+    #[test]
+    fn what_fails_changes_nothing() {
+        let mut session = session(3);
+        assert!(session.edit(1, false, Operation::Delete {}).is_err());
+        let subtracted = SelectStep {
+            mode: Mode::Subtract,
+            ..ball(0.0, 1.0)[0].clone()
+        };
+        assert!(session.select(1, false, vec![subtracted]).is_err());
+        session.select(7, true, ball(1.0, 0.5)).expect("a ball");
+        let views = SelectStep::add(Shape::Views {
+            min: Some(1),
+            max: None,
+        });
+        assert!(session.select(7, true, vec![views]).is_err(), "no cameras");
+        assert_eq!(
+            (session.at(), selected(&session)),
+            (1, vec![1]),
+            "the entry of the gesture is still there"
+        );
+    }
+
+    #[test]
+    fn a_part_that_was_split_off_is_found_again() {
+        let mut session = session(4);
+        session.select(1, true, ball(0.0, 1.2)).expect("a ball");
+        session
+            .edit(2, false, Operation::Split { name: "mine".into() })
+            .expect("split");
+        let parts = session.parts().expect("made before");
+        assert_eq!(
+            (
+                parts.len(),
+                parts[0].0.as_str(),
+                parts[0].1.len(),
+                session.draft().len()
+            ),
+            (1, "part-1", 2, 2)
+        );
+    }
+}

@@ -1,0 +1,213 @@
+//! The thread that edits.
+
+use super::save::{Saved, save};
+use super::session::Session;
+use super::{Editing, EditingError};
+use crate::message::EditRequest;
+use crate::subject::Subject;
+use irradia_edit::{Draft, Selection, Transform};
+use irradia_runs::Scene;
+use irradia_runs::formats::read_splats;
+use irradia_splat::{RenderOptions, Splats};
+use irradia_train::model::Model;
+use serde_json::{Value, json};
+use std::borrow::Cow;
+use std::sync::Arc;
+
+/// Entries of the list that pages are told: those around the last one made.
+const LISTED: usize = 120;
+
+/// A session and what is shown of it.
+struct Bench {
+    session: Session,
+    options: RenderOptions,
+    /// Whether the scene is shown as it was opened.
+    before: bool,
+    saved: Option<Saved>,
+    /// What was shown last: splats, selection and its number, which is 0 if nothing is selected.
+    shown: Option<(Arc<Draft>, Option<Arc<Selection>>)>,
+    mask: u64,
+    masks: u64,
+}
+
+/// What pages are told of a scene of so many splats that nobody has edited.
+pub(super) fn untouched(splats: usize) -> Value {
+    json!({
+        "tell": "editing", "selected": 0, "of": splats, "hidden": 0, "locked": 0, "box": null, "at": 0, "first": 0, "total": 0,
+        "entries": [], "gesture": 0, "before": false, "busy": false, "mask": 0, "saved": null,
+    })
+}
+
+/// Does what pages ask for until it closes. `tell` gives a page a line, `wake` wakes who draws.
+pub(crate) fn work(editing: &Editing, subject: &Subject, tell: &dyn Fn(u64, &str), wake: &dyn Fn()) {
+    let mut bench: Option<Bench> = None;
+    while let Some((seat, request)) = editing.next() {
+        let mut told = (*editing.told.borrow()).as_ref().clone();
+        told["busy"] = true.into();
+        editing.tell(told.clone());
+        let outcome = match &mut bench {
+            Some(bench) => bench.answer(editing, &request),
+            none => Bench::open(editing, subject).and_then(|opened| none.insert(opened).answer(editing, &request)),
+        };
+        match outcome {
+            Ok(Some(line)) => tell(seat, &line),
+            Ok(None) => {}
+            Err(error) => tell(seat, &error.to_string()),
+        }
+        told["busy"] = false.into();
+        if let Some(bench) = &mut bench {
+            bench.show(subject);
+            editing.keep(bench.session.draft(), bench.session.list());
+            told = bench.to_json();
+        }
+        wake();
+        editing.tell(told);
+    }
+}
+
+impl Bench {
+    fn open(editing: &Editing, subject: &Subject) -> Result<Self, EditingError> {
+        let cloud = read_splats(&editing.source)?;
+        let edition = subject.edition();
+        let scene = edition.as_ref().map(|edition| edition.scene());
+        let cameras = scene.and_then(|scene| scene.cameras.as_deref()).unwrap_or_default();
+        let session = Session::new(Draft::new(cloud, cameras.to_vec()));
+        let drawn = scene.and_then(|scene| scene.model.splats()).map(Splats::len);
+        Ok(Self {
+            options: scene.map_or_else(RenderOptions::default, |scene| scene.options),
+            before: false,
+            saved: None,
+            // What is drawn was read from the same file.
+            shown: (drawn == Some(session.draft().len())).then(|| (session.original().clone(), None)),
+            session,
+            mask: 0,
+            masks: 0,
+        })
+    }
+
+    /// Does one thing; returns a line for the page that asked for it.
+    fn answer(&mut self, editing: &Editing, request: &EditRequest) -> Result<Option<String>, EditingError> {
+        let session = &mut self.session;
+        if self.before && !matches!(request, EditRequest::Compare { .. } | EditRequest::Save) {
+            // What was drawn on the scene as it was may be elsewhere now.
+            self.before = false;
+            return Ok(Some("the scene is shown as it is now: try again".to_owned()));
+        }
+        match request.clone() {
+            EditRequest::Select {
+                gesture,
+                replace,
+                steps,
+            } => session.select(gesture, replace, steps)?,
+            EditRequest::Deselect => session.deselect(),
+            EditRequest::Edit { gesture, whole, edit } => session.edit(gesture, whole, edit)?,
+            EditRequest::Undo => session.go(session.at().saturating_sub(1))?,
+            EditRequest::Redo => session.go(session.at() + 1)?,
+            EditRequest::Go { at } => session.go(at)?,
+            EditRequest::Compare { before } => self.before = before,
+            EditRequest::Save => {
+                let saved = save(session, &editing.source, self.saved.as_ref())?;
+                let line = saved.line();
+                self.saved = Some(saved);
+                return Ok(Some(line));
+            }
+        }
+        Ok(None)
+    }
+
+    /// Draws from now on what the session has come to.
+    fn show(&mut self, subject: &Subject) {
+        let session = &self.session;
+        let (draft, selected, placement) = match self.before {
+            true => (session.original(), None, Transform::IDENTITY),
+            false => (session.draft(), Some(session.selected()), session.placement()),
+        };
+        let selected = selected.filter(|selected| !selected.is_empty()).cloned();
+        let is_same = |a: &Option<Arc<Selection>>, b: &Option<Arc<Selection>>| match (a, b) {
+            (Some(a), Some(b)) => Arc::ptr_eq(a, b),
+            (a, b) => a.is_none() && b.is_none(),
+        };
+        let known = self.shown.as_ref();
+        let is_new = known.is_none_or(|(known, _)| !Arc::ptr_eq(known, draft));
+        let is_masked = known.is_none_or(|(_, known)| !is_same(known, &selected));
+        if is_new || is_masked {
+            let shown = |selected: &Arc<Selection>| {
+                let all = selected.as_slice().iter().zip(draft.hidden.as_slice());
+                Arc::new(
+                    all.filter(|(_, hidden)| !**hidden)
+                        .map(|(selected, _)| *selected)
+                        .collect(),
+                )
+            };
+            self.masks += 1;
+            self.mask = if selected.is_some() { self.masks } else { 0 };
+            let scene = is_new.then(|| scene_of(draft, self.options));
+            subject.show(scene, placement, selected.as_ref().map(shown));
+        }
+        self.shown = Some((draft.clone(), selected));
+    }
+
+    /// What pages are told.
+    fn to_json(&self) -> Value {
+        let session = &self.session;
+        let (draft, selected) = (session.draft(), session.selected());
+        let (at, total) = (session.at(), session.entries().len());
+        let first = at.saturating_sub(LISTED / 2).min(total.saturating_sub(LISTED));
+        let entries: Vec<Value> = session
+            .entries()
+            .skip(first)
+            .take(LISTED)
+            .map(|entry| json!({ "kind": if entry.is_edit { "edit" } else { "select" }, "text": entry.text }))
+            .collect();
+        json!({
+            "tell": "editing",
+            "selected": selected.count(),
+            "of": draft.len(),
+            "hidden": draft.hidden.count(),
+            "locked": draft.locked.count(),
+            "box": box_around(draft, selected),
+            "at": at,
+            "first": first,
+            "total": total,
+            "entries": entries,
+            "gesture": session.gesture(),
+            "before": self.before,
+            "busy": false,
+            "mask": self.mask,
+            "saved": self.saved.as_ref().map(Saved::line),
+        })
+    }
+}
+
+/// The corners of a box around the centres of the selected splats, world. Along each axis the outermost hundredth is left out: what a
+/// lasso catches in the far background would make the box say nothing.
+fn box_around(draft: &Draft, selected: &Selection) -> Option<[[f32; 3]; 2]> {
+    let means = draft.cloud.means.iter().zip(selected.as_slice());
+    let means: Vec<[f32; 3]> = means
+        .filter(|(_, selected)| **selected)
+        .map(|(mean, _)| *mean)
+        .collect();
+    let last = means.len().checked_sub(1)?;
+    let bounds = [0, 1, 2].map(|c| {
+        let mut values: Vec<f32> = means.iter().map(|mean| mean[c]).collect();
+        [last / 100, last - last / 100].map(|at| *values.select_nth_unstable_by(at, f32::total_cmp).1)
+    });
+    Some([0, 1].map(|side| bounds.map(|bound| bound[side])))
+}
+
+/// The scene to draw.
+fn scene_of(draft: &Draft, options: RenderOptions) -> Scene {
+    let cloud = match draft.hidden.is_empty() {
+        true => Cow::Borrowed(&draft.cloud),
+        false => Cow::Owned(draft.shown()),
+    };
+    Scene {
+        model: Model::Splats {
+            splats: Cow::Owned(Splats::from_cloud(&cloud)),
+            residual: None,
+        },
+        options,
+        cameras: (!draft.cameras.is_empty()).then(|| draft.cameras.clone().into()),
+        world_from_dataset: cloud.world_from_dataset,
+    }
+}

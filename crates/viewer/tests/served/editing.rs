@@ -1,0 +1,208 @@
+//! Editing by pages: what they may ask for, and what they may not.
+
+use crate::client::Socket;
+use crate::security::{Served, serve};
+use irradia_runs::formats::read_splats;
+use serde_json::{Value, json};
+use std::fs;
+
+/// A page that has been greeted.
+fn page(served: &Served) -> Socket {
+    let mut page = served.socket();
+    told(&mut page, "editing");
+    page
+}
+
+/// The next message of a kind.
+fn told(page: &mut Socket, kind: &str) -> Value {
+    loop {
+        let (opcode, bytes) = page.receive().expect("a message");
+        if opcode == 1 {
+            let value: Value = serde_json::from_slice(&bytes).expect("JSON");
+            if value["tell"] == kind {
+                return value;
+            }
+        }
+    }
+}
+
+fn ask(page: &mut Socket, request: &Value) {
+    assert!(page.send(1, request.to_string().as_bytes()));
+}
+
+/// The session when `key` has come to `value` after a request.
+fn after(page: &mut Socket, request: &Value, (key, value): (&str, Value)) -> Value {
+    ask(page, request);
+    loop {
+        let editing = told(page, "editing");
+        if editing["busy"] == false && editing[key] == value {
+            return editing;
+        }
+    }
+}
+
+/// Why a request is refused.
+fn refusal(page: &mut Socket, request: &Value) -> String {
+    ask(page, request);
+    told(page, "problem")["text"].as_str().expect("text").to_owned()
+}
+
+fn right_one() -> Value {
+    json!({ "do": "select", "replace": true, "steps": [{ "shape": "sphere", "center": [1, 0, 0], "radius": 0.5 }] })
+}
+
+#[test]
+fn pages_share_a_session_that_leaves_the_source_alone() {
+    let served = serve("127.0.0.1");
+    let source = fs::read(served.scene()).expect("the scene");
+    let (mut first, mut second) = (page(&served), page(&served));
+    let selected = after(&mut first, &right_one(), ("selected", json!(1)));
+    assert_eq!(selected["box"], json!([[1.0, 0.0, 0.0], [1.0, 0.0, 0.0]]));
+    let deleted = after(
+        &mut first,
+        &json!({ "do": "edit", "edit": { "op": "delete" } }),
+        ("at", json!(2)),
+    );
+    assert_eq!((&selected["of"], &deleted["of"]), (&json!(3), &json!(2)));
+    while told(&mut second, "editing") != deleted {}
+    let name = json!("saved scene.edits.toml and scene.edited.ply");
+    after(&mut second, &json!({ "do": "save" }), ("saved", name));
+    let folder = served.scene().parent().expect("a folder").to_owned();
+    assert_eq!(read_splats(&folder.join("scene.edited.ply")).expect("splats").len(), 2);
+    assert_eq!(fs::read(served.scene()).expect("the scene"), source);
+    let list = fs::read_to_string(folder.join("scene.edits.toml")).expect("the list");
+    let list = irradia_edit::EditList::parse(&list).expect("a list");
+    assert_eq!(list.edits[0].to_string(), "delete sphere center=1,0,0 radius=0.5");
+    after(&mut second, &json!({ "do": "undo" }), ("selected", json!(1)));
+    after(&mut second, &json!({ "do": "go", "at": 0 }), ("selected", json!(0)));
+    after(&mut second, &json!({ "do": "go", "at": u32::MAX }), ("of", json!(2)));
+    // Another session does not replace what this one saved.
+    let again = Served::of(served.scene(), "127.0.0.1");
+    let mut third = page(&again);
+    after(&mut third, &right_one(), ("selected", json!(1)));
+    let name = json!("saved scene.edits-2.toml and scene.edited-2.ply");
+    after(&mut third, &json!({ "do": "save" }), ("saved", name));
+}
+
+#[test]
+fn hostile_requests_are_refused_in_one_line_and_change_nothing() {
+    let served = serve("127.0.0.1");
+    let mut page = page(&served);
+    let camera = json!({ "position": [0, 0, -4], "rotation": [1, 0, 0, 0], "focal": [50, 50], "principal": [32, 24], "size": [64, 48] });
+    let lasso = |points: usize| {
+        let points: Vec<[f64; 2]> = (0..points).map(|i| [i as f64 % 64.0, i as f64 % 48.0]).collect();
+        json!({ "do": "select", "steps": [{ "shape": "polygon", "camera": camera, "points": points }] })
+    };
+    let step = |step: Value| json!({ "do": "select", "steps": [step] });
+    let edit = |edit: Value| json!({ "do": "edit", "whole": true, "edit": edit });
+    for (request, says) in [
+        (lasso(2001), "at most 2000 points"),
+        (lasso(2), "points"),
+        (
+            step(json!({ "shape": "sphere", "center": [0, 0, 0], "radius": -1 })),
+            "radius",
+        ),
+        (
+            step(json!({ "shape": "sphere", "center": [0, 0, 1e300], "radius": 1 })),
+            "center",
+        ),
+        (
+            step(json!({ "shape": "box", "center": [0, 0, 0], "size": [0, 1, 1] })),
+            "size",
+        ),
+        (
+            step(json!({ "shape": "box", "mode": "subtract", "center": [0, 0, 0], "size": [1, 1, 1] })),
+            "nothing is selected",
+        ),
+        (json!({ "do": "select", "steps": [] }), "1 to 8 steps"),
+        (
+            json!({ "do": "edit", "edit": { "op": "delete" } }),
+            "nothing is selected",
+        ),
+        (edit(json!({ "op": "delete" })), "needs a selection"),
+        (edit(json!({ "op": "merge", "file": "/etc/passwd" })), "merges no files"),
+        (edit(json!({ "op": "recolor", "exposure": 1e9 })), "exposure"),
+        (
+            edit(json!({ "op": "set-length", "from": [0, 0, 0], "to": [0, 0, 0], "length": 1 })),
+            "set-length",
+        ),
+        (
+            json!({ "do": "edit", "edit": { "op": "split", "name": "../../evil" } }),
+            "split name",
+        ),
+    ] {
+        let line = refusal(&mut page, &request);
+        assert!(line.contains(says) && !line.contains('\n'), "{request}: {line}");
+    }
+    // What cannot be read at all is a fault of the page, and no news for it.
+    for text in [
+        r#"{"do":"select","steps":[{"shape":"sphere","center":[0,0,NaN],"radius":1}]}"#,
+        r#"{"do":"select","steps":[{"shape":"sphere","center":[0,0,1e999],"radius":1}]}"#,
+        r#"{"do":"select","steps":[{"shape":"cube"}]}"#,
+        r#"{"do":"edit","whole":true,"edit":{"op":"format-disk"}}"#,
+        r#"{"do":"go","at":-1}"#,
+    ] {
+        assert!(page.send(1, text.as_bytes()));
+    }
+    let editing = after(&mut page, &right_one(), ("selected", json!(1)));
+    assert_eq!((&editing["total"], &editing["of"]), (&json!(1), &json!(3)));
+    page.send(1, lasso(20_000).to_string().as_bytes());
+    assert!(page.is_ended(), "larger than any request");
+    served.draws();
+}
+
+#[test]
+fn a_download_needs_a_known_format_and_the_token() {
+    let served = serve("127.0.0.1");
+    let host = served.host();
+    after(&mut page(&served), &right_one(), ("selected", json!(1)));
+    for name in [
+        "ply",
+        "compressed.ply",
+        "points.ply",
+        "spz",
+        "splat",
+        "ksplat",
+        "sog",
+        "glb",
+        "spz.glb",
+        "gltf",
+        "npz",
+        "edits.toml",
+    ] {
+        assert_eq!(served.status(&format!("/download/{name}"), &[&host]), 200, "{name}");
+    }
+    for name in ["exe", "meta.json", "", "..%2fscene.ply", "ply/../../x", "PLY%00"] {
+        assert_eq!(served.status(&format!("/download/{name}"), &[&host]), 404, "{name}");
+    }
+    assert_eq!(served.status("/selection/999", &[&host]), 404);
+    assert_eq!(served.status("/selection/1", &[&host]), 200);
+    assert_eq!(
+        served.status("/download/ply", &[&host, "Origin: http://evil.example"]),
+        403
+    );
+    let guarded = serve("0.0.0.0");
+    for path in ["/download/ply", "/selection/1", "/socket"] {
+        assert_eq!(guarded.status(path, &[&guarded.host()]), 403, "{path}");
+    }
+}
+
+#[test]
+fn what_is_no_scene_of_splats_is_not_edited() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let data = folder.path().join("data");
+    irradia_runs::write_synth_dataset(
+        &data,
+        &irradia_runs::prelude::SynthOptions {
+            views: 2,
+            width: 16,
+            height: 12,
+            ..Default::default()
+        },
+    )
+    .expect("a dataset");
+    let served = Served::of(&data, "127.0.0.1");
+    let mut page = served.socket();
+    assert!(refusal(&mut page, &right_one()).contains("dataset"));
+    assert_eq!(served.status("/download/ply", &[&served.host()]), 404);
+}

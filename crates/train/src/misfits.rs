@@ -16,6 +16,8 @@ const MIN_VIEWS: usize = 8;
 const DEVIATIONS: f64 = 5.0;
 /// Factor over the median error that a misfit has at least: the wrong poses had 3.5 to 5.4, and 2.1 has been seen of a photograph that is right.
 const FACTOR: f64 = 2.5;
+/// Factor over the median that the error of its better part has at least.
+const TRIMMED_FACTOR: f64 = 1.5;
 /// Largest share of misfits: with more of them it is not clear who is wrong.
 const MOST: f64 = 0.2;
 
@@ -35,15 +37,22 @@ fn outliers(errors: &[(usize, f64)]) -> Vec<(usize, f64)> {
     found.iter().map(|(view, excess)| (*view, excess.exp())).collect()
 }
 
+/// Those of `errors`, over all pixels and over those that fit best, that are far beyond the others' in the first and beyond them in the
+/// second: a person before the camera makes a part of a photograph worse, a wrong pose all of it.
+fn misfits(errors: &[(usize, [f64; 2])]) -> Vec<(usize, f64)> {
+    let all: Vec<(usize, f64)> = errors.iter().map(|(view, [all, _])| (*view, *all)).collect();
+    let mut found = outliers(&all);
+    if !found.is_empty() {
+        let least = TRIMMED_FACTOR * median(errors.iter().map(|(_, [_, best])| *best).collect());
+        found.retain(|(misfit, _)| errors.iter().any(|(view, [_, best])| view == misfit && *best > least));
+    }
+    found
+}
+
 impl Trainer {
-    /// Leaves out the photographs whose `errors`, over all pixels and over those that fit best, are both beyond the others', and says
-    /// which: a person before the camera makes a part of a photograph worse, a wrong pose all of it.
+    /// Leaves out the photographs whose `errors`, over all pixels and over those that fit best, do not fit the others', and says which.
     pub(crate) fn leave_out_misfits(&mut self, errors: &[(usize, [f64; 2])]) -> Option<Event> {
-        let [mut found, trimmed] = [0, 1].map(|kind| {
-            let errors: Vec<(usize, f64)> = errors.iter().map(|(view, error)| (*view, error[kind])).collect();
-            outliers(&errors)
-        });
-        found.retain(|(view, _)| trimmed.iter().any(|(other, _)| other == view));
+        let found = misfits(errors);
         if found.is_empty() {
             return None;
         }
@@ -92,5 +101,14 @@ mod tests {
         let wide: Vec<(usize, f64)> = (0..50).map(|i| (i, 0.05 * f64::from(rng.normal()).exp())).collect();
         assert_eq!(outliers(&wide), []);
         assert_eq!(outliers(&errors[..7]), []);
+        // A person before the camera: the rest of the photograph is as good as the others.
+        let mut both: Vec<(usize, [f64; 2])> = errors
+            .iter()
+            .map(|(view, error)| (*view, [*error, 0.5 * error]))
+            .collect();
+        both[17].1[1] /= 4.0;
+        let mut found: Vec<usize> = misfits(&both).iter().map(|(view, _)| *view).collect();
+        found.sort_unstable();
+        assert_eq!(found, [3, 40]);
     }
 }

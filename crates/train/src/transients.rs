@@ -21,12 +21,13 @@ const LEAST: f32 = 0.2;
 /// Factor over the difference at the same place in other views. A person pasted into 14 of 43 photographs of fox is found whole at 3
 /// or 4, and nothing at all in the photographs without.
 const FACTOR: f32 = 3.0;
-/// The share of the other views that differ less. With the median, unlearned surfaces at the border of the scene count after a fifth of a run.
-const WITNESS_QUANTILE: f32 = 0.75;
+/// The share of the other views that differ less. With the median, unlearned surfaces at the border of the scene count after a fifth of a run; with 0.75
+/// and three witnesses, 25 of 62 photographs of can, whose background is hardly known, lose 12 % each, and held-out PSNR 0.4 dB.
+const WITNESS_QUANTILE: f32 = 0.9;
 /// Neighbours of a transient's blocks belong to it from this share of both limits.
 const GROW: f32 = 0.4;
 /// Other views that must see a block's surface.
-const MIN_WITNESSES: usize = 3;
+const MIN_WITNESSES: usize = 6;
 /// Views asked about each place, the nearest ones.
 const WITNESSES: usize = 24;
 /// Depths that differ by less than this fraction are those of the same surface.
@@ -392,9 +393,9 @@ mod tests {
         let camera = views[3].1.camera;
         views[3].1 = of_frame(&camera, |_, _| 0.2);
         assert_eq!(Hidden::find(&views, 1.0, &Hidden::default()), Hidden::default());
-        // Two witnesses are too few, and so are those that see another surface.
+        // Five witnesses are too few, and so are those that see another surface.
         views[3].1 = of_frame(&camera, person);
-        assert_eq!(Hidden::find(&views[1..4], 1.0, &Hidden::default()), Hidden::default());
+        assert_eq!(Hidden::find(&views[0..6], 1.0, &Hidden::default()), Hidden::default());
         views[3].1.depth.fill(2.0);
         assert_eq!(Hidden::find(&views, 1.0, &Hidden::default()), Hidden::default());
     }

@@ -128,6 +128,7 @@ mod tests {
             background: None,
             clip: None,
             view: None,
+            highlight: false,
         }
     }
 

@@ -19,7 +19,7 @@ pub struct Args {
     #[arg(value_name = "OP")]
     pub ops: Vec<Edit>,
     /// The file to write, its name selects the format; or a folder, which also gets the cameras and the edits
-    #[arg(long, short, value_name = "FILE|FOLDER", required_unless_present_any = ["preview", "in_place"])]
+    #[arg(long, short, value_name = "FILE|FOLDER")]
     pub out: Option<PathBuf>,
     /// Make the edits of this list first
     #[arg(long, value_name = "FILE")]
@@ -62,6 +62,9 @@ Examples:
   irradia edit scene.ply -o out.ply \"delete box center=0,0,0 size=2,2,2 -sphere center=0,0,0 radius=0.5\" \"rotate axis=0,0,1 degrees=90\"";
 
 pub fn run(args: &Args) -> Result<()> {
+    if args.out.is_none() && !args.preview && !args.in_place {
+        return Err(Usage("no output: name one with --out, or use --preview or --in-place".into()).into());
+    }
     use_threads(args.threads)?;
     let mut list = match &args.edits {
         Some(path) => {

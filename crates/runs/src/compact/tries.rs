@@ -247,11 +247,10 @@ impl<'a> Tries<'a> {
             keep(&mut state, &judged.change, count);
             Ok(self.through(&state.splats)?.1 as f64)
         };
-        let all = bytes_with(first)?;
+        let (all, half) = (bytes_with(first)?, bytes_with(first / 2)?);
+        let slope = ((all - half) / (first - first / 2) as f64).max(1.0);
         let mut count = first;
         if all > most as f64 {
-            let half = bytes_with(first / 2)?;
-            let slope = (all - half) / (first - first / 2) as f64;
             count = (first as f64 - (all - most as f64) / slope) as usize;
             let near = bytes_with(count.clamp(1, first))?;
             count = (count as f64 + (most as f64 - near) / slope).max(0.0) as usize;
@@ -264,8 +263,9 @@ impl<'a> Tries<'a> {
             if found.bytes <= most {
                 return Ok(found);
             }
-            // What is left is trained further with a little less.
-            count = (count as f64 * most as f64 / found.bytes as f64 * 0.98) as usize;
+            // What is left is trained further with a little less; what a file has beside its splats stays.
+            let excess = 1.1 * (found.bytes - most) as f64 / slope;
+            count = (found.splats.len() as f64 - excess.max(1.0)).max(0.0) as usize;
             self.begin = found.splats;
         }
         Err(RunError::setting(

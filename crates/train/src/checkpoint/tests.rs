@@ -231,10 +231,10 @@ fn moments_follow_edited_splats() {
     let splats = splats_of(&bytes).unwrap();
     assert_eq!(splats, trainer.engine.state().splats);
     let same: Vec<Option<u32>> = (0..n as u32).map(Some).collect();
-    assert!(
-        with_splats(&bytes, &splats, &same).unwrap() == bytes,
-        "an edit that changes nothing"
-    );
+    // The order of the metadata in the header varies.
+    let data = |bytes: &[u8]| bytes[8 + u64::from_le_bytes(*bytes.first_chunk().unwrap()) as usize..].to_vec();
+    let edited = with_splats(&bytes, &splats, &same).unwrap();
+    assert!(data(&edited) == data(&bytes), "an edit that changes nothing");
 
     // The last splat, a new one, the first.
     let edited = splats.gather(&[n as u32 - 1, 3, 0]);

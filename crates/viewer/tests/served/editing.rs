@@ -194,7 +194,7 @@ fn what_is_no_scene_of_splats_is_not_edited() {
     irradia_runs::write_synth_dataset(
         &data,
         &irradia_runs::prelude::SynthOptions {
-            views: 2,
+            views: 3,
             width: 16,
             height: 12,
             ..Default::default()

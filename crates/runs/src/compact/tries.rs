@@ -265,7 +265,8 @@ impl<'a> Tries<'a> {
             }
             // What is left is trained further with a little less; what a file has beside its splats stays.
             let excess = 1.1 * (found.bytes - most) as f64 / slope;
-            count = (found.splats.len() as f64 - excess.max(1.0)).max(0.0) as usize;
+            let had = found.splats.len() as f64;
+            count = (had - excess.max(1.0)).max(0.5 * had) as usize;
             self.begin = found.splats;
         }
         Err(RunError::setting(

@@ -54,7 +54,8 @@ fn a_scene_gets_as_small_as_it_is_asked_to_and_its_pictures_stay() {
         "the same bytes"
     );
 
-    let most = half.bytes[1] * 2 / 3;
+    // What a file has beside its splats is more than half of so small a scene.
+    let most = half.bytes[1] * 7 / 8;
     let small = compact(&input(Some(CompactTarget::Bytes(most)), "small.sog"), &mut |_| ()).expect("compacted");
     assert!(small.bytes[1] <= most && small.bytes[1] > most * 3 / 4, "{small:?}");
     let other = compact(&input(Some(CompactTarget::Splats(count)), "all.spz"), &mut |_| ()).expect("compacted");

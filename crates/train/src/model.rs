@@ -54,7 +54,15 @@ pub struct Frame {
     pub depth: Vec<f32>,
 }
 
-impl Model<'_> {
+impl<'a> Model<'a> {
+    /// A scene of Gaussians alone.
+    pub fn of_splats(splats: impl Into<Cow<'a, Splats>>) -> Self {
+        Model::Splats {
+            splats: splats.into(),
+            residual: None,
+        }
+    }
+
     /// Renders the view of `camera`; `renderer` reuses its buffers from frame to frame.
     pub fn render(&self, renderer: &mut Renderer, camera: &Camera, options: &RenderOptions) -> Frame {
         let (width, height) = (camera.intrinsics.width, camera.intrinsics.height);

@@ -14,3 +14,19 @@ pub fn gpu_or_skip<G, E: Display>(open: impl FnOnce() -> Result<G, E>) -> Option
         }
     }
 }
+
+/// Checks a shader as every implementation does; needs no GPU.
+///
+/// # Panics
+/// With its name and the reason, when it is not valid WGSL.
+pub fn validate_shader(name: &str, source: &str) {
+    let module =
+        naga::front::wgsl::parse_str(source).unwrap_or_else(|error| panic!("{name}: {}", error.emit_to_string(source)));
+    let mut validator = naga::valid::Validator::new(
+        naga::valid::ValidationFlags::all(),
+        naga::valid::Capabilities::default(),
+    );
+    if let Err(error) = validator.validate(&module) {
+        panic!("{name}: {}", error.emit_to_string(source));
+    }
+}

@@ -10,5 +10,5 @@ pub mod torch;
 
 pub use compare::{Difference, max_abs_difference, relative_difference};
 pub use golden::Golden;
-pub use gpu::gpu_or_skip;
+pub use gpu::{gpu_or_skip, validate_shader};
 pub use shared::shared;

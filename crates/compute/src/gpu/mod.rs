@@ -17,6 +17,9 @@ pub use sort::Sort;
 use std::fmt;
 use std::sync::{Arc, Mutex, PoisonError};
 
+/// `group_index`: the number of a workgroup, for kernels that [`Work::run`] runs.
+pub const GRID: &str = include_str!("shaders/grid.wgsl");
+
 /// Threads of a workgroup, where a kernel has no reason for another number: what every implementation offers at least.
 pub const GROUP: u32 = 256;
 

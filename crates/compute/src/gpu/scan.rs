@@ -1,6 +1,5 @@
-use super::{Array, Gpu, Kernel, Shader, Work};
+use super::{Array, GRID, Gpu, Kernel, Shader, Work};
 
-const GRID: &str = include_str!("shaders/grid.wgsl");
 const GROUP_SCAN: &str = include_str!("shaders/scan_group.wgsl");
 pub(super) const SHADERS: [Shader; 3] = [
     Shader {

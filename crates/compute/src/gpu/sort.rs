@@ -1,6 +1,5 @@
-use super::{Array, Gpu, Kernel, Scan, Shader, Work};
+use super::{Array, GRID, Gpu, Kernel, Scan, Shader, Work};
 
-const GRID: &str = include_str!("shaders/grid.wgsl");
 pub(super) const SHADERS: [Shader; 2] = [
     Shader {
         name: "sort_count",

@@ -4,6 +4,7 @@
 //! All `unsafe` code is in `simd::x86` and `nearest::x86`.
 
 pub mod adam;
+mod device;
 #[cfg(feature = "gpu")]
 pub mod gpu;
 pub mod nearest;
@@ -11,5 +12,6 @@ pub mod planes;
 pub mod simd;
 pub mod sort;
 
+pub use device::{Device, DeviceChoice, DeviceError};
 pub use planes::Planes;
 pub use simd::Level;

@@ -5,20 +5,17 @@
 //! splats (density control, initialisation, files) takes the state with [`Engine::state_mut`], rarely.
 
 use crate::densify::mcmc;
+#[cfg(feature = "gpu")]
+use crate::gpu::GpuTraining;
 use crate::regularize::{self, Regularized, Regularizers};
 use crate::render::{
     CameraGradient, ChunkBounds, FramePlanes, OutputGradient, RenderOptions, Renderer, SplatGradients, ViewParams,
 };
 use crate::{Optimizer, Rates, SplatState, Splats, Statistics, Surface};
+use irradia_compute::{Device, DeviceError};
 use irradia_scene::{Camera, sh};
 use rayon::prelude::*;
 use std::sync::OnceLock;
-#[cfg(feature = "gpu")]
-use {
-    crate::gpu::GpuTraining,
-    irradia_compute::gpu::{Gpu, GpuError},
-    std::sync::Arc,
-};
 
 /// The state of splats in training with the renderer and the gradients of the last frame, on the CPU or on a GPU.
 ///
@@ -106,24 +103,30 @@ impl Engine {
         }
     }
 
-    /// Continues on `gpu`.
+    /// Continues on `device`.
     ///
     /// # Errors
     /// When the device refuses the kernels.
-    #[cfg(feature = "gpu")]
-    pub fn use_gpu(&mut self, gpu: Arc<Gpu>) -> Result<(), GpuError> {
+    pub fn use_device(&mut self, device: &Device) -> Result<(), DeviceError> {
         self.use_cpu();
-        self.gpu = Some(Box::new(GpuTraining::new(gpu)?));
+        match device {
+            Device::Cpu => {}
+            #[cfg(feature = "gpu")]
+            Device::Gpu(gpu) => self.gpu = Some(Box::new(GpuTraining::new(gpu.clone())?)),
+        }
         Ok(())
     }
 
-    /// What has gone wrong on the GPU: the state and everything made from it are then unspecified.
+    /// What has gone wrong on the device: the state and everything made from it are then unspecified.
     ///
     /// # Errors
     /// When something has.
-    #[cfg(feature = "gpu")]
-    pub fn check_gpu(&self) -> Result<(), GpuError> {
-        self.gpu.as_ref().map_or(Ok(()), |gpu| gpu.renderer.gpu().check())
+    pub fn check_device(&self) -> Result<(), DeviceError> {
+        #[cfg(feature = "gpu")]
+        if let Some(gpu) = &self.gpu {
+            return gpu.renderer.gpu().check();
+        }
+        Ok(())
     }
 
     /// Continues on the CPU.

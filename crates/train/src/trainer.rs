@@ -17,6 +17,7 @@ use crate::times::Times;
 use crate::transients::Hidden;
 use cpu_time::ProcessTime;
 use irradia_compute::adam::AdamStep;
+use irradia_compute::{Device, DeviceError};
 use irradia_field::{FieldError, FieldState, KnownDepth};
 use irradia_measure::{DepthSample, Lpips};
 use irradia_scene::{Camera, Dataset, LoadError, Rng, sh};
@@ -71,6 +72,9 @@ pub enum TrainError {
         /// What else would do.
         otherwise: String,
     },
+    /// The device cannot be used, or failed.
+    #[error(transparent)]
+    Device(#[from] DeviceError),
     /// A checkpoint does not fit.
     #[error("{0}")]
     Checkpoint(String),
@@ -87,16 +91,19 @@ pub struct TrainOptions {
     pub memory: Option<usize>,
     /// Weights of the perceptual loss; without them a recipe's perceptual loss is skipped.
     pub lpips: Option<Arc<Lpips>>,
+    /// Where splats are trained.
+    pub device: Device,
 }
 
 impl Default for TrainOptions {
-    /// Seed 0, the recipe's steps, and no limit on memory.
+    /// Seed 0, the recipe's steps, no limit on memory, on the CPU.
     fn default() -> Self {
         Self {
             seed: 0,
             steps: None,
             memory: None,
             lpips: None,
+            device: Device::Cpu,
         }
     }
 }
@@ -218,6 +225,8 @@ impl Trainer {
             ..Needs::of(&dataset, &recipe, options.lpips.as_ref().map(|lpips| lpips.net()))
         };
         let memory = MemoryPlan::new(&needs, options.memory)?;
+        let mut engine = Engine::new(SplatState::new(Splats::zeros(0, sh::MAX_DEGREE)));
+        let decisions = use_device(&mut engine, &options.device, &recipe)?;
         Ok(Self {
             clock: Clock::new(&recipe),
             pace: options.steps.map_or(1.0, |steps| total / steps.max(1) as f64),
@@ -229,11 +238,11 @@ impl Trainer {
             cap: cap(&recipe, &cameras).min(memory.splats),
             memory,
             pixels: mean_pixels(&cameras),
-            decisions: Vec::new(),
+            decisions,
             depths: HashMap::new(),
             objective: Objective::new(options.lpips.clone()),
             free_space: FreeSpace::new(&dataset, recipe.free_space),
-            engine: Engine::new(SplatState::new(Splats::zeros(0, sh::MAX_DEGREE))),
+            engine,
             field: None,
             sockets: Sockets::default(),
             trained: dataset.train.clone(),
@@ -301,6 +310,7 @@ impl Trainer {
         } else {
             self.splat_step(events)?
         };
+        self.engine.check_device()?;
         let before = self.clock.time;
         let entered = self.tick(metrics) && !self.finished();
         let total = self.recipe.total_steps() as f64;
@@ -683,6 +693,27 @@ impl Trainer {
                 .map(|field| Box::new(field.clone())),
         }
     }
+}
+
+/// Puts the engine on the device, as far as the recipe's splats can be trained there. Returns what is told of it.
+fn use_device(engine: &mut Engine, device: &Device, recipe: &Recipe) -> Result<Vec<String>, DeviceError> {
+    if device.is_cpu() {
+        return Ok(Vec::new());
+    }
+    let fields = (0..recipe.stage.len()).filter(|stage| is_field(recipe, *stage)).count();
+    let name = &recipe.name;
+    if recipe.residual.is_some() || fields == recipe.stage.len() {
+        return Ok(vec![format!(
+            "recipe {name} trains a field: on the CPU, not on {device}"
+        )]);
+    }
+    engine.use_device(device)?;
+    let of_fields = if fields > 0 {
+        "; its field is trained on the CPU"
+    } else {
+        ""
+    };
+    Ok(vec![format!("splats are trained on {device}{of_fields}")])
 }
 
 fn train_cameras(dataset: &Dataset) -> Vec<Camera> {

@@ -1,4 +1,5 @@
-use super::{Gpu, GpuError};
+use super::Gpu;
+use crate::DeviceError;
 use bytemuck::{NoUninit, Pod};
 
 /// Memory on the device, in words of 32 bits, that grows and never shrinks.
@@ -91,11 +92,11 @@ impl Array {
     ///
     /// # Errors
     /// When it cannot: the device's limit is said.
-    pub fn check(gpu: &Gpu, label: &'static str, words: usize) -> Result<(), GpuError> {
+    pub fn check(gpu: &Gpu, label: &'static str, words: usize) -> Result<(), DeviceError> {
         let (needed, limit) = (4 * words as u64, gpu.info.largest_array);
         match needed <= limit {
             true => Ok(()),
-            false => Err(GpuError::TooLarge {
+            false => Err(DeviceError::TooLarge {
                 name: gpu.info.name.clone(),
                 label,
                 needed: needed.div_ceil(1_000_000),

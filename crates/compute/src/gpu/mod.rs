@@ -14,6 +14,7 @@ pub use kernel::{Kernel, Shader, Work};
 pub use scan::Scan;
 pub use sort::Sort;
 
+use crate::DeviceError;
 use std::fmt;
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -22,42 +23,6 @@ pub const GRID: &str = include_str!("shaders/grid.wgsl");
 
 /// Threads of a workgroup, where a kernel has no reason for another number: what every implementation offers at least.
 pub const GROUP: u32 = 256;
-
-/// Why the GPU cannot be used: one line.
-#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-pub enum GpuError {
-    /// There is none of the wanted kind.
-    #[error("no GPU {0}; irradia devices lists what is there")]
-    None(String),
-    /// The driver refuses.
-    #[error("the GPU {name} cannot be used: {reason}")]
-    Refused {
-        /// Its name.
-        name: String,
-        /// The driver's words.
-        reason: String,
-    },
-    /// It failed at work.
-    #[error("the GPU {name} failed: {reason}")]
-    Failed {
-        /// Its name.
-        name: String,
-        /// The driver's words.
-        reason: String,
-    },
-    /// Memory for one array is above what the device binds at once.
-    #[error("{label} needs {needed} MB in one piece, and the GPU {name} binds {limit} MB at most")]
-    TooLarge {
-        /// Its name.
-        name: String,
-        /// What was to be stored.
-        label: &'static str,
-        /// Megabytes.
-        needed: u64,
-        /// Megabytes.
-        limit: u64,
-    },
-}
 
 /// What kind of processor an adapter is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -190,14 +155,14 @@ impl Gpu {
     ///
     /// # Errors
     /// When there is none of the wanted kind, or its driver refuses.
-    pub fn open(wanted: &Wanted) -> Result<Arc<Self>, GpuError> {
+    pub fn open(wanted: &Wanted) -> Result<Arc<Self>, DeviceError> {
         let is_wanted = |info: &AdapterInfo| match wanted {
             Wanted::Real => info.is_usable && info.kind != AdapterKind::Software,
             Wanted::Any => info.is_usable,
             Wanted::Named(name) => info.name.to_lowercase().contains(&name.to_lowercase()),
         };
         let Some((adapter, info)) = list().into_iter().find(|(_, info)| is_wanted(info)) else {
-            return Err(GpuError::None(match wanted {
+            return Err(DeviceError::None(match wanted {
                 Wanted::Real => "was found".to_owned(),
                 Wanted::Any => "was found; Mesa's software Vulkan would do (mesa-vulkan-drivers)".to_owned(),
                 Wanted::Named(name) => format!("is called {name:?}"),
@@ -210,7 +175,7 @@ impl Gpu {
             ..Default::default()
         };
         let (device, queue) =
-            pollster::block_on(adapter.request_device(&descriptor)).map_err(|error| GpuError::Refused {
+            pollster::block_on(adapter.request_device(&descriptor)).map_err(|error| DeviceError::Refused {
                 name: info.name.clone(),
                 reason: one_line(&error.to_string()),
             })?;
@@ -245,10 +210,10 @@ impl Gpu {
     ///
     /// # Errors
     /// When something did.
-    pub fn check(&self) -> Result<(), GpuError> {
+    pub fn check(&self) -> Result<(), DeviceError> {
         match &*self.failure.lock().unwrap_or_else(PoisonError::into_inner) {
             None => Ok(()),
-            Some(reason) => Err(GpuError::Failed {
+            Some(reason) => Err(DeviceError::Failed {
                 name: self.info.name.clone(),
                 reason: reason.clone(),
             }),

@@ -180,7 +180,7 @@ impl<'a> Tries<'a> {
             seed: self.input.seed,
             steps: Some(self.input.steps),
             memory: usual_limit(),
-            lpips: None,
+            ..TrainOptions::default()
         };
         let first = self.begin.len();
         let mut trainer = Trainer::from_splats(self.dataset.clone(), self.recipe.clone(), options, self.begin.clone())?;

@@ -3,7 +3,8 @@
 use super::shaders::Kernels;
 use crate::render::{FramePlanes, RenderOptions};
 use crate::{Splats, ViewParams};
-use irradia_compute::gpu::{Array, GROUP, Gpu, GpuError, Scan, Sort, Work};
+use irradia_compute::DeviceError;
+use irradia_compute::gpu::{Array, GROUP, Gpu, Scan, Sort, Work};
 use std::sync::{Arc, OnceLock};
 
 /// Width and height of a tile, pixels.
@@ -103,7 +104,7 @@ impl GpuRenderer {
     ///
     /// # Errors
     /// When the device refuses one.
-    pub fn new(gpu: Arc<Gpu>) -> Result<Self, GpuError> {
+    pub fn new(gpu: Arc<Gpu>) -> Result<Self, DeviceError> {
         let array = |label| Array::zeros(&gpu, label, 0);
         let renderer = Self {
             kernels: Kernels::new(&gpu),

@@ -9,6 +9,7 @@ use crate::{
     Engine, Optimizer, Rates, RenderOptions, Renderer, SplatGradients, SplatState, Splats, Statistics, ViewParams,
 };
 use glam::Vec3;
+use irradia_compute::Device;
 use irradia_compute::adam::AdamStep;
 use irradia_compute::gpu::{Gpu, Wanted};
 use irradia_scene::{Camera, Intrinsics, Pose, Rng};
@@ -258,7 +259,7 @@ fn steps_agree_with_the_cpu_under_every_option_of_an_update() {
     let [v_color, .., error] = gradients(&camera, 6);
     for (case, update) in updates.into_iter().enumerate() {
         let mut engines = [0, 1].map(|_| Engine::new(SplatState::new(splats.clone())));
-        engines[1].use_gpu(gpu.clone()).unwrap();
+        engines[1].use_device(&Device::Gpu(gpu.clone())).unwrap();
         for step in 1..=3 {
             for engine in &mut engines {
                 engine.render(camera.into(), &RenderOptions::default());
@@ -304,7 +305,7 @@ fn noise_moves_faint_splats_by_the_given_amount_and_opaque_ones_not_at_all() {
         (0..3).for_each(|c| splats.log_scales.set(c, i, 0.0));
     }
     let mut engine = Engine::new(SplatState::new(splats));
-    engine.use_gpu(gpu).unwrap();
+    engine.use_device(&Device::Gpu(gpu)).unwrap();
     engine.render(camera.into(), &RenderOptions::default());
     let before = engine.state().clone();
     let pixels = 83 * 61;

@@ -5,7 +5,8 @@ use crate::engine::Update;
 use crate::regularize::Regularized;
 use crate::render::{CameraGradient, Gather, OutputGradient, RenderOptions};
 use crate::{SplatState, Splats, Statistics, ViewParams};
-use irradia_compute::gpu::{Array, GROUP, Gpu, GpuError, Work};
+use irradia_compute::DeviceError;
+use irradia_compute::gpu::{Array, GROUP, Gpu, Work};
 use irradia_scene::sh;
 use std::sync::Arc;
 
@@ -48,7 +49,7 @@ pub(crate) struct GpuTraining {
 }
 
 impl GpuTraining {
-    pub fn new(gpu: Arc<Gpu>) -> Result<Self, GpuError> {
+    pub fn new(gpu: Arc<Gpu>) -> Result<Self, DeviceError> {
         let array = |label| Array::zeros(&gpu, label, 0);
         Ok(Self {
             moments_geometry: array("moments of geometry"),

@@ -32,6 +32,7 @@ mod editing;
 mod error;
 mod guard;
 mod importance;
+mod kernels;
 mod listen;
 mod live;
 mod message;

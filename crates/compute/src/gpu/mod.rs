@@ -9,17 +9,15 @@ mod kernel;
 mod scan;
 mod sort;
 
+pub use crate::shaders::{GRID, Shader};
 pub use array::Array;
-pub use kernel::{Kernel, Shader, Work};
+pub use kernel::{Kernel, Work};
 pub use scan::Scan;
 pub use sort::Sort;
 
 use crate::DeviceError;
 use std::fmt;
 use std::sync::{Arc, Mutex, PoisonError};
-
-/// `group_index`: the number of a workgroup, for kernels that [`Work::run`] runs.
-pub const GRID: &str = include_str!("shaders/grid.wgsl");
 
 /// Threads of a workgroup, where a kernel has no reason for another number: what every implementation offers at least.
 pub const GROUP: u32 = 256;

@@ -9,6 +9,7 @@ mod shaders;
 mod training;
 
 pub use frame::GpuRenderer;
+pub use training::DeviceGradient;
 pub(crate) use training::GpuTraining;
 
 #[cfg(test)]

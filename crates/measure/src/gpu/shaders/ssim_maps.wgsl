@@ -12,19 +12,20 @@
 const C1: f32 = 0.0001;
 const C2: f32 = 0.0009;
 
+const THREADS: u32 = 64u;
 var<workgroup> pairs: array<vec2f, 676>;
 // After the window along x: render, truth, squares, products.
 var<workgroup> rows: array<vec4f, 416>;
-var<workgroup> shared_values: array<vec3f, 256>;
+var<workgroup> shared_values: array<vec3f, 64>;
 
-@compute @workgroup_size(256)
+@compute @workgroup_size(64)
 fn main(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups: vec3u, @builtin(local_invocation_index) at: u32) {
     let number = group_index(group, groups);
     let channel = number / task.size.w;
     let tile = number % task.size.w;
     let corner = vec2i(vec2u(tile % task.size.z, tile / task.size.z) * TILE) - i32(RADIUS);
     let size = vec2i(task.size.xy);
-    for (var i = at; i < SEEN * SEEN; i += 256u) {
+    for (var i = at; i < SEEN * SEEN; i += THREADS) {
         let place = corner + vec2i(vec2u(i % SEEN, i / SEEN));
         pairs[i] = vec2f(0.0);
         if channel < 3u && all(place >= vec2i(0)) && all(place < size) {
@@ -32,46 +33,63 @@ fn main(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups: ve
         }
     }
     workgroupBarrier();
-    for (var i = at; i < SEEN * TILE; i += 256u) {
-        let first = (i / TILE) * SEEN + i % TILE;
-        var sum = vec4f(0.0);
-        for (var k = 0u; k < 11u; k++) {
-            let xy = pairs[first + k];
-            let weight = WINDOW[max(k, 10u - k) - RADIUS];
-            sum += weight * vec4f(xy, dot(xy, xy), xy.x * xy.y);
+    // Four neighbours at a time: 14 values serve 4 windows.
+    for (var i = at; i < SEEN * TILE / 4u; i += THREADS) {
+        let row = i / 4u;
+        let column = 4u * (i % 4u);
+        var sums_of_four = array<vec4f, 4>();
+        for (var k = 0u; k < 14u; k++) {
+            let xy = pairs[row * SEEN + column + k];
+            let moments = vec4f(xy, dot(xy, xy), xy.x * xy.y);
+            for (var q = 0u; q < 4u; q++) {
+                sums_of_four[q] += window_weight(k, q) * moments;
+            }
         }
-        rows[i] = sum;
+        for (var q = 0u; q < 4u; q++) {
+            rows[row * TILE + column + q] = sums_of_four[q];
+        }
     }
     workgroupBarrier();
-    var mean = vec4f(0.0);
-    for (var k = 0u; k < 11u; k++) {
-        mean += WINDOW[max(k, 10u - k) - RADIUS] * rows[(at / TILE + k) * TILE + at % TILE];
+    let column = at % TILE;
+    let row = 4u * (at / TILE);
+    var means = array<vec4f, 4>();
+    for (var k = 0u; k < 14u; k++) {
+        let moments = rows[(row + k) * TILE + column];
+        for (var q = 0u; q < 4u; q++) {
+            means[q] += window_weight(k, q) * moments;
+        }
     }
-    let pixel = vec2i(corner + i32(RADIUS) + vec2i(vec2u(at % TILE, at / TILE)));
     var dissimilarity = 0.0;
-    if channel < 3u && all(pixel < size) {
-        let to = u32(pixel.y * size.x + pixel.x);
-        let m = weight_at(to);
-        let product = mean.x * mean.y;
-        let squares = mean.x * mean.x + mean.y * mean.y;
-        let n1 = 2.0 * product + C1;
-        let d1 = squares + C1;
-        let n2 = 2.0 * (mean.w - product) + C2;
-        let d2 = max(mean.z - squares, 0.0) + C2;
-        let inverse = 1.0 / (d1 * d2);
-        let scale = m * inverse;
-        let ssim = n1 * n2 * scale;
-        dissimilarity = m - ssim;
-        let by_d2 = ssim * (d1 * inverse);
-        let by_d1 = ssim * (d2 * inverse);
-        let pixels = task.size.x * task.size.y;
-        let plane = 3u * channel * pixels + to;
-        maps[plane] = mean.y * scale * (n2 - n1) + mean.x * (by_d2 - by_d1);
-        maps[plane + pixels] = -by_d2;
-        maps[plane + 2u * pixels] = n1 * scale;
+    for (var q = 0u; q < 4u; q++) {
+        let pixel = corner + i32(RADIUS) + vec2i(vec2u(column, row + q));
+        if channel < 3u && all(pixel < size) {
+            dissimilarity += differentiate(means[q], u32(pixel.y * size.x + pixel.x), channel);
+        }
     }
     let sum = sum_group(vec3f(0.0, 0.0, dissimilarity), at);
     if at == 0u && channel < 3u {
         sums[3u * number + 2u] = sum.z;
     }
+}
+
+// Writes the derivatives at a pixel, from the window's means; returns its weighted 1 - SSIM.
+fn differentiate(mean: vec4f, to: u32, channel: u32) -> f32 {
+    let m = weight_at(to);
+    let product = mean.x * mean.y;
+    let squares = mean.x * mean.x + mean.y * mean.y;
+    let n1 = 2.0 * product + C1;
+    let d1 = squares + C1;
+    let n2 = 2.0 * (mean.w - product) + C2;
+    let d2 = max(mean.z - squares, 0.0) + C2;
+    let inverse = 1.0 / (d1 * d2);
+    let scale = m * inverse;
+    let ssim = n1 * n2 * scale;
+    let by_d2 = ssim * (d1 * inverse);
+    let by_d1 = ssim * (d2 * inverse);
+    let pixels = task.size.x * task.size.y;
+    let plane = 3u * channel * pixels + to;
+    maps[plane] = mean.y * scale * (n2 - n1) + mean.x * (by_d2 - by_d1);
+    maps[plane + pixels] = -by_d2;
+    maps[plane + 2u * pixels] = n1 * scale;
+    return m - ssim;
 }

@@ -11,6 +11,7 @@
 // Pixels less opaque than this do not count.
 const MIN_ALPHA: f32 = 0.5;
 
+const THREADS: u32 = 256u;
 var<workgroup> shared_values: array<vec3f, 256>;
 
 struct Sample {

@@ -6,12 +6,14 @@
 
 use crate::densify::mcmc;
 #[cfg(feature = "gpu")]
-use crate::gpu::GpuTraining;
+use crate::gpu::{DeviceGradient, GpuTraining};
 use crate::regularize::{self, Regularized, Regularizers};
 use crate::render::{
     CameraGradient, ChunkBounds, FramePlanes, OutputGradient, RenderOptions, Renderer, SplatGradients, ViewParams,
 };
 use crate::{Optimizer, Rates, SplatState, Splats, Statistics, Surface};
+#[cfg(feature = "gpu")]
+use irradia_compute::gpu::Array;
 use irradia_compute::{Device, DeviceError};
 use irradia_scene::{Camera, sh};
 use rayon::prelude::*;
@@ -297,6 +299,22 @@ impl Engine {
         }
         let splats = self.moved.as_ref().unwrap_or(&known(&self.state).splats);
         self.renderer.backward(splats, v_out, &mut self.gradients);
+    }
+
+    /// The planes of the last frame on a GPU, and room for those of its gradients, `[3 + 1 + 1 (+ 1), H, W]`: colour, alpha, depth, and the
+    /// error to gather. `None` on the CPU.
+    #[cfg(feature = "gpu")]
+    pub fn device_frame(&mut self) -> Option<[&Array; 2]> {
+        self.gpu.as_mut().map(|gpu| gpu.frame_and_gradients())
+    }
+
+    /// As [`Self::backward`], of the gradients written to [`Self::device_frame`].
+    ///
+    /// # Panics
+    /// When the engine is on the CPU.
+    #[cfg(feature = "gpu")]
+    pub fn backward_on_device(&mut self, of: &DeviceGradient) {
+        self.gpu.as_mut().expect("there is a device frame").propagate(of);
     }
 
     /// Number of splats whose gradient was not finite in the last backward pass; on a GPU, in the one before.

@@ -21,7 +21,7 @@ pub(crate) use principal::eigen;
 
 pub use engine::{Engine, Noise, Placement, Update};
 #[cfg(feature = "gpu")]
-pub use gpu::GpuRenderer;
+pub use gpu::{DeviceGradient, GpuRenderer};
 pub use nearest::{Nearest, Neighbour};
 pub use render::{
     CameraGradient, FramePlanes, Gather, OutputGradient, RenderOptions, Renderer, SplatGradients, ViewParams,

@@ -4,6 +4,7 @@
 mod audit;
 pub mod checkpoint;
 pub mod compare;
+mod device;
 mod edges;
 pub mod eval;
 pub mod event;

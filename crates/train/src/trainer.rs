@@ -1,5 +1,6 @@
 //! Start here: [`Trainer::step`] is one step from batch to update.
 
+use crate::device::{DeviceLoss, use_device};
 use crate::event::{Event, StepReport};
 use crate::exposure_probe;
 use crate::field_step::{first_field, is_field};
@@ -8,7 +9,7 @@ use crate::free_space::FreeSpace;
 use crate::half_fit::HalfFit;
 use crate::memory::{MemoryPlan, Needs};
 use crate::model::Model;
-use crate::objective::{Objective, Reference};
+use crate::objective::{Objective, ObjectiveValues, Reference};
 use crate::photos::{PhotoCache, Prepared};
 use crate::recipe::{AdamKind, Choice, DensityControl, LengthUnit, Param, Recipe};
 use crate::schedule::{Clock, Round, StepMetrics, StepPlan, plan, upcoming_views};
@@ -158,6 +159,7 @@ pub struct Trainer {
     /// Known depths of the views on which a field is trained, by view, width and height.
     pub(crate) depths: HashMap<(usize, u32, u32), Arc<[KnownDepth]>>,
     objective: Objective,
+    device_loss: DeviceLoss,
     free_space: FreeSpace,
 }
 
@@ -241,6 +243,7 @@ impl Trainer {
             decisions,
             depths: HashMap::new(),
             objective: Objective::new(options.lpips.clone()),
+            device_loss: DeviceLoss::new(&options.device)?,
             free_space: FreeSpace::new(&dataset, recipe.free_space),
             engine,
             field: None,
@@ -365,27 +368,16 @@ impl Trainer {
             background,
             depths: &self.known_depths(view, &camera, &plan),
         };
-        let frame = FramePlanes {
-            color: self.sockets.frame_color(&self.engine),
-            ..self.engine.frame()
+        let camera_gradient = self.sockets.needs_camera_gradient();
+        let on_device = self.sockets.exposure.is_none().then(|| {
+            let has_lpips = self.options.lpips.is_some();
+            self.device_loss
+                .step(&mut self.engine, &reference, &plan, camera_gradient, has_lpips)
+        });
+        let loss = match on_device.flatten() {
+            Some(loss) => loss,
+            None => self.step_losses(&reference, view, &plan, &mut rng),
         };
-        let loss = self.objective.evaluate(frame, &reference, &plan, &mut rng);
-        if plan.gathers == Some(Statistics::Error) {
-            self.objective.error(frame.color, &photo, background.is_some());
-            if plan.edge_share > 0.0 {
-                self.objective.add_edges(&photo, plan.edge_share);
-            }
-        }
-        self.sockets
-            .step_after_blending(&self.engine, view, self.objective.v_color_mut(), &plan);
-        let mut v_out = self.objective.gradient();
-        v_out.camera = self.sockets.needs_camera_gradient();
-        v_out.gather = match plan.gathers {
-            Some(Statistics::AbsoluteGradient) => Gather::Absolute,
-            Some(Statistics::Error) => self.objective.gather_error(),
-            Some(Statistics::Gradient) | None => Gather::Nothing,
-        };
-        self.engine.backward(&v_out);
         self.sockets
             .step_before_blending(&mut self.engine, view, &camera, self.extent, &plan);
         self.engine.update(&self.update(&plan));
@@ -421,6 +413,33 @@ impl Trainer {
             non_finite: self.engine.non_finite(),
         };
         Ok((report, metrics))
+    }
+
+    /// The losses of the last frame, on the host, and its backward pass.
+    fn step_losses(&mut self, reference: &Reference, view: usize, plan: &StepPlan, rng: &mut Rng) -> ObjectiveValues {
+        let frame = FramePlanes {
+            color: self.sockets.frame_color(&self.engine),
+            ..self.engine.frame()
+        };
+        let loss = self.objective.evaluate(frame, reference, plan, rng);
+        if plan.gathers == Some(Statistics::Error) {
+            self.objective
+                .error(frame.color, reference.photo, reference.background.is_some());
+            if plan.edge_share > 0.0 {
+                self.objective.add_edges(reference.photo, plan.edge_share);
+            }
+        }
+        self.sockets
+            .step_after_blending(&self.engine, view, self.objective.v_color_mut(), plan);
+        let mut v_out = self.objective.gradient();
+        v_out.camera = self.sockets.needs_camera_gradient();
+        v_out.gather = match plan.gathers {
+            Some(Statistics::AbsoluteGradient) => Gather::Absolute,
+            Some(Statistics::Error) => self.objective.gather_error(),
+            Some(Statistics::Gradient) | None => Gather::Nothing,
+        };
+        self.engine.backward(&v_out);
+        loss
     }
 
     /// The splat update of this step.
@@ -693,27 +712,6 @@ impl Trainer {
                 .map(|field| Box::new(field.clone())),
         }
     }
-}
-
-/// Puts the engine on the device, as far as the recipe's splats can be trained there. Returns what is told of it.
-fn use_device(engine: &mut Engine, device: &Device, recipe: &Recipe) -> Result<Vec<String>, DeviceError> {
-    if device.is_cpu() {
-        return Ok(Vec::new());
-    }
-    let fields = (0..recipe.stage.len()).filter(|stage| is_field(recipe, *stage)).count();
-    let name = &recipe.name;
-    if recipe.residual.is_some() || fields == recipe.stage.len() {
-        return Ok(vec![format!(
-            "recipe {name} trains a field: on the CPU, not on {device}"
-        )]);
-    }
-    engine.use_device(device)?;
-    let of_fields = if fields > 0 {
-        "; its field is trained on the CPU"
-    } else {
-        ""
-    };
-    Ok(vec![format!("splats are trained on {device}{of_fields}")])
 }
 
 fn train_cameras(dataset: &Dataset) -> Vec<Camera> {

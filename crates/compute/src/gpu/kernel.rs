@@ -41,6 +41,8 @@ const LINE: u32 = 65_535;
 pub struct Work<'a> {
     gpu: &'a Gpu,
     encoder: wgpu::CommandEncoder,
+    /// Names of the kernels, for the profile.
+    names: Vec<&'static str>,
 }
 
 impl<'a> Work<'a> {
@@ -49,6 +51,7 @@ impl<'a> Work<'a> {
         Self {
             gpu,
             encoder: gpu.device.create_command_encoder(&Default::default()),
+            names: Vec::new(),
         }
     }
 
@@ -75,9 +78,12 @@ impl<'a> Work<'a> {
             layout: &kernel.pipeline.get_bind_group_layout(0),
             entries: &entries,
         });
+        let profile = self.gpu.profile.get();
+        let timestamp_writes = profile.and_then(|profile| profile.writes(self.names.len()));
+        self.names.push(kernel.name);
         let mut pass = self.encoder.begin_compute_pass(&wgpu::ComputePassDescriptor {
             label: Some(kernel.name),
-            timestamp_writes: None,
+            timestamp_writes,
         });
         pass.set_pipeline(&kernel.pipeline);
         pass.set_bind_group(0, &bindings, &[]);
@@ -102,6 +108,11 @@ impl<'a> Work<'a> {
 
     /// Hands it to the device, which begins at once.
     pub fn submit(self) {
-        self.gpu.queue.submit([self.encoder.finish()]);
+        match self.gpu.profile.get() {
+            Some(profile) => profile.submit(self.gpu, self.encoder, &self.names),
+            None => {
+                self.gpu.queue.submit([self.encoder.finish()]);
+            }
+        }
     }
 }

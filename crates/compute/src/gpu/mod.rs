@@ -6,6 +6,7 @@
 
 mod array;
 mod kernel;
+mod profile;
 mod scan;
 mod sort;
 
@@ -16,8 +17,10 @@ pub use scan::Scan;
 pub use sort::Sort;
 
 use crate::DeviceError;
+use profile::Profile;
+use std::collections::BTreeMap;
 use std::fmt;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 
 /// Threads of a workgroup, where a kernel has no reason for another number: what every implementation offers at least.
 pub const GROUP: u32 = 256;
@@ -84,6 +87,7 @@ pub struct Gpu {
     queue: wgpu::Queue,
     info: AdapterInfo,
     failure: Arc<Mutex<Option<String>>>,
+    profile: OnceLock<Profile>,
 }
 
 impl fmt::Debug for Gpu {
@@ -92,6 +96,8 @@ impl fmt::Debug for Gpu {
     }
 }
 
+/// Bytes that a workgroup of the largest kernel shares.
+const SHARED: u32 = 22 << 10;
 /// Storage arrays that a kernel binds at most.
 const BINDINGS: u32 = 12;
 
@@ -139,7 +145,8 @@ fn describe(adapter: &wgpu::Adapter) -> AdapterInfo {
             false => [0; 2],
         },
         is_usable: limits.max_storage_buffers_per_shader_stage >= BINDINGS
-            && limits.max_compute_invocations_per_workgroup >= GROUP,
+            && limits.max_compute_invocations_per_workgroup >= GROUP
+            && limits.max_compute_workgroup_storage_size >= SHARED,
     }
 }
 
@@ -168,6 +175,7 @@ impl Gpu {
         };
         let descriptor = wgpu::DeviceDescriptor {
             label: Some("irradia"),
+            required_features: adapter.features() & wgpu::Features::TIMESTAMP_QUERY,
             required_limits: adapter.limits(),
             memory_hints: wgpu::MemoryHints::Performance,
             ..Default::default()
@@ -196,6 +204,7 @@ impl Gpu {
             queue,
             info,
             failure,
+            profile: OnceLock::new(),
         }))
     }
 
@@ -222,6 +231,23 @@ impl Gpu {
     pub fn fail(&self, reason: &str) {
         let mut failure = self.failure.lock().unwrap_or_else(PoisonError::into_inner);
         failure.get_or_insert(one_line(reason));
+    }
+
+    /// From now on measures each kernel by the device's clock, and waits for every submission. Whether the device has such a clock.
+    pub fn start_profile(&self) -> bool {
+        let has_clock = self.device.features().contains(wgpu::Features::TIMESTAMP_QUERY);
+        if has_clock {
+            self.profile.get_or_init(|| Profile::new(&self.device, &self.queue));
+        }
+        has_clock
+    }
+
+    /// Seconds and calls of each kernel since [`Gpu::start_profile`] or the last call; empty if the device has no clock.
+    pub fn take_profile(&self) -> BTreeMap<&'static str, (f64, u64)> {
+        let profile = self.profile.get();
+        profile.map_or_else(BTreeMap::new, |profile| {
+            std::mem::take(&mut *profile.spent.lock().unwrap_or_else(PoisonError::into_inner))
+        })
     }
 
     /// Waits until everything submitted is done.

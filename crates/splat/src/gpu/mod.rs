@@ -8,6 +8,7 @@ mod frame;
 mod training;
 
 pub use frame::GpuRenderer;
+pub use training::DeviceGradient;
 pub(crate) use training::GpuTraining;
 
 #[cfg(test)]

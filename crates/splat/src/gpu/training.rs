@@ -31,6 +31,19 @@ mod flags {
     pub const ERROR: u32 = 128;
 }
 
+/// Which gradients a frame on the device has.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct DeviceGradient {
+    /// Of alpha.
+    pub alpha: bool,
+    /// Of the accumulated depth.
+    pub depth: bool,
+    /// What else to accumulate per splat, for these statistics.
+    pub gather: Option<Statistics>,
+    /// Whether the camera's gradient is wanted.
+    pub camera: bool,
+}
+
 /// The twin of the CPU's state, renderer and gradients.
 pub(crate) struct GpuTraining {
     pub renderer: GpuRenderer,
@@ -120,35 +133,57 @@ impl GpuTraining {
         self.renderer.draw(view, options, true);
     }
 
+    /// The planes of the last frame, and room for those of its gradients: red, green, blue, alpha, depth, and the error to gather.
+    pub fn frame_and_gradients(&mut self) -> [&Array; 2] {
+        let pixels = self.renderer.last.as_ref().expect("render comes first").pixels();
+        self.v_frame.reserve(&self.renderer.gpu, (FRAME_PLANES + 1) * pixels);
+        [&self.renderer.planes, &self.v_frame]
+    }
+
     /// The gradients of the last frame, which stay on the device until the update.
     pub fn backward(&mut self, v_out: &OutputGradient) {
+        let pixels = self.renderer.last.as_ref().expect("render comes first").pixels();
+        assert_eq!(v_out.color.len(), 3 * pixels, "a colour gradient per pixel");
+        let gpu = self.renderer.gpu.clone();
+        let [_, v_frame] = self.frame_and_gradients();
+        v_frame.write(&gpu, 0, v_out.color);
+        if let Some(alpha) = v_out.alpha {
+            v_frame.write(&gpu, 3 * pixels, alpha);
+        }
+        if let Some(depth) = v_out.depth {
+            v_frame.write(&gpu, 4 * pixels, depth);
+        }
+        if let Gather::Error(error) = v_out.gather {
+            v_frame.write(&gpu, 5 * pixels, error);
+        }
+        self.propagate(&DeviceGradient {
+            alpha: v_out.alpha.is_some(),
+            depth: v_out.depth.is_some(),
+            gather: match v_out.gather {
+                Gather::Nothing => None,
+                Gather::Absolute => Some(Statistics::AbsoluteGradient),
+                Gather::Error(_) => Some(Statistics::Error),
+            },
+            camera: v_out.camera,
+        });
+    }
+
+    /// As [`Self::backward`], of the gradients that [`Self::frame_and_gradients`] received.
+    pub fn propagate(&mut self, of: &DeviceGradient) {
         let renderer = &mut self.renderer;
         let last = renderer.last.clone().expect("render comes first");
         assert!(last.trains, "a frame of a training");
-        let (gpu, pixels) = (renderer.gpu.clone(), last.pixels());
-        assert_eq!(v_out.color.len(), 3 * pixels, "a colour gradient per pixel");
-        self.v_frame.reserve(&gpu, (FRAME_PLANES + 1) * pixels);
-        self.v_frame.write(&gpu, 0, v_out.color);
-        let mut more = 0;
-        if let Some(alpha) = v_out.alpha {
-            self.v_frame.write(&gpu, 3 * pixels, alpha);
-            more |= flag::ALPHA;
-        }
-        if let Some(depth) = v_out.depth {
-            self.v_frame.write(&gpu, 4 * pixels, depth);
-            more |= flag::DEPTH;
-        }
-        match v_out.gather {
-            Gather::Nothing => {}
-            Gather::Absolute => more |= flag::GATHER_ABSOLUTE,
-            Gather::Error(error) => {
-                self.v_frame.write(&gpu, 5 * pixels, error);
-                more |= flag::GATHER_ERROR;
-            }
-        }
+        let gpu = renderer.gpu.clone();
+        let bits = [
+            (of.alpha, flag::ALPHA),
+            (of.depth, flag::DEPTH),
+            (of.gather == Some(Statistics::AbsoluteGradient), flag::GATHER_ABSOLUTE),
+            (of.gather == Some(Statistics::Error), flag::GATHER_ERROR),
+            (of.camera, flag::CAMERA),
+        ];
+        let more = bits.iter().filter(|(on, _)| *on).map(|(_, bit)| bit).sum();
         let [visible, entries] = last.found;
-        if v_out.camera {
-            more |= flag::CAMERA;
+        if of.camera {
             self.v_camera.reserve(&gpu, CAMERA * visible);
         }
         renderer.view.write(&gpu, 0, &renderer.view_words(&last, more));
@@ -193,7 +228,7 @@ impl GpuTraining {
             visible.div_ceil(VJP_GROUP),
         );
         work.submit();
-        self.camera = v_out.camera.then(|| self.sum_camera(&last.view, visible));
+        self.camera = of.camera.then(|| self.sum_camera(&last.view, visible));
     }
 
     /// Sums the camera's gradients in order, in double precision.

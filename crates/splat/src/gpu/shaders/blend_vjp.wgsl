@@ -1,6 +1,7 @@
 // The vector-Jacobian product of blending, a segment of a tile by each workgroup of 32 threads. A thread holds a splat and its sums, and
-// visits all pixels of the tile, one after the splat before it: the state of a pixel, transmittance and light from behind, passes from
-// thread to thread through shared memory. So there are no reductions over pixels and no atomics, and every sum has a fixed order
+// visits all pixels of the tile, four a turn, a turn after the thread before it: the state of a pixel, transmittance and light from behind,
+// passes from thread to thread through shared memory. A thread that is through takes the splat 32 behind its own at once, since the last
+// thread is by then ahead of the first. So there are no reductions over pixels and no atomics, and every sum has a fixed order
 // (the scheme of Taming 3DGS, Mallick et al. 2024, section 5, with shared memory for the shuffles of a warp, whose width differs).
 @group(0) @binding(0) var<uniform> view: View;
 @group(0) @binding(1) var<storage, read> ranges: array<vec2u>;
@@ -16,6 +17,9 @@
 @group(0) @binding(10) var<storage, read> v_frame: array<f32>;
 // [slot, 12]: the moments 1, dx, dy, dx^2, dx dy, dy^2 of v_p / ln 2, gradients of red, green, blue and depth, two gathered sums.
 @group(0) @binding(11) var<storage, read_write> sums: array<f32>;
+
+// Turns of a thread with one splat: the pixels of a tile, four at a time.
+const TURNS: u32 = 64u;
 
 var<workgroup> transmittances: array<f32, 256>;
 var<workgroup> rests: array<f32, 256>;
@@ -82,15 +86,28 @@ fn main(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups: ve
     }
 
     let origin = vec2f(corner) + 0.5;
-    for (var bucket = 0u; bucket < count; bucket += 32u) {
-        let holds = bucket + lane < count;
-        var slot = 0u;
-        var xy = vec2f(0.0);
-        var quadratic = vec3f(0.0);
-        var log2_opacity = 0.0;
-        var color = vec4f(0.0);
-        if holds {
-            slot = slots[first + bucket + lane];
+    var slot = 0u;
+    var xy = vec2f(0.0);
+    var quadratic = vec3f(0.0);
+    var log2_opacity = 0.0;
+    var color = vec4f(0.0);
+    var moment0 = 0.0;
+    var moments1 = vec2f(0.0);
+    var moments2 = vec3f(0.0);
+    var v_color = vec4f(0.0);
+    var gathered = vec2f(0.0);
+    let turns = (count + 31u) / 32u * TURNS + 31u;
+    for (var turn = 0u; turn < turns; turn++) {
+        workgroupBarrier();
+        // Before its first turn, this has wrapped around.
+        let own = turn - lane;
+        let k = own / TURNS * 32u + lane;
+        if own >= turns || k >= count {
+            continue;
+        }
+        let group_of_four = own % TURNS;
+        if group_of_four == 0u {
+            slot = slots[first + k];
             let i = splat_of_slot[slot];
             let a = footprints[3u * i];
             let b = footprints[3u * i + 1u];
@@ -99,50 +116,45 @@ fn main(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups: ve
             quadratic = vec3f(a.zw, b.x);
             log2_opacity = b.y;
             color = vec4f(b.zw, c.x, c.y);
+            moment0 = 0.0;
+            moments1 = vec2f(0.0);
+            moments2 = vec3f(0.0);
+            v_color = vec4f(0.0);
+            gathered = vec2f(0.0);
         }
-        var moment0 = 0.0;
-        var moments1 = vec2f(0.0);
-        var moments2 = vec3f(0.0);
-        var v_color = vec4f(0.0);
-        var gathered = vec2f(0.0);
-        for (var turn = 0u; turn < TILE_PIXELS + 31u; turn++) {
-            workgroupBarrier();
-            let at = turn - lane;
-            // Before its first pixel, `at` has wrapped around.
-            if !holds || at >= TILE_PIXELS {
-                continue;
-            }
+        for (var q = 0u; q < 4u; q++) {
+            let at = 4u * group_of_four + q;
             let t = transmittances[at];
-            if t <= 0.0 {
-                continue;
-            }
             let d = vec2f(f32(at % TILE), f32(at / TILE)) - xy;
-            let f = fragment(exponent(quadratic, log2_opacity, d), t);
-            if f.drawn {
-                let v = v_pixels[at];
-                let g = dot(color, v);
-                let rest = rests[at] - f.weight * g;
-                v_color += f.weight * v;
-                var v_p = 0.0;
-                if !f.capped {
-                    v_p = (t * g - rest / (1.0 - f.alpha)) * f.alpha;
+            let p = exponent(quadratic, log2_opacity, d);
+            if t > 0.0 && LOG2_ALPHA_MIN <= p {
+                let f = fragment(p, t);
+                if f.drawn {
+                    let v = v_pixels[at];
+                    let g = dot(color, v);
+                    let rest = rests[at] - f.weight * g;
+                    v_color += f.weight * v;
+                    var v_p = 0.0;
+                    if !f.capped {
+                        v_p = (t * g - rest / (1.0 - f.alpha)) * f.alpha;
+                    }
+                    moment0 += v_p;
+                    moments1 += v_p * d;
+                    moments2 += v_p * vec3f(d.x * d.x, d.x * d.y, d.y * d.y);
+                    if has(flags, FLAG_GATHER_ABSOLUTE) {
+                        let slope = vec2f(2.0 * quadratic.x * d.x + quadratic.y * d.y, quadratic.y * d.x + 2.0 * quadratic.z * d.y);
+                        gathered += abs(v_p) * abs(slope);
+                    } else if has(flags, FLAG_GATHER_ERROR) {
+                        gathered += f.weight * vec2f(errors[at], 1.0);
+                    }
+                    rests[at] = rest;
+                    transmittances[at] = f.transmittance;
+                } else if f.ends {
+                    transmittances[at] = -t;
                 }
-                moment0 += v_p;
-                moments1 += v_p * d;
-                moments2 += v_p * vec3f(d.x * d.x, d.x * d.y, d.y * d.y);
-                if has(flags, FLAG_GATHER_ABSOLUTE) {
-                    let slope = vec2f(2.0 * quadratic.x * d.x + quadratic.y * d.y, quadratic.y * d.x + 2.0 * quadratic.z * d.y);
-                    gathered += abs(v_p) * abs(slope);
-                } else if has(flags, FLAG_GATHER_ERROR) {
-                    gathered += f.weight * vec2f(errors[at], 1.0);
-                }
-                rests[at] = rest;
-                transmittances[at] = f.transmittance;
-            } else if f.ends {
-                transmittances[at] = -t;
             }
         }
-        if holds {
+        if group_of_four == TURNS - 1u {
             let to = slot * 12u;
             sums[to] = moment0;
             sums[to + 1u] = moments1.x;

@@ -30,6 +30,39 @@ pub(crate) fn kernels() -> &'static str {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::page::file;
+
+    /// Arrays that the page binds to a kernel: the elements of the list behind `.name, ` or `(name, `.
+    fn bound(name: &str) -> usize {
+        let scripts = ["device", "frame", "sort", "webgpu"].map(|script| {
+            let (_, text) = file(&format!("js/local/{script}.js")).expect("a module of the page");
+            text
+        });
+        let calls = ['.', '('].map(|before| format!("{before}{name}, ["));
+        let list = scripts
+            .iter()
+            .flat_map(|text| calls.iter().map(move |call| text.split_once(call)));
+        let (_, list) = list.flatten().next().unwrap_or_else(|| panic!("the page runs {name}"));
+        let (mut depth, mut commas) = (0, 0);
+        for letter in list.chars() {
+            match letter {
+                '[' => depth += 1,
+                ']' if depth == 0 => break,
+                ']' => depth -= 1,
+                ',' if depth == 0 => commas += 1,
+                _ => {}
+            }
+        }
+        commas + 1
+    }
+
+    #[test]
+    fn the_page_binds_what_kernels_have() {
+        for shader in of_a_frame() {
+            let bindings = shader.source().matches("@binding(").count();
+            assert_eq!(bound(shader.name), bindings, "{}", shader.name);
+        }
+    }
 
     #[test]
     fn parts_make_the_kernels_again() {

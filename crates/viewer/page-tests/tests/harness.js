@@ -110,7 +110,7 @@ export async function picture(page) {
   const address = await page.evaluate(() => {
     const { drawsLocally, local, served } = document.querySelector("irr-stage");
     // WebGPU's canvas is empty once the browser has composed it.
-    if (drawsLocally) local.painter.present?.();
+    if (drawsLocally) local.painter.present();
     return (drawsLocally ? local.canvas : served).toDataURL("image/png");
   });
   return PNG.sync.read(Buffer.from(address.split(",")[1], "base64"));

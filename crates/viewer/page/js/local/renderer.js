@@ -148,6 +148,7 @@ export class LocalRenderer {
     const lost = this.gpu;
     this.gpu = null;
     if (this.painter === lost) this.use(this.openWebGl());
+    lost.gpu.device.destroy();
   }
 
   /** Stops using a painter that fails. @param {WebGpu | WebGl | null} painter @param {unknown} error */
@@ -284,6 +285,7 @@ export class LocalRenderer {
       if (moving) this.share = Math.min(1, Math.max(0.25, this.share * Math.min(1.15, Math.max(0.7, Math.sqrt(BUDGET / spent)))));
       if (!isThere || painter !== this.painter) return;
       if (painter.canvas !== this.element.firstChild) this.element.replaceChildren(painter.canvas);
+      painter.present();
       this.sharp = !moving && edition === this.edition;
       this.painted = wanted;
       this.finished = true;

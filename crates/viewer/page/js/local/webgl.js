@@ -163,6 +163,9 @@ export class WebGl {
     return true;
   }
 
+  /** Pictures are painted on the canvas. */
+  present() {}
+
   /** Paints one eye of a headset. @param {WebGLFramebuffer | null} to @param {{ x: number, y: number }} port its corner, pixels
    * @param {Camera} camera @param {Intrinsics} k @param {Options} options */
   eye(to, port, camera, k, options) {

@@ -21,6 +21,8 @@ export class WebGpu {
   degree = 0;
   /** By what the unpacked splats were tinted and clipped. */
   dressed = "";
+  /** Width and height of the last picture. */
+  painted = [1, 1];
   /** Grows with each selection. */
   selection = 0;
 
@@ -52,8 +54,13 @@ export class WebGpu {
       const module = gpu.device.createShaderModule({ label: "present", code: await shader("present.wgsl") });
       return gpu.device.createRenderPipelineAsync({ label: "present", layout: "auto", vertex: { module }, fragment: { module, targets: [{ format }] } });
     };
-    const [kernels, presenting] = await Promise.all([gpu.kernels(), present()]);
-    return new WebGpu(gpu, kernels, presenting, format, changed);
+    try {
+      const [kernels, presenting] = await Promise.all([gpu.kernels(), present()]);
+      return new WebGpu(gpu, kernels, presenting, format, changed);
+    } catch (error) {
+      gpu.device.destroy();
+      throw error;
+    }
   }
 
   /** Makes room; throws where there is too little. @param {number} count @param {number} degree */
@@ -85,15 +92,13 @@ export class WebGpu {
     this.changed();
   }
 
-  /** Paints; resolves when the picture is on the canvas, to whether there is one.
+  /** Paints; resolves when `present` can show the picture, to whether there is one.
    * @param {import("./renderer.js").Camera} camera @param {import("./renderer.js").Intrinsics} k @param {import("./renderer.js").Options} options */
   async paint(camera, k, { near, background, antialias, clip, highlight }) {
     const { gpu, drawn } = this;
     this.dress(clip, highlight);
     if (!(await this.frame.draw({ camera, k, near, background, antialias }, drawn))) return false;
-    [this.canvas.width, this.canvas.height] = [k.width, k.height];
-    this.size.write(0, Uint32Array.of(k.width, k.height));
-    this.present();
+    this.painted = [k.width, k.height];
     await gpu.queue.onSubmittedWorkDone();
     return true;
   }
@@ -118,9 +123,12 @@ export class WebGpu {
     work.submit();
   }
 
-  /** The last frame to the canvas, which holds it until the browser has composed the page. */
+  /** Brings the last picture to the canvas, which holds it until the browser has composed the page. */
   present() {
     const { device, queue } = this.gpu;
+    const [width, height] = this.painted;
+    if (this.canvas.width !== width || this.canvas.height !== height) [this.canvas.width, this.canvas.height] = [width, height];
+    this.size.write(0, Uint32Array.of(width, height));
     const encoder = device.createCommandEncoder();
     const view = this.context.getCurrentTexture().createView();
     const pass = encoder.beginRenderPass({ colorAttachments: [{ view, loadOp: "clear", storeOp: "store" }] });

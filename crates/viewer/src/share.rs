@@ -1,7 +1,7 @@
 //! A scene as one page that opens from the disk, without a network, or as a folder for a web server.
 //!
-//! The page draws with the viewer's own modules and shaders, held as text; the import map gives modules their names as `data:`
-//! addresses. The scene is the compact form of `compact.rs`, gzipped, in base64 or in a file beside the page.
+//! The page draws with the viewer's own modules and shaders; the import map gives modules their names as `data:` addresses, shaders
+//! are gzipped, in base64. The scene is the compact form of `compact.rs`, gzipped, in base64 or in a file beside the page.
 
 use crate::ViewerError;
 use crate::compact::compact;
@@ -193,10 +193,16 @@ fn page(scene: &Scene, options: &ShareOptions, packed: Option<&[u8]>) -> String 
     let mut text = |kind: &str, id: &str, text: &str| {
         texts += &format!("<script type=\"{kind}\" id=\"{id}\">{text}</script>\n");
     };
-    for path in SHADERS.into_iter().chain([KERNELS]) {
-        let name = path.trim_start_matches("shaders/");
-        text("text/plain", name, file(path).expect("a shader").1);
-    }
+    let shaders: serde_json::Map<_, _> = SHADERS
+        .into_iter()
+        .chain([KERNELS])
+        .map(|path| {
+            let name = path.trim_start_matches("shaders/");
+            (name.to_owned(), file(path).expect("a shader").1.into())
+        })
+        .collect();
+    let shaders = gzip(json!(shaders).to_string().as_bytes());
+    text("text/plain", "shaders", &base64::encode(&shaders));
     // A worker of a page from the disk can be no module: what it exports is for tests.
     text(
         "text/plain",

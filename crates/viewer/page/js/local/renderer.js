@@ -33,6 +33,7 @@ export class LocalRenderer {
   webGl = undefined;
   /** Why WebGPU does not paint; empty where it does. */
   reason = "";
+  opened = false;
   /** Whether only WebGL2 may paint. */
   holds = false;
   /** Splats of the scene, and those that have arrived. */
@@ -79,7 +80,8 @@ export class LocalRenderer {
     } catch (error) {
       this.reason = message(error);
     }
-    this.use(this.gpu ?? this.openWebGl());
+    this.opened = true;
+    this.use(this.painterOf());
   }
 
   openWebGl() {
@@ -120,6 +122,8 @@ export class LocalRenderer {
 
   /** @param {string | undefined} mode */
   painterOf(mode = PLAIN) {
+    // Until it is known whether there is WebGPU, nobody paints.
+    if (!this.opened) return null;
     return this.gpu && mode === PLAIN && !this.holds ? this.gpu : this.openWebGl();
   }
 

@@ -7,7 +7,7 @@ import { join } from "node:path";
 import { pathToFileURL } from "node:url";
 import { after, before, test } from "node:test";
 import { PNG } from "pngjs";
-import { browse, OUT, psnr, readPng, run, scratch } from "./harness.js";
+import { browse, OUT, pretendGpu, psnr, readPng, run, scratch } from "./harness.js";
 import { random, trained } from "./scenes.js";
 
 /** @type {import("playwright-core").Browser} */
@@ -18,9 +18,10 @@ after(() => browser.close());
 const SIZE = { width: 640, height: 360 };
 
 /** Opens a shared page and waits for its final picture. */
-async function open(address, options = {}) {
-  const context = await browser.newContext({ viewport: SIZE, ...options });
+async function open(address, options = {}, { by = browser, before = () => {} } = {}) {
+  const context = await by.newContext({ viewport: SIZE, ...options });
   const page = await context.newPage();
+  await page.addInitScript(before);
   const problems = [];
   page.on("pageerror", (error) => problems.push(String(error)));
   page.on("console", (message) => message.type() === "error" && problems.push(message.text()));
@@ -43,20 +44,24 @@ async function settled(page, problems) {
 }
 
 const shown = async (page) => {
-  const address = await page.evaluate(() => document.querySelector("canvas").toDataURL("image/png"));
+  const address = await page.evaluate(() => {
+    // WebGPU's canvas is empty once the browser has composed it.
+    /** @type {any} */ (window).irradia.renderer.painter.present();
+    return document.querySelector("canvas").toDataURL("image/png");
+  });
   return PNG.sync.read(Buffer.from(address.split(",")[1], "base64"));
 };
 
 let frames = 0;
 
 /** The program's picture of the page's camera. */
-async function rendered(page, scene) {
+async function rendered(page, scene, { width, height } = SIZE) {
   const camera = await page.evaluate(() => /** @type {any} */ (window).irradia.camera());
   const file = join(scratch, "shared_camera.json");
   writeFileSync(file, JSON.stringify({ irradia_path: 1, fps: 30, loop: false, ease: false, closing: 0, keys: [{ time: 0, ...camera }] }));
   const out = join(scratch, `shared_${(frames += 1)}`);
   mkdirSync(out);
-  run("render", scene, "--path", file, "--size", `${SIZE.width}x${SIZE.height}`, "--out", out);
+  run("render", scene, "--path", file, "--size", `${width}x${height}`, "--out", out);
   return readPng(join(out, readdirSync(out)[0]));
 }
 
@@ -116,6 +121,22 @@ test("a flight plays by itself, ends at a touch and plays again at the press of 
   const plain = await other.newPage();
   await plain.goto(pathToFileURL(join(scratch, "plain.html")).href);
   assert.equal(await plain.locator("#play").isVisible(), false);
+});
+
+test("a page from a file draws with WebGPU where there is a GPU", async () => {
+  const viewport = { width: 320, height: 180 };
+  const html = join(scratch, "gpu.html");
+  const scene = random(4000);
+  run("share", scene, "-o", html);
+  const by = await browse("webgpu");
+  const { page, problems, asked } = await open(pathToFileURL(html).href, { offline: true, viewport }, { by, before: pretendGpu });
+  assert.equal(await page.evaluate(() => /** @type {any} */ (window).irradia.renderer.api), "WebGPU");
+  const db = psnr(await shown(page), await rendered(page, scene, viewport));
+  console.log(`WebGPU: ${db.toFixed(2)} dB`);
+  assert.ok(db >= 38, `${db} dB`);
+  assert.deepEqual(problems, []);
+  assert.deepEqual(asked, [pathToFileURL(html).href]);
+  await by.close();
 });
 
 test("a page that is too large loses harmonics, then splats, and says so", async () => {

@@ -34,7 +34,8 @@ pub(crate) struct DeviceLoss {
     gpu: Option<irradia_measure::gpu::GpuLoss>,
 }
 
-/// A step's losses need the frame on the host: it has random backgrounds, developed frames, or losses that a GPU lacks.
+/// Whether a step's losses need the frame on the host: for random backgrounds, or losses that a GPU lacks.
+#[cfg(feature = "gpu")]
 fn needs_host(reference: &Reference, plan: &StepPlan, has_lpips: bool) -> bool {
     let weighs = |param| plan.value(param) > 0.0;
     reference.background.is_some()

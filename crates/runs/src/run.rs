@@ -267,6 +267,7 @@ impl Run {
 
     fn save_unfinished(&mut self) -> Result<(), RunError> {
         if !self.trainer.finished() && self.trainer.clock.step > 0 {
+            self.trainer.read_back()?;
             self.journal.save_now(&self.trainer)?;
         }
         Ok(())

@@ -9,6 +9,7 @@ mod device;
 pub mod gpu;
 pub mod nearest;
 pub mod planes;
+pub mod shaders;
 pub mod simd;
 pub mod sort;
 

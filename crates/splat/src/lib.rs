@@ -13,6 +13,7 @@ mod nearest;
 mod principal;
 pub mod regularize;
 pub mod render;
+pub mod shaders;
 mod splats;
 mod state;
 

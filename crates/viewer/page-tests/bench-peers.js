@@ -97,7 +97,7 @@ const http = createServer((request, response) => {
 await new Promise((resolve) => http.listen(0, "127.0.0.1", () => resolve(null)));
 const { port } = /** @type {import("node:net").AddressInfo} */ (http.address());
 
-const browser = await browse({ webgl: true });
+const browser = await browse("webgl");
 const angles = Array.from({ length: FRAMES }, (_, i) => 0.1 * i);
 
 async function peer(name) {

@@ -39,12 +39,12 @@ const turn = (page, seconds) => page.evaluate(async (seconds) => {
     last = id;
   }
   stage.removeEventListener("drawing", count);
-  return { fps: pictures / seconds, delays: stage.delays, size: stage.drawsLocally ? stage.localCanvas.width : stage.served.width };
+  return { fps: pictures / seconds, delays: stage.delays, size: stage.drawsLocally ? stage.local.canvas.width : stage.served.width };
 }, seconds);
 
 // The served picture is measured as a browser without a GPU shows it; WebGL needs the software rasteriser.
 const browser = await browse();
-const drawing = wants("local") ? await browse({ webgl: true }) : null;
+const drawing = wants("local") ? await browse("webgl") : null;
 
 if (wants("served")) {
   const server = await serve("view", random(SPLATS), "--port", "0");

@@ -6,8 +6,11 @@ const text = (id) => /** @type {HTMLElement} */ (document.getElementById(id)).te
 /** Start camera, background and how the scene is drawn, as the program wrote them. */
 export const view = JSON.parse(text("view"));
 
+/** By name. @type {Promise<Record<string, string>>} */
+const shaders = unzipped(inside("shaders")).json();
+
 /** @param {string} name */
-export const shader = async (name) => text(name);
+export const shader = async (name) => (await shaders)[name];
 
 export const orderWorker = () => new Worker(URL.createObjectURL(new Blob([text("order.js")], { type: "text/javascript" })));
 
@@ -16,8 +19,18 @@ export const openMask = async () => null;
 
 /** The scene in compact form. @param {AbortSignal} signal */
 export async function openSplats(signal) {
-  const packed = view.file ? (await fetch(view.file, { signal })).body : new Blob(decoded(text("splats"))).stream();
+  const packed = view.file ? (await fetch(view.file, { signal })).body : inside("splats");
   if (!packed) throw new Error("the scene is not beside the page");
+  return unzipped(packed);
+}
+
+/** What the page holds in base64. @param {string} id */
+function inside(id) {
+  return new Blob(decoded(text(id))).stream();
+}
+
+/** @param {ReadableStream} packed */
+function unzipped(packed) {
   return new Response(packed.pipeThrough(new DecompressionStream("gzip")));
 }
 

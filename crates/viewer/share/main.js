@@ -10,23 +10,25 @@ const STEEPEST = 1.54;
 /** Largest number of device pixels per CSS pixel. */
 const DENSITY = 2;
 
-const canvas = /** @type {HTMLCanvasElement} */ (document.querySelector("canvas"));
+const stage = /** @type {HTMLElement} */ (document.getElementById("stage"));
 const message = /** @type {HTMLElement} */ (document.getElementById("message"));
 const { up, start } = view;
 let camera = start;
 let pivot = view.pivot;
 let stale = true;
 
-const renderer = new LocalRenderer(canvas, () => (stale = true), (problem) => (message.textContent = problem));
-if (renderer.works) renderer.load({ version: 1, background: view.background, antialias: view.antialias });
-else message.textContent = "This browser does not draw with WebGL2.";
+const renderer = new LocalRenderer(stage, () => (stale = true), (problem) => (message.textContent = problem));
+renderer.load({ version: 1, background: view.background, antialias: view.antialias });
+renderer.ready.then(() => {
+  if (!renderer.works) message.textContent = "This browser draws neither with WebGPU nor with WebGL2.";
+});
 // For tests, and for pages that hold this one.
 Object.assign(window, { irradia: { renderer, camera: () => camera, set: (to) => ((camera = to), (stale = true)) } });
 
 /** Pixels and focal length: the picture is at least as wide and as high as at the start. */
 function intrinsics() {
   const density = Math.min(devicePixelRatio || 1, DENSITY);
-  const [width, height] = [Math.max(1, Math.round(canvas.clientWidth * density)), Math.max(1, Math.round(canvas.clientHeight * density))];
+  const [width, height] = [Math.max(1, Math.round(stage.clientWidth * density)), Math.max(1, Math.round(stage.clientHeight * density))];
   const vertical = height / 2 / Math.tan(camera.fov / 2);
   const focal = Math.min(vertical, (vertical * width) / height / view.aspect);
   return { width, height, fx: focal, fy: focal, cx: width / 2, cy: height / 2 };
@@ -105,15 +107,15 @@ function touch() {
   opens = false;
   fly(null);
 }
-for (const kind of ["pointerdown", "wheel"]) canvas.addEventListener(kind, touch);
+for (const kind of ["pointerdown", "wheel"]) stage.addEventListener(kind, touch);
 
 /** @type {Map<number, { x: number, y: number }>} */
 const pointers = new Map();
-canvas.addEventListener("pointerdown", (event) => {
-  canvas.setPointerCapture(event.pointerId);
+stage.addEventListener("pointerdown", (event) => {
+  stage.setPointerCapture(event.pointerId);
   pointers.set(event.pointerId, { x: event.clientX, y: event.clientY });
 });
-canvas.addEventListener("pointermove", (event) => {
+stage.addEventListener("pointermove", (event) => {
   const before = pointers.get(event.pointerId);
   if (!before) return;
   const now = { x: event.clientX, y: event.clientY };
@@ -127,13 +129,13 @@ canvas.addEventListener("pointermove", (event) => {
   else orbit(dx, dy);
   pointers.set(event.pointerId, now);
 });
-for (const kind of /** @type {const} */ (["pointerup", "pointercancel"])) canvas.addEventListener(kind, (event) => pointers.delete(event.pointerId));
-canvas.addEventListener("contextmenu", (event) => event.preventDefault());
-canvas.addEventListener("wheel", (event) => {
+for (const kind of /** @type {const} */ (["pointerup", "pointercancel"])) stage.addEventListener(kind, (event) => pointers.delete(event.pointerId));
+stage.addEventListener("contextmenu", (event) => event.preventDefault());
+stage.addEventListener("wheel", (event) => {
   event.preventDefault();
   dolly(-event.deltaY * (event.deltaMode === 1 ? 16 : 1) * (event.ctrlKey ? 0.01 : 0.0015));
 }, { passive: false });
-canvas.addEventListener("dblclick", () => {
+stage.addEventListener("dblclick", () => {
   [camera, pivot, stale] = [start, view.pivot, true];
 });
 addEventListener("keydown", ({ key }) => {
@@ -147,7 +149,7 @@ addEventListener("keydown", ({ key }) => {
   else if (key === "-") dolly(-0.2);
   else if (key === "Home") [camera, pivot, stale] = [start, view.pivot, true];
 });
-new ResizeObserver(() => (stale = true)).observe(canvas);
+new ResizeObserver(() => (stale = true)).observe(stage);
 
 /** @param {number} now */
 function frame(now) {

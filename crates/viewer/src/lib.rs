@@ -17,6 +17,7 @@
 //! | `paint.rs`, `palette.rs` | a camera's picture: colours, depth, normals, counts, ellipses, errors |
 //! | `editing/` | selections and edits of a finished scene, which all pages share |
 //! | `compact.rs`, `importance.rs` | splats as they travel to a browser that draws them itself, most important first |
+//! | `kernels.rs` | the program's compute shaders, for browsers with WebGPU |
 //! | `share.rs` | a scene as one page, or a folder for a web server |
 //! | `listen.rs`, `guard.rs`, `serve.rs`, `page.rs` | addresses, who may talk to us, and what is answered |
 //! | `client.rs`, `message.rs` | the socket of one page |
@@ -32,6 +33,7 @@ mod editing;
 mod error;
 mod guard;
 mod importance;
+mod kernels;
 mod listen;
 mod live;
 mod message;

@@ -1,9 +1,15 @@
-//! The files of the page, as they are in `page/`.
+//! The files of the page: those of `page/`, as they are, and the program's own shaders.
+
+use crate::kernels::kernels;
 
 const HTML: &str = "text/html; charset=utf-8";
 const CSS: &str = "text/css; charset=utf-8";
 const SCRIPT: &str = "text/javascript; charset=utf-8";
 const TEXT: &str = "text/plain; charset=utf-8";
+const JSON: &str = "application/json";
+
+/// What the page gets of [`kernels`].
+pub(crate) const KERNELS: &str = "shaders/kernels.json";
 
 macro_rules! files {
     ($($kind:ident $name:literal,)*) => {
@@ -30,9 +36,14 @@ const FILES: &[(&str, &str, &str)] = files![
     SCRIPT "js/hud.js",
     SCRIPT "js/icons.js",
     SCRIPT "js/local/assets.js",
+    SCRIPT "js/local/device.js",
+    SCRIPT "js/local/frame.js",
     SCRIPT "js/local/order.js",
     SCRIPT "js/local/renderer.js",
+    SCRIPT "js/local/sort.js",
     SCRIPT "js/local/stream.js",
+    SCRIPT "js/local/webgl.js",
+    SCRIPT "js/local/webgpu.js",
     SCRIPT "js/main.js",
     SCRIPT "js/math.js",
     SCRIPT "js/navigation.js",
@@ -50,11 +61,13 @@ const FILES: &[(&str, &str, &str)] = files![
     SCRIPT "js/timeline.js",
     SCRIPT "js/toolbar.js",
     SCRIPT "js/xr.js",
+    TEXT "shaders/present.wgsl",
     TEXT "shaders/project.frag",
     TEXT "shaders/project.vert",
     TEXT "shaders/shape.frag",
     TEXT "shaders/splat.frag",
     TEXT "shaders/splat.vert",
+    TEXT "shaders/unpack.wgsl",
     CSS "style/controls.css",
     CSS "style/layout.css",
     CSS "style/stage.css",
@@ -63,6 +76,9 @@ const FILES: &[(&str, &str, &str)] = files![
 
 /// Content type and text of a file.
 pub(crate) fn file(name: &str) -> Option<(&'static str, &'static str)> {
+    if name == KERNELS {
+        return Some((JSON, kernels()));
+    }
     FILES
         .iter()
         .find(|(known, ..)| *known == name)

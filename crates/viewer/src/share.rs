@@ -1,11 +1,11 @@
 //! A scene as one page that opens from the disk, without a network, or as a folder for a web server.
 //!
-//! The page draws with the viewer's own modules and shaders, held as text; the import map gives modules their names as `data:`
-//! addresses. The scene is the compact form of `compact.rs`, gzipped, in base64 or in a file beside the page.
+//! The page draws with the viewer's own modules and shaders; the import map gives modules their names as `data:` addresses, shaders
+//! are gzipped, in base64. The scene is the compact form of `compact.rs`, gzipped, in base64 or in a file beside the page.
 
 use crate::ViewerError;
 use crate::compact::compact;
-use crate::page::file;
+use crate::page::{KERNELS, file};
 use irradia_runs::formats::{gzip, write_atomic};
 use irradia_runs::scene::base64;
 use irradia_runs::{Film, Scene};
@@ -25,6 +25,19 @@ const POSTER: (u32, u32) = (1280, 720);
 const KEYS_PER_SECOND: f32 = 5.0;
 /// Tries to meet a limit of bytes by merging splats.
 const TRIES: u32 = 5;
+
+/// Modules of the page that draw, in `js/local/`.
+const DRAWING: [&str; 7] = ["device", "frame", "renderer", "sort", "stream", "webgl", "webgpu"];
+/// Their shaders, beside the program's own.
+const SHADERS: [&str; 7] = [
+    "shaders/project.vert",
+    "shaders/project.frag",
+    "shaders/splat.vert",
+    "shaders/splat.frag",
+    "shaders/shape.frag",
+    "shaders/unpack.wgsl",
+    "shaders/present.wgsl",
+];
 
 /// What to share, and how.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -158,31 +171,38 @@ fn page(scene: &Scene, options: &ShareOptions, packed: Option<&[u8]>) -> String 
     let module = |name: &str| {
         let (_, text) = file(name).expect("a file of the page");
         // Modules name each other by their places in the folder; in one page they have names only.
-        ["\"../math.js\"", "\"./stream.js\"", "\"./assets.js\""]
-            .iter()
+        ["../math", "./assets"]
+            .into_iter()
+            .map(str::to_owned)
+            .chain(DRAWING.map(|name| format!("./{name}")))
             .fold(text.to_owned(), |text, place| {
-                let name = place.trim_matches('"').rsplit('/').next().unwrap_or_default();
-                text.replace(place, &format!("\"irradia/{name}\""))
+                let name = place.rsplit('/').next().unwrap_or_default();
+                text.replace(&format!("\"{place}.js\""), &format!("\"irradia/{name}.js\""))
             })
     };
     let address = |text: &str| format!("data:text/javascript;base64,{}", base64::encode(text.as_bytes()));
-    let imports = json!({ "imports": {
+    let mut imports = json!({
         "irradia/math.js": address(&module("js/math.js")),
-        "irradia/stream.js": address(&module("js/local/stream.js")),
-        "irradia/renderer.js": address(&module("js/local/renderer.js")),
         "irradia/assets.js": address(include_str!("../share/assets.js")),
-    }});
+    });
+    for name in DRAWING {
+        imports[format!("irradia/{name}.js")] = address(&module(&format!("js/local/{name}.js"))).into();
+    }
+    let imports = json!({ "imports": imports });
     let mut texts = String::new();
     let mut text = |kind: &str, id: &str, text: &str| {
         texts += &format!("<script type=\"{kind}\" id=\"{id}\">{text}</script>\n");
     };
-    for name in ["project.vert", "project.frag", "splat.vert", "splat.frag", "shape.frag"] {
-        text(
-            "text/plain",
-            name,
-            file(&format!("shaders/{name}")).expect("a shader").1,
-        );
-    }
+    let shaders: serde_json::Map<_, _> = SHADERS
+        .into_iter()
+        .chain([KERNELS])
+        .map(|path| {
+            let name = path.trim_start_matches("shaders/");
+            (name.to_owned(), file(path).expect("a shader").1.into())
+        })
+        .collect();
+    let shaders = gzip(json!(shaders).to_string().as_bytes());
+    text("text/plain", "shaders", &base64::encode(&shaders));
     // A worker of a page from the disk can be no module: what it exports is for tests.
     text(
         "text/plain",

@@ -1,21 +1,5 @@
-use super::{Array, Gpu};
+use super::{Array, Gpu, Shader};
 use std::borrow::Cow;
-
-/// The source of a kernel. Its entry point is `main`, its bindings are those of group 0, in order, all of them used.
-#[derive(Clone, Copy, Debug)]
-pub struct Shader {
-    /// For messages and tests.
-    pub name: &'static str,
-    /// WGSL: shared functions first.
-    pub parts: &'static [&'static str],
-}
-
-impl Shader {
-    /// The whole source.
-    pub fn source(&self) -> String {
-        self.parts.concat()
-    }
-}
 
 /// A compiled shader.
 #[derive(Debug)]

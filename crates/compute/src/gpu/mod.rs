@@ -10,8 +10,9 @@ mod profile;
 mod scan;
 mod sort;
 
+pub use crate::shaders::{GRID, Shader};
 pub use array::Array;
-pub use kernel::{Kernel, Shader, Work};
+pub use kernel::{Kernel, Work};
 pub use scan::Scan;
 pub use sort::Sort;
 
@@ -20,9 +21,6 @@ use profile::Profile;
 use std::collections::BTreeMap;
 use std::fmt;
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
-
-/// `group_index`: the number of a workgroup, for kernels that [`Work::run`] runs.
-pub const GRID: &str = include_str!("shaders/grid.wgsl");
 
 /// Threads of a workgroup, where a kernel has no reason for another number: what every implementation offers at least.
 pub const GROUP: u32 = 256;

@@ -1,20 +1,5 @@
-use super::{Array, GRID, Gpu, Kernel, Shader, Work};
-
-const GROUP_SCAN: &str = include_str!("shaders/scan_group.wgsl");
-pub(super) const SHADERS: [Shader; 3] = [
-    Shader {
-        name: "scan_blocks",
-        parts: &[GRID, include_str!("shaders/scan_blocks.wgsl")],
-    },
-    Shader {
-        name: "scan_sums",
-        parts: &[GROUP_SCAN, include_str!("shaders/scan_sums.wgsl")],
-    },
-    Shader {
-        name: "scan_apply",
-        parts: &[GRID, GROUP_SCAN, include_str!("shaders/scan_apply.wgsl")],
-    },
-];
+use super::{Array, Gpu, Kernel, Work};
+use crate::shaders::SCAN;
 
 /// Words of a block.
 const BLOCK: usize = 2048;
@@ -30,7 +15,7 @@ impl Scan {
     /// Compiles.
     pub fn new(gpu: &Gpu) -> Self {
         Self {
-            kernels: SHADERS.each_ref().map(|shader| Kernel::new(gpu, shader)),
+            kernels: SCAN.each_ref().map(|shader| Kernel::new(gpu, shader)),
             sums: Array::zeros(gpu, "sums of blocks", 0),
         }
     }

@@ -1,19 +1,5 @@
-use super::{Array, GRID, Gpu, Kernel, Scan, Shader, Work};
-
-pub(super) const SHADERS: [Shader; 2] = [
-    Shader {
-        name: "sort_count",
-        parts: &[GRID, include_str!("shaders/sort_count.wgsl")],
-    },
-    Shader {
-        name: "sort_scatter",
-        parts: &[
-            GRID,
-            include_str!("shaders/scan_group.wgsl"),
-            include_str!("shaders/sort_scatter.wgsl"),
-        ],
-    },
-];
+use super::{Array, Gpu, Kernel, Scan, Work};
+use crate::shaders::SORT;
 
 /// Keys of a block.
 const BLOCK: usize = 4096;
@@ -44,7 +30,7 @@ impl Sort {
         // An even number, so that what is sorted ends where it was.
         let passes = bits.div_ceil(DIGIT).next_multiple_of(2);
         Self {
-            kernels: SHADERS.each_ref().map(|shader| Kernel::new(gpu, shader)),
+            kernels: SORT.each_ref().map(|shader| Kernel::new(gpu, shader)),
             scan: Scan::new(gpu),
             passes: (0..passes)
                 .map(|_| Pass {

@@ -1,7 +1,7 @@
 //! Frames on the GPU.
 
-use super::shaders::Kernels;
 use crate::render::{FramePlanes, RenderOptions};
+use crate::shaders::Kernels;
 use crate::{Splats, ViewParams};
 use irradia_compute::DeviceError;
 use irradia_compute::gpu::{Array, GROUP, Gpu, Scan, Sort, Work};

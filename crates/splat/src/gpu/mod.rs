@@ -5,7 +5,6 @@
 //! differently from the CPU; what differs is rounding alone.
 
 mod frame;
-mod shaders;
 mod training;
 
 pub use frame::GpuRenderer;

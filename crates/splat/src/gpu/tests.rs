@@ -1,10 +1,10 @@
 //! The GPU against its twin on the CPU.
 
-use super::shaders::SHADERS;
 use super::{GpuRenderer, GpuTraining};
 use crate::engine::{Noise, Update};
 use crate::regularize::{Regularized, Regularizers};
 use crate::render::{Gather, OutputGradient};
+use crate::shaders::SHADERS;
 use crate::{
     Engine, Optimizer, Rates, RenderOptions, Renderer, SplatGradients, SplatState, Splats, Statistics, ViewParams,
 };

@@ -4,7 +4,7 @@ import assert from "node:assert/strict";
 import { join } from "node:path";
 import { cpSync, existsSync, readFileSync, readdirSync } from "node:fs";
 import { after, before, test } from "node:test";
-import { OUT, browse, get, open, picture, psnr, run, scratch, serve, set, sharp, stopAll, until } from "./harness.js";
+import { OUT, browse, get, open, picture, pretendGpu, psnr, run, scratch, serve, set, sharp, stopAll, until } from "./harness.js";
 import { dataset, trained } from "./scenes.js";
 
 /** @type {import("playwright-core").Browser} */
@@ -198,12 +198,14 @@ test("turning the scene upright keeps the picture, and views stay in place", asy
   await server.stop();
 });
 
-test("a page that draws itself shows the selection and the edit", async () => {
-  const local = await browse({ webgl: true });
-  const server = await serve("view", copy("local"), "--port", "0");
-  const { page, problems } = await open(local, server.address, { width: 800, height: 560 });
+// WebGPU's software is slow: a small picture.
+for (const [api, size, before] of /** @type {const} */ ([["WebGL2", { width: 800, height: 560 }], ["WebGPU", { width: 640, height: 260 }, pretendGpu]])) test(`a page that draws itself with ${api} shows the selection and the edit`, async () => {
+  const local = await browse(api === "WebGPU" ? "webgpu" : "webgl");
+  const server = await serve("view", copy(`local_${api}`), "--port", "0");
+  const { page, problems } = await open(local, server.address, { ...size, before });
   await set(page, { drawing: "local", axes: false, tab: "edit", sidebar: true });
   await sharp(page);
+  assert.equal(await page.evaluate(() => document.querySelector("irr-stage").local.api), api);
   const opened = await picture(page);
   await page.getByRole("button", { name: "Rectangle" }).click();
   await drag(page, [[0.4, 0.4], [0.6, 0.6]]);

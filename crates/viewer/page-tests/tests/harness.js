@@ -53,17 +53,27 @@ export async function serve(...args) {
 
 const CHROMIUM = [process.env.CHROMIUM, "/usr/bin/chromium", "/usr/bin/chromium-browser", "/usr/bin/google-chrome"].find((path) => path && existsSync(path));
 
-/** A headless browser; with WebGL it draws everything by a software rasteriser, which is slower. */
-export const browse = ({ webgl = false } = {}) => chromium.launch({
+const WEBGL = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"];
+const WEBGPU = ["--enable-unsafe-webgpu", "--use-webgpu-adapter=swiftshader", "--enable-features=Vulkan", "--use-vulkan=swiftshader", "--disable-gpu-watchdog"];
+
+/** A headless browser; with WebGL or WebGPU too it draws everything by a software rasteriser, which is slower.
+ * @param {"webgl" | "webgpu" | null} [api] */
+export const browse = (api = null) => chromium.launch({
   executablePath: CHROMIUM,
   args: ["--headless", "--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking", "--disable-component-update", "--disable-sync",
-    ...(webgl ? ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"] : ["--disable-gpu", "--disable-software-rasterizer"])],
+    ...(api ? [...WEBGL, ...(api === "webgpu" ? WEBGPU : [])] : ["--disable-gpu", "--disable-software-rasterizer"])],
 });
 
+/** For `addInitScript`: WebGPU's software says that it is a GPU, since pages leave software to WebGL2. */
+export function pretendGpu() {
+  for (const [key, value] of Object.entries({ isFallbackAdapter: false, architecture: "tested" })) Object.defineProperty(GPUAdapterInfo.prototype, key, { get: () => value });
+}
+
 /** Opens the page and waits until it shows a sharp picture. @param {import("playwright-core").Browser} browser */
-export async function open(browser, address, { width = 1440, height = 900, theme = "dark", density = 1 } = {}) {
+export async function open(browser, address, { width = 1440, height = 900, theme = "dark", density = 1, before = () => {} } = {}) {
   const context = await browser.newContext({ viewport: { width, height }, colorScheme: /** @type {any} */ (theme), deviceScaleFactor: density, reducedMotion: "reduce" });
   const page = await context.newPage();
+  await page.addInitScript(before);
   context.setDefaultTimeout(120000);
   const problems = [];
   page.on("pageerror", (error) => problems.push(String(error)));
@@ -75,6 +85,10 @@ export async function open(browser, address, { width = 1440, height = 900, theme
 
 /** Waits for the final picture of the present camera. */
 export async function sharp(page) {
+  await page.evaluate(async () => {
+    await document.querySelector("irr-stage").local.ready;
+    for (let i = 0; i < 2; i += 1) await new Promise(requestAnimationFrame);
+  });
   await page.waitForFunction(() => {
     const stage = document.querySelector("irr-stage");
     if (stage.drawsLocally) return stage.local.sharp && stage.local.total > 0 && stage.local.loaded === stage.local.total && !stage.local.busy && !stage.dirty;
@@ -94,8 +108,10 @@ export async function until(page, holds, argument = null, seconds = 120) {
 /** The picture on the stage, without the overlay. */
 export async function picture(page) {
   const address = await page.evaluate(() => {
-    const stage = document.querySelector("irr-stage");
-    return (stage.drawsLocally ? stage.localCanvas : stage.served).toDataURL("image/png");
+    const { drawsLocally, local, served } = document.querySelector("irr-stage");
+    // WebGPU's canvas is empty once the browser has composed it.
+    if (drawsLocally) local.painter.present();
+    return (drawsLocally ? local.canvas : served).toDataURL("image/png");
   });
   return PNG.sync.read(Buffer.from(address.split(",")[1], "base64"));
 }

@@ -4,15 +4,15 @@ import assert from "node:assert/strict";
 import { mkdirSync, readdirSync, writeFileSync } from "node:fs";
 import { join } from "node:path";
 import { after, before, test } from "node:test";
-import { browse, get, open, picture, psnr, readPng, run, scratch, serve, set, sharp, stopAll } from "./harness.js";
+import { browse, get, open, picture, pretendGpu, psnr, readPng, run, scratch, serve, set, sharp, stopAll, until } from "./harness.js";
 import { field, fox, random, shiny, trained } from "./scenes.js";
 
-/** One shows pictures, the other draws them: @type {[import("playwright-core").Browser, import("playwright-core").Browser]} */
-let [browser, drawing] = [];
-before(async () => ([browser, drawing] = [await browse(), await browse({ webgl: true })]));
+/** One shows pictures, the others draw them. @type {Record<"browser" | "drawing" | "computing", import("playwright-core").Browser>} */
+let { browser, drawing, computing } = {};
+before(async () => ([browser, drawing, computing] = [await browse(), await browse("webgl"), await browse("webgpu")]));
 after(async () => {
   stopAll();
-  await Promise.all([browser.close(), drawing.close()]);
+  await Promise.all([browser, drawing, computing].map((one) => one.close()));
 });
 
 let frames = 0;
@@ -95,6 +95,82 @@ for (const [name, make] of [["a trained scene", trained], ["random splats", () =
       console.log(`${name}: ${db.toFixed(2)} dB`);
       assert.ok(db >= 35, `${db} dB`);
     }
+    assert.deepEqual(problems, []);
+    await server.stop();
+  });
+}
+
+/** What paints in the page, and what the panel says of it. */
+const painter = (page) => page.evaluate(() => {
+  const { api, reason } = document.querySelector("irr-stage").local;
+  return { api, reason, text: document.querySelector("irr-display-panel").textContent };
+});
+
+/** WebGPU's software is slow: small pictures. */
+const SMALL = { width: 320, height: 240 };
+
+for (const [name, make] of [["a trained scene", trained], ["random splats", () => random(4000)]]) {
+  test(`${name} drawn with WebGPU are those of the renderer, with and without the GPU`, async () => {
+    const scene = make();
+    const server = await serve("view", scene, "--port", "0");
+    const { page, problems } = await open(computing, server.address, { ...SMALL, before: pretendGpu });
+    assert.equal(await page.evaluate(() => document.querySelector("irr-stage").drawsLocally), true, "a GPU draws where nothing is said");
+    await set(page, { axes: false, sidebar: false });
+    const compare = async (/** @type {number} */ least, /** @type {string} */ api) => {
+      await sharp(page);
+      const [shown, { api: used, text }] = [await picture(page), await painter(page)];
+      const db = psnr(shown, await rendered(page, scene, shown));
+      console.log(`${name}, ${used}: ${db.toFixed(2)} dB`);
+      assert.ok(used === api && text.includes(`here, by ${api}`), `${used}: ${text}`);
+      assert.ok(db >= least, `${db} dB`);
+      return shown;
+    };
+    const first = await compare(38, "WebGPU");
+    await drag(page, 60, -20);
+    const second = await compare(38, "WebGPU");
+    assert.ok(psnr(first, second) < 30, "the drag did not change the picture");
+    const { center, radius } = await get(page, "scene");
+    const corner = (/** @type {number} */ part) => center.map((/** @type {number} */ c) => c + part * radius);
+    await set(page, { clip: [corner(-0.3), corner(0.2)] });
+    await sharp(page);
+    const clipped = await picture(page);
+    await set(page, { drawing: "served" });
+    await sharp(page);
+    assert.ok(psnr(clipped, await picture(page)) >= 35, "clipped here as on the server");
+    await set(page, { drawing: "local", clip: null, mode: "ellipses" });
+    await sharp(page);
+    assert.equal((await painter(page)).api, "WebGL2");
+    await set(page, { mode: "color" });
+    await sharp(page);
+    assert.equal((await painter(page)).api, "WebGPU");
+    await page.evaluate(() => document.querySelector("irr-stage").local.gpu.gpu.device.destroy());
+    await until(page, () => document.querySelector("irr-stage").local.api === "WebGL2");
+    await compare(35, "WebGL2");
+    assert.match((await painter(page)).text, /the GPU was lost/);
+    assert.deepEqual(problems, []);
+    await server.stop();
+  });
+}
+
+for (const [name, before, reason] of /** @type {const} */ ([
+  ["no WebGPU", () => Object.defineProperty(Navigator.prototype, "gpu", { get: () => undefined }), /has no WebGPU/],
+  ["no adapter", () => (GPU.prototype.requestAdapter = async () => null), /no GPU/],
+  ["a GPU that is software", () => {}, /on the CPU/],
+  ["a kernel that does not compile", () => {
+    Object.defineProperty(GPUAdapterInfo.prototype, "isFallbackAdapter", { get: () => false });
+    Object.defineProperty(GPUAdapterInfo.prototype, "architecture", { get: () => "tested" });
+    GPUDevice.prototype.createComputePipelineAsync = async () => { throw new Error("refused"); };
+  }, /refused/],
+])) {
+  test(`with ${name} the page draws with WebGL2 and says why`, async () => {
+    const server = await serve("view", random(500), "--port", "0");
+    const { page, problems } = await open(computing, server.address, { ...SMALL, before });
+    await set(page, { drawing: "local", axes: false });
+    await sharp(page);
+    const { api, reason: said, text } = await painter(page);
+    assert.equal(api, "WebGL2");
+    assert.match(said, reason);
+    assert.ok(text.includes(said), text);
     assert.deepEqual(problems, []);
     await server.stop();
   });

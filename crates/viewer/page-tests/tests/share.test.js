@@ -12,7 +12,7 @@ import { random, trained } from "./scenes.js";
 
 /** @type {import("playwright-core").Browser} */
 let browser;
-before(async () => (browser = await browse({ webgl: true })));
+before(async () => (browser = await browse("webgl")));
 after(() => browser.close());
 
 const SIZE = { width: 640, height: 360 };

@@ -7,7 +7,7 @@ import { trained } from "./scenes.js";
 
 /** @type {import("playwright-core").Browser} */
 let browser;
-before(async () => (browser = await browse({ webgl: true })));
+before(async () => (browser = await browse("webgl")));
 after(async () => {
   stopAll();
   await browser.close();
@@ -57,7 +57,7 @@ test("a session begins where one is offered, and both eyes see the scene", async
   await until(page, () => globalThis.headsetSession.frames === 4);
   await page.waitForTimeout(500);
   const [left, right, between] = await page.evaluate(() => {
-    const { gl } = document.querySelector("irr-stage").local;
+    const { gl } = document.querySelector("irr-stage").local.webGl;
     const [width, height] = [gl.drawingBufferWidth, gl.drawingBufferHeight];
     const pixels = new Uint8Array(4 * width * height);
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);

@@ -36,7 +36,7 @@ class Hud extends HTMLElement {
     owner.addEventListener("drawing", () => {
       const { shown, times, local } = owner;
       const header = shown?.header;
-      const size = owner.drawsLocally ? `${local?.canvas.width} × ${local?.canvas.height}` : header ? `${header.width} × ${header.height}` : "";
+      const size = owner.drawsLocally ? `${local?.canvas?.width} × ${local?.canvas?.height}` : header ? `${header.width} × ${header.height}` : "";
       const where = owner.drawsLocally
         ? `here${local && local.loaded < (local.total ?? 0) ? `, ${Math.round((100 * local.loaded) / (local.total ?? 1))} % loaded` : ""}`
         : `server ${header ? header.milliseconds.toFixed(0) : "–"} ms`;

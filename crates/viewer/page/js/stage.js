@@ -50,7 +50,7 @@ export class Stage extends HTMLElement {
   connectedCallback() {
     this.served = /** @type {HTMLCanvasElement} */ (el("canvas", { className: "served" }));
     this.context = this.served.getContext("bitmaprenderer");
-    this.localCanvas = /** @type {HTMLCanvasElement} */ (el("canvas", { className: "local", hidden: true }));
+    this.drawn = el("div", { className: "local", hidden: true });
     this.photo = /** @type {HTMLImageElement} */ (el("img", { className: "photo", hidden: true, alt: "" }));
     this.overlay = /** @type {HTMLCanvasElement} */ (el("canvas", { className: "overlay", tabIndex: 0 }));
     this.overlay.setAttribute("role", "img");
@@ -58,8 +58,8 @@ export class Stage extends HTMLElement {
     this.handle = el("button", { className: "handle", hidden: true });
     this.handle.setAttribute("aria-label", "Border between photograph and picture");
     this.empty = el("div", { className: "empty" });
-    this.prepend(this.served, this.localCanvas, this.photo, this.overlay, this.handle, this.empty);
-    const local = new LocalRenderer(this.localCanvas, () => (this.dirty = true), (problem) => state.set({ problem }));
+    this.prepend(this.served, this.drawn, this.photo, this.overlay, this.handle, this.empty);
+    const local = new LocalRenderer(this.drawn, () => (this.dirty = true), (problem) => state.set({ problem }));
     this.local = local;
     const pointer = new Pointer(this, this.overlay);
     this.pointer = pointer;
@@ -117,7 +117,8 @@ export class Stage extends HTMLElement {
   /** Whether this page draws. */
   get drawsLocally() {
     const scene = state.get("scene");
-    if (!scene?.travels || !this.local?.works || !LOCAL_MODES.includes(state.get("mode")) || state.get("compare") === "error") return false;
+    if (!scene?.travels || !LOCAL_MODES.includes(state.get("mode")) || state.get("compare") === "error") return false;
+    if (!this.local?.paints(state.get("mode"))) return false;
     const drawing = state.get("drawing");
     if (drawing !== "auto") return drawing === "local";
     return this.local.accelerated && scene.count <= MANY && !state.get("hello")?.live;
@@ -168,7 +169,7 @@ export class Stage extends HTMLElement {
   /** @param {number} now */
   frame(now) {
     this.navigation?.tick(now);
-    if (!this.served || !this.localCanvas || !this.local) return;
+    if (!this.served || !this.drawn || !this.local) return;
     const local = this.drawsLocally;
     if (this.dirty) {
       this.dirty = false;
@@ -177,16 +178,16 @@ export class Stage extends HTMLElement {
       const { width, height, fx, fy, cx, cy } = shot;
       const k = { width, height, fx, fy, cx, cy };
       if (local) {
-        if (this.localCanvas.hidden) connection.send({ do: "rest" });
+        if (this.drawn.hidden) connection.send({ do: "rest" });
         this.local.want(state.get("camera"), k, shot);
         this.shown = { camera: state.get("camera"), k, header: null };
       } else if (state.get("scene")) {
         connection.send({ do: "shot", ...shot });
         this.sent.set(shot.id, { camera: state.get("camera"), k, at: performance.now() });
         if (this.sent.size > 400) this.sent.delete(this.sent.keys().next().value ?? 0);
-        if (this.localCanvas.hidden === false) this.dispatchEvent(new Event("drawing"));
+        if (this.drawn.hidden === false) this.dispatchEvent(new Event("drawing"));
       }
-      this.localCanvas.hidden = !local;
+      this.drawn.hidden = !local;
       this.served.hidden = local;
     }
     if (local && this.local.draw(now)) this.count(now);
@@ -200,7 +201,7 @@ export class Stage extends HTMLElement {
   layOut() {
     const rect = this.frameRect;
     const style = { left: `${rect.left}px`, top: `${rect.top}px`, width: `${rect.width}px`, height: `${rect.height}px` };
-    for (const element of [this.localCanvas, this.photo]) if (element) Object.assign(element.style, style);
+    for (const element of [this.drawn, this.photo]) if (element) Object.assign(element.style, style);
     if (this.served) {
       // Until a picture of the stage's new size is here, the old one keeps its proportions; the vertical field of view stays.
       const k = this.shown?.header ? this.shown.k : rect;

@@ -18,9 +18,11 @@ export async function offersXr() {
 /** @param {import("./stage.js").Stage} stage */
 export async function enterXr(stage) {
   const { local } = stage;
-  const gl = local?.gl;
+  // Headsets show what WebGL2 draws.
+  const gl = local?.holdWebGl(true)?.gl;
   if (!local || !gl || !state.get("scene")?.travels) {
-    state.set({ problem: "VR needs splats, drawn in this browser" });
+    local?.holdWebGl(false);
+    state.set({ problem: "VR needs splats, drawn in this browser with WebGL2" });
     return;
   }
   try {
@@ -45,8 +47,12 @@ export async function enterXr(stage) {
       }
     };
     session.requestAnimationFrame(frame);
-    session.addEventListener("end", () => stage.dispatchEvent(new Event("drawing")));
+    session.addEventListener("end", () => {
+      local.holdWebGl(false);
+      stage.dispatchEvent(new Event("drawing"));
+    });
   } catch (error) {
+    local.holdWebGl(false);
     state.set({ problem: `VR cannot begin: ${error}` });
   }
 }

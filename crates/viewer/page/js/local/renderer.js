@@ -1,19 +1,20 @@
-// Draws splats with WebGL2: one pass projects every splat into a texture, another blends a quad for each, farthest first.
+// Draws splats in the browser: loads them, shares out the time, and leaves painting to WebGPU or, where that is missing, to WebGL2.
 
-import { axes } from "../math.js";
-import { openMask, openSplats, orderWorker, shader } from "./assets.js";
+import { openMask, openSplats } from "./assets.js";
 import { readSplats } from "./stream.js";
+import { WebGl } from "./webgl.js";
+import { WebGpu } from "./webgpu.js";
 
 /** @typedef {import("../camera.js").Camera} Camera */
 /** @typedef {import("../camera.js").Intrinsics} Intrinsics */
 /** @typedef {import("../math.js").Vec3} Vec3 */
+/** How to paint, beside the camera; clip: a box, world; highlight: whether selected splats are tinted; measured: whether painting
+ * takes as long as the picture does.
+ * @typedef {{ near: number, background: Vec3, antialias: boolean, clip: [Vec3, Vec3] | null, highlight: boolean, mode: string, measured: boolean }} Options */
 
-/** Splats per row of the textures, as the shaders have it. */
-const ROW = 1024;
-/** Splats an instance, as the shader has it: of one splat each, instances cost a software rasteriser 4 microseconds apiece. */
-const BATCH = 128;
 const NEAR = 0.01;
-const SHAPES = ["color", "ellipses", "rings", "points"];
+/** What both paint; other modes are WebGL2's. */
+const PLAIN = "color";
 /** Milliseconds after which a camera is at rest. */
 const REST = 100;
 /** Milliseconds of a moving picture. */
@@ -24,72 +25,202 @@ const PATIENCE = 1500;
 const RETRY = 100;
 
 export class LocalRenderer {
-  works = false;
-  accelerated = false;
-  /** @type {WebGL2RenderingContext | null} */
-  gl = null;
-  /** Splats of the scene, and their degree. */
+  /** What paints now; null before the beginning, and where nothing can. @type {WebGpu | WebGl | null} */
+  painter = null;
+  /** @type {WebGpu | null} */
+  gpu = null;
+  /** Undefined until it is needed, null if it cannot paint. @type {WebGl | null | undefined} */
+  webGl = undefined;
+  /** Why WebGPU does not paint; empty where it does. */
+  reason = "";
+  opened = false;
+  /** Whether only WebGL2 may paint. */
+  holds = false;
+  /** Splats of the scene, and those that have arrived. */
   total = 0;
-  degree = 0;
-  /** @type {{ camera: Camera, shot: any } | null} */
-  painted = null;
-  fresh = false;
-  /** Splats that have arrived. */
   loaded = 0;
   version = 0;
-  /** @type {Intrinsics | undefined} */
-  k;
+  /** Whether the splats of `version` have begun to arrive, and when. */
+  begun = false;
+  beganAt = 0;
+  /** Whether some version has been shown whole. */
+  complete = false;
+  /** @type {Intrinsics | null} */
+  k = null;
   /** @type {{ camera: Camera, shot: any } | null} */
   wanted = null;
+  /** @type {{ camera: Camera, shot: any } | null} */
+  painted = null;
   changedAt = 0;
+  /** Grows whenever a picture would be another one. */
+  edition = 0;
+  /** Whether what was painted last is not the newest for its camera. */
+  fresh = false;
+  /** Whether the canvas shows the newest picture of a camera at rest, in full size. */
+  sharp = false;
   /** Share of the sides drawn while moving. */
   share = 1;
-  sharp = false;
-  busy = false;
-  generation = 0;
+  painting = false;
+  finished = false;
   /** The selection to show, and the one that is shown. */
   mask = 0;
   masked = 0;
-  /** Whether some version has been shown whole, and when the present one began to arrive. */
-  complete = false;
-  beganAt = 0;
-  sortMilliseconds = 0;
-  drawn = 0;
 
-  /** @param {HTMLCanvasElement} canvas @param {() => void} dirty @param {(problem: string) => void} report */
-  constructor(canvas, dirty, report) {
-    this.canvas = canvas;
+  /** @param {HTMLElement} element gets the canvas @param {() => void} dirty @param {(problem: string) => void} report */
+  constructor(element, dirty, report) {
+    this.element = element;
     this.dirty = dirty;
     this.report = report;
-    const options = { alpha: false, antialias: false, depth: false, preserveDrawingBuffer: true, powerPreference: "high-performance" };
-    const gl = /** @type {WebGL2RenderingContext | null} */ (canvas.getContext("webgl2", options));
-    if (!gl) return;
-    this.gl = gl;
-    const info = gl.getExtension("WEBGL_debug_renderer_info");
-    const device = String(gl.getParameter(info ? info.UNMASKED_RENDERER_WEBGL : gl.RENDERER));
-    this.accelerated = !/swiftshader|llvmpipe|software|basic render/i.test(device);
-    this.works = true;
-    this.worker = orderWorker();
-    this.worker.onmessage = ({ data }) => this.ordered(data);
-    this.ready = this.prepare(gl);
-    canvas.addEventListener("webglcontextlost", () => {
-      this.works = false;
-      this.dirty();
-    });
+    this.ready = this.open();
   }
 
-  /** @param {WebGL2RenderingContext} gl */
-  async prepare(gl) {
-    const [projectVert, projectFrag, splatVert, splatFrag, shapeFrag] = await Promise.all(["project.vert", "project.frag", "splat.vert", "splat.frag", "shape.frag"].map(shader));
-    this.projecting = program(gl, projectVert, projectFrag);
-    this.blending = program(gl, splatVert, splatFrag);
-    this.shaping = program(gl, splatVert, shapeFrag);
-    this.empty = gl.createVertexArray();
-    this.quads = gl.createVertexArray();
-    gl.bindVertexArray(this.quads);
-    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
-    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, Uint16Array.from({ length: 6 * BATCH }, (_, i) => 4 * Math.floor(i / 6) + [0, 1, 2, 2, 1, 3][i % 6]), gl.STATIC_DRAW);
-    gl.bindVertexArray(null);
+  async open() {
+    try {
+      this.gpu = await WebGpu.open(() => this.change(), (reason) => this.withoutGpu(reason));
+    } catch (error) {
+      this.reason = message(error);
+    }
+    this.opened = true;
+    this.use(this.painterOf());
+  }
+
+  openWebGl() {
+    if (this.webGl === undefined) this.webGl = WebGl.open(() => this.change(), () => this.giveUp(this.webGl ?? null, "the GPU was lost"));
+    return this.webGl;
+  }
+
+  /** Whether it can paint at all; not before the beginning. */
+  get works() {
+    return this.gpu !== null || Boolean(this.webGl);
+  }
+
+  get accelerated() {
+    return this.painter?.accelerated ?? false;
+  }
+
+  get api() {
+    return this.painter?.api ?? "";
+  }
+
+  get canvas() {
+    return this.painter?.canvas ?? null;
+  }
+
+  /** Splats of the present picture. */
+  get drawn() {
+    return this.painter?.drawn ?? 0;
+  }
+
+  get busy() {
+    return this.painting || Boolean(this.painter?.busy);
+  }
+
+  /** Whether it can paint in a mode. @param {string} mode */
+  paints(mode) {
+    return this.works && this.painterOf(mode) !== null;
+  }
+
+  /** @param {string | undefined} mode */
+  painterOf(mode = PLAIN) {
+    // Until it is known whether there is WebGPU, nobody paints.
+    if (!this.opened) return null;
+    return this.gpu && mode === PLAIN && !this.holds ? this.gpu : this.openWebGl();
+  }
+
+  /** Lets WebGL2 alone paint, or no longer. @param {boolean} holds */
+  holdWebGl(holds) {
+    this.holds = holds;
+    this.use(this.painterOf(this.wanted?.shot.mode));
+    return this.webGl ?? null;
+  }
+
+  /** Paints with another painter from now on, which takes the scene from its beginning; its canvas follows with its first picture.
+   * @param {WebGpu | WebGl | null} painter */
+  use(painter) {
+    if (painter === this.painter) return;
+    this.painter = painter;
+    this.abort?.abort();
+    [this.version, this.loaded, this.total, this.begun, this.masked] = [0, 0, 0, false, 0];
+    this.change();
+    this.dirty();
+  }
+
+  /** @param {string} reason */
+  withoutGpu(reason) {
+    if (!this.gpu) return;
+    this.reason = reason;
+    const lost = this.gpu;
+    this.gpu = null;
+    if (this.painter === lost) this.use(this.openWebGl());
+    lost.gpu.device.destroy();
+  }
+
+  /** Stops using a painter that fails. @param {WebGpu | WebGl | null} painter @param {unknown} error */
+  giveUp(painter, error) {
+    if (painter === null || painter === this.gpu) return this.withoutGpu(message(error));
+    this.webGl = null;
+    if (this.painter === painter) this.use(null);
+    this.report(message(error));
+  }
+
+  /** A picture would be another one. */
+  change() {
+    this.sharp = false;
+    this.fresh = true;
+    this.edition += 1;
+  }
+
+  /** Paints the same picture again. */
+  redraw() {
+    this.changedAt = performance.now();
+    this.change();
+    this.dirty();
+  }
+
+  /** Loads a version of the scene, once local drawing is wanted. @param {import("../state.js").Scene | null} scene */
+  load(scene) {
+    this.scene = scene;
+  }
+
+  /** @param {WebGpu | WebGl} painter @param {import("../state.js").Scene} scene */
+  async fetch(painter, scene) {
+    if (this.version === scene.version) return;
+    this.version = scene.version;
+    this.abort?.abort();
+    const abort = new AbortController();
+    this.abort = abort;
+    try {
+      await painter.ready;
+      const response = await openSplats(abort.signal);
+      await readSplats(response, (header) => abort.signal.aborted || this.begin(painter, header), (block) => abort.signal.aborted || this.take(painter, block));
+    } catch (error) {
+      if (abort.signal.aborted) return;
+      this.version = 0;
+      this.report(message(error));
+    }
+  }
+
+  /** @param {WebGpu | WebGl} painter @param {import("./stream.js").Header} header */
+  begin(painter, { count, degree }) {
+    this.complete ||= this.total > 0 && this.loaded === this.total;
+    this.beganAt = performance.now();
+    [this.loaded, this.total, this.masked, this.begun] = [0, count, 0, true];
+    try {
+      painter.begin(count, degree);
+    } catch (error) {
+      this.giveUp(painter, error);
+    }
+  }
+
+  /** @param {WebGpu | WebGl} painter @param {import("./stream.js").Block} block */
+  take(painter, block) {
+    painter.take(block);
+    this.loaded = block.first + block.count;
+    this.changedAt = performance.now();
+    this.change();
+    this.aim();
+    this.dirty();
+    this.fetchMask();
   }
 
   /** Shows a selection by its number, 0 for none. @param {number} mask */
@@ -100,307 +231,112 @@ export class LocalRenderer {
 
   /** Fetches the selection once all splats are here. */
   async fetchMask() {
-    const gl = this.gl;
-    if (!gl || !this.selected || this.masked === this.mask || this.fetching || this.loaded < this.total) return;
+    const painter = this.painter;
+    if (!painter || !this.begun || this.masked === this.mask || this.fetching || this.loaded < this.total) return;
     this.fetching = true;
-    const [mask, generation] = [this.mask, this.generation];
+    const { mask, abort } = this;
     try {
       const bits = mask ? await openMask(this.version) : new Uint8Array(0);
-      if (bits && generation === this.generation) {
-        const bytes = new Uint8Array(ROW * Math.max(1, Math.ceil(this.total / ROW)));
-        for (let i = 0; i < this.total && i < 8 * bits.length; i += 1) bytes[i] = (bits[i >> 3] >> (i & 7)) & 1;
-        gl.bindTexture(gl.TEXTURE_2D, this.selected);
-        gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, ROW, bytes.length / ROW, gl.RED_INTEGER, gl.UNSIGNED_BYTE, bytes);
+      if (bits && abort === this.abort && painter === this.painter) {
+        painter.select(bits);
         this.masked = mask;
         this.redraw();
       }
     } catch (error) {
-      this.report(String(error));
+      this.report(message(error));
       this.masked = mask;
     }
     this.fetching = false;
     if (this.masked !== this.mask) setTimeout(() => this.fetchMask(), RETRY);
   }
 
-  /** Paints the same picture again. */
-  redraw() {
-    this.changedAt = performance.now();
-    this.sharp = false;
-    this.fresh = true;
-    this.dirty();
-  }
-
-  /** Loads a version of the scene, once local drawing is wanted. @param {import("../state.js").Scene | null} scene */
-  load(scene) {
-    this.scene = scene;
-  }
-
-  /** @param {import("../state.js").Scene} scene */
-  async fetch(scene) {
-    const gl = this.gl;
-    if (!gl || this.version === scene.version) return;
-    this.version = scene.version;
-    this.abort?.abort();
-    this.abort = new AbortController();
-    await this.ready;
-    try {
-      const response = await openSplats(this.abort.signal);
-      await readSplats(response, (header) => this.begin(gl, header), (block) => this.take(gl, block));
-    } catch (error) {
-      if (!(error instanceof DOMException && error.name === "AbortError")) {
-        this.version = 0;
-        this.report(String(error));
-      }
-    }
-  }
-
-  /** @param {WebGL2RenderingContext} gl @param {import("./stream.js").Header} header */
-  begin(gl, { count, degree }) {
-    const rows = Math.max(1, Math.ceil(count / ROW));
-    if (rows > gl.getParameter(gl.MAX_TEXTURE_SIZE)) {
-      this.works = false;
-      this.dirty();
-      throw new Error("there are more splats than this browser can draw");
-    }
-    for (const texture of [this.cores, this.bands, this.selected, this.place, this.look, this.order]) if (texture) gl.deleteTexture(texture);
-    this.cores = texture(gl, 2 * ROW, rows);
-    this.bands = texture(gl, Math.max(1, degree) * ROW, degree ? rows : 1);
-    this.selected = texture(gl, ROW, rows, gl.R8UI);
-    this.masked = 0;
-    this.place = texture(gl, ROW, rows);
-    this.look = texture(gl, ROW, rows);
-    this.order = texture(gl, ROW, rows, gl.R32UI);
-    this.target = gl.createFramebuffer();
-    gl.bindFramebuffer(gl.FRAMEBUFFER, this.target);
-    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, this.place, 0);
-    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT1, gl.TEXTURE_2D, this.look, 0);
-    gl.drawBuffers([gl.COLOR_ATTACHMENT0, gl.COLOR_ATTACHMENT1]);
-    this.complete ||= this.total > 0 && this.loaded === this.total;
-    this.beganAt = performance.now();
-    [this.loaded, this.total, this.degree, this.drawn] = [0, count, degree, 0];
-    this.generation += 1;
-    this.worker?.postMessage({ reserve: count });
-  }
-
-  /** @param {WebGL2RenderingContext} gl @param {import("./stream.js").Block} block */
-  take(gl, { first, count, cores, bands }) {
-    const rows = Math.ceil(count / ROW);
-    upload(gl, this.cores, first / ROW, 2 * ROW, rows, cores);
-    if (this.degree) upload(gl, this.bands, first / ROW, this.degree * ROW, rows, bands);
-    const words = new Float32Array(cores.buffer);
-    const halves = new Uint16Array(cores.buffer);
-    const positions = new Float32Array(3 * count);
-    const radii = new Float32Array(count);
-    for (let i = 0; i < count; i += 1) {
-      positions.set(words.subarray(8 * i, 8 * i + 3), 3 * i);
-      const largest = Math.max(half(halves[16 * i + 6]), half(halves[16 * i + 7]), half(halves[16 * i + 8]));
-      radii[i] = 3.4 * Math.exp(largest);
-    }
-    this.worker?.postMessage({ block: { first, count, positions, radii } }, [positions.buffer, radii.buffer]);
-    this.loaded = first + count;
-    this.changedAt = performance.now();
-    this.sharp = false;
-    this.sort();
-    this.dirty();
-    this.fetchMask();
-  }
-
   /** @param {Camera} camera @param {Intrinsics} k @param {any} shot */
   want(camera, k, shot) {
-    if (this.scene) this.fetch(this.scene);
+    this.use(this.painterOf(shot.mode));
     this.wanted = { camera, shot };
     this.k = k;
     this.changedAt = performance.now();
     this.sharp = false;
-    this.sort();
+    this.edition += 1;
+    if (this.painter && this.scene) this.fetch(this.painter, this.scene);
+    this.aim();
   }
 
-  /** Asks the worker for the order of the present camera, one question at a time. */
-  sort() {
-    if (this.busy || !this.wanted || !this.k || !this.loaded) return;
-    this.busy = true;
-    const { camera } = this.wanted;
-    const [right, down, forward] = axes(camera.rotation);
-    const { fx, fy, cx, cy, width, height } = this.k;
-    const limits = [-cx / fx, (width - cx) / fx, -cy / fy, (height - cy) / fy];
-    this.asked = this.wanted;
-    this.worker?.postMessage({ look: { right, down, forward, position: camera.position, limits, near: NEAR }, generation: this.generation });
+  /** Tells the painter which camera comes. */
+  aim() {
+    if (this.wanted && this.k) this.painter?.aim(this.wanted.camera, this.k, NEAR);
   }
 
-  /** @param {{ sorted: Uint32Array, milliseconds: number, generation: number }} answer */
-  ordered({ sorted, milliseconds, generation }) {
-    this.busy = false;
-    this.sortMilliseconds = milliseconds;
-    const gl = this.gl;
-    if (!gl || generation !== this.generation) return this.sort();
-    const whole = Math.floor(sorted.length / ROW);
-    gl.bindTexture(gl.TEXTURE_2D, this.order ?? null);
-    if (whole) gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, ROW, whole, gl.RED_INTEGER, gl.UNSIGNED_INT, sorted);
-    const rest = sorted.subarray(whole * ROW);
-    if (rest.length) gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, whole, rest.length, 1, gl.RED_INTEGER, gl.UNSIGNED_INT, rest);
-    this.drawn = sorted.length;
-    this.sharp = false;
-    this.fresh = true;
-    if (this.asked !== this.wanted) this.sort();
-  }
-
-  /** Draws if something has changed; whether it has. @param {number} now */
+  /** Paints if something has changed; whether there is a new picture. @param {number} now */
   draw(now) {
-    const gl = this.gl;
-    if (!gl || !this.wanted || !this.k || !this.target || !this.projecting || this.sharp) return false;
+    const { painter, wanted, k } = this;
+    if (painter && wanted && k && this.begun && !this.painting && !this.sharp) this.paint(painter, wanted, k, now);
+    const { finished } = this;
+    this.finished = false;
+    return finished;
+  }
+
+  /** @param {WebGpu | WebGl} painter @param {{ camera: Camera, shot: any }} wanted @param {Intrinsics} k @param {number} now */
+  async paint(painter, wanted, k, now) {
     // A newer version replaces the picture when it is whole: half of it would flicker at each edit.
-    if (this.loaded < this.total && this.complete && now < this.beganAt + PATIENCE) return false;
-    const moving = now - this.changedAt < REST || this.busy;
-    if (moving && !this.fresh && this.painted === this.wanted) return false;
+    if (this.loaded < this.total && this.complete && now < this.beganAt + PATIENCE) return;
+    const moving = now - this.changedAt < REST || painter.busy;
+    if (moving && !this.fresh && this.painted === wanted) return;
+    const { edition } = this;
     const started = performance.now();
-    this.paint(moving ? this.share : 1);
-    if (!this.accelerated || moving) {
-      // Waits for the picture, to know what it costs.
-      gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4));
+    const end = (/** @type {boolean} */ isThere) => {
       const spent = performance.now() - started;
       if (moving) this.share = Math.min(1, Math.max(0.25, this.share * Math.min(1.15, Math.max(0.7, Math.sqrt(BUDGET / spent)))));
-    }
-    this.sharp = !moving;
+      if (!isThere || painter !== this.painter) return;
+      if (painter.canvas !== this.element.firstChild) this.element.replaceChildren(painter.canvas);
+      painter.present();
+      this.sharp = !moving && edition === this.edition;
+      this.painted = wanted;
+      this.finished = true;
+    };
     this.fresh = false;
-    this.painted = this.wanted;
-    return true;
+    const painted = painter.paint(wanted.camera, scaled(k, moving ? this.share : 1), this.options(wanted.shot, moving || !painter.accelerated));
+    if (typeof painted === "boolean") return end(painted);
+    this.painting = true;
+    try {
+      end(await painted);
+    } catch (error) {
+      this.giveUp(painter, error);
+    }
+    this.painting = false;
   }
 
-  /** Paints the wanted picture with a share of its sides. @param {number} share */
-  paint(share) {
-    const { gl, k, wanted } = this;
-    if (!gl || !k || !wanted) return;
-    const scene = this.scene;
-    const [width, height] = [Math.max(1, Math.round(k.width * share)), Math.max(1, Math.round(k.height * share))];
-    if (this.canvas.width !== width || this.canvas.height !== height) [this.canvas.width, this.canvas.height] = [width, height];
-    this.project(gl, wanted.camera, { ...k, width, height, fx: (k.fx * width) / k.width, fy: (k.fy * height) / k.height, cx: (k.cx * width) / k.width, cy: (k.cy * height) / k.height }, wanted.shot.clip, Boolean(wanted.shot.highlight));
-    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
-    gl.viewport(0, 0, width, height);
-    const [r, g, b] = wanted.shot.background ?? scene?.background ?? [0, 0, 0];
-    gl.clearColor(r, g, b, 1);
-    gl.clear(gl.COLOR_BUFFER_BIT);
-    this.blend(gl, width, height, Math.max(0, SHAPES.indexOf(wanted.shot.mode)));
+  /** @param {any} shot @param {boolean} measured @returns {Options} */
+  options({ background, clip, highlight, mode }, measured) {
+    return {
+      near: NEAR,
+      background: background ?? this.scene?.background ?? [0, 0, 0],
+      antialias: Boolean(this.scene?.antialias),
+      clip: clip ?? null,
+      highlight: Boolean(highlight && this.masked),
+      mode: mode ?? PLAIN,
+      measured,
+    };
   }
 
-  /** Paints one eye of a headset. @param {WebGLFramebuffer | null} to @param {{ x: number, y: number, width: number, height: number }} port
+  /** Paints one eye of a headset, with WebGL2. @param {WebGLFramebuffer | null} to @param {{ x: number, y: number, width: number, height: number }} port
    * @param {Camera} camera @param {Float32Array} projection column by column */
-  eye(to, { x, y, width, height }, camera, projection) {
-    const gl = this.gl;
-    if (!gl) return;
+  eye(to, port, camera, projection) {
+    const { width, height } = port;
     const [fx, fy] = [(projection[0] * width) / 2, (projection[5] * height) / 2];
-    const k = { width, height, fx, fy, cx: ((1 - projection[8]) * width) / 2, cy: ((1 + projection[9]) * height) / 2 };
+    this.k = { width, height, fx, fy, cx: ((1 - projection[8]) * width) / 2, cy: ((1 + projection[9]) * height) / 2 };
     this.wanted = { camera, shot: this.wanted?.shot ?? {} };
-    this.k = k;
-    this.sort();
-    this.project(gl, camera, k, null, false);
-    gl.bindFramebuffer(gl.FRAMEBUFFER, to);
-    gl.viewport(x, y, width, height);
-    this.blend(gl, width, height, 0);
-  }
-
-  /** @param {WebGL2RenderingContext} gl @param {Camera} camera @param {Intrinsics} k @param {[Vec3, Vec3] | null} clip
-   * @param {boolean} highlight whether selected splats are tinted */
-  project(gl, camera, k, clip, highlight) {
-    const projecting = this.projecting;
-    if (!projecting || !this.total) return;
-    const [x, y, z] = axes(camera.rotation);
-    const at = projecting.at;
-    gl.bindFramebuffer(gl.FRAMEBUFFER, this.target ?? null);
-    gl.viewport(0, 0, ROW, Math.max(1, Math.ceil(this.loaded / ROW)));
-    gl.disable(gl.BLEND);
-    gl.useProgram(projecting.program);
-    bind(gl, 0, this.cores, at("u_cores"));
-    bind(gl, 1, this.bands, at("u_bands"));
-    bind(gl, 2, this.selected, at("u_selected"));
-    gl.uniform1i(at("u_highlight"), this.masked && highlight ? 1 : 0);
-    gl.uniform1i(at("u_degree"), this.degree ?? 0);
-    gl.uniform1i(at("u_count"), this.loaded);
-    // Column by column: the camera's axes are the rows of camera from world.
-    gl.uniformMatrix3fv(at("u_rotation"), false, [x[0], y[0], z[0], x[1], y[1], z[1], x[2], y[2], z[2]]);
-    gl.uniform3fv(at("u_position"), camera.position);
-    gl.uniform2f(at("u_focal"), k.fx, k.fy);
-    gl.uniform2f(at("u_principal"), k.cx, k.cy);
-    const [mx, my] = [(0.15 * k.width) / k.fx, (0.15 * k.height) / k.fy];
-    gl.uniform4f(at("u_limits"), -(k.cx / k.fx + mx), (k.width - k.cx) / k.fx + mx, -(k.cy / k.fy + my), (k.height - k.cy) / k.fy + my);
-    gl.uniform1f(at("u_near"), NEAR);
-    gl.uniform1i(at("u_antialias"), this.scene?.antialias ? 1 : 0);
-    gl.uniform3fv(at("u_low"), clip?.[0] ?? [-3e38, -3e38, -3e38]);
-    gl.uniform3fv(at("u_high"), clip?.[1] ?? [3e38, 3e38, 3e38]);
-    gl.bindVertexArray(this.empty ?? null);
-    gl.drawArrays(gl.TRIANGLES, 0, 3);
-  }
-
-  /** @param {WebGL2RenderingContext} gl @param {number} width @param {number} height @param {number} shape */
-  blend(gl, width, height, shape) {
-    const blending = shape ? this.shaping : this.blending;
-    if (!blending) return;
-    const at = blending.at;
-    gl.useProgram(blending.program);
-    gl.enable(gl.BLEND);
-    gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
-    bind(gl, 0, this.place, at("u_place"));
-    bind(gl, 1, this.look, at("u_look"));
-    bind(gl, 2, this.order, at("u_order"));
-    gl.uniform1i(at("u_drawn"), this.drawn);
-    gl.uniform2f(at("u_size"), width, height);
-    gl.uniform1i(at("u_shape"), shape);
-    gl.bindVertexArray(this.quads ?? null);
-    gl.drawElementsInstanced(gl.TRIANGLES, 6 * BATCH, gl.UNSIGNED_SHORT, 0, Math.ceil(this.drawn / BATCH));
-    gl.bindVertexArray(null);
+    this.aim();
+    this.webGl?.eye(to, port, camera, this.k, this.options({}, false));
   }
 }
 
-/** @param {number} bits of a half-precision number */
-function half(bits) {
-  const exponent = (bits >> 10) & 31;
-  const fraction = bits & 1023;
-  const value = exponent ? 2 ** (exponent - 15) * (1 + fraction / 1024) : 2 ** -14 * (fraction / 1024);
-  return bits & 0x8000 ? -value : value;
+/** @param {Intrinsics} k @param {number} share of its sides @returns {Intrinsics} */
+function scaled(k, share) {
+  const [width, height] = [Math.max(1, Math.round(k.width * share)), Math.max(1, Math.round(k.height * share))];
+  const [x, y] = [width / k.width, height / k.height];
+  return { width, height, fx: k.fx * x, fy: k.fy * y, cx: k.cx * x, cy: k.cy * y };
 }
 
-/** @param {WebGL2RenderingContext} gl @param {number} width @param {number} height @param {number} [format] */
-function texture(gl, width, height, format = gl.RGBA32UI) {
-  const made = gl.createTexture();
-  gl.bindTexture(gl.TEXTURE_2D, made);
-  gl.texStorage2D(gl.TEXTURE_2D, 1, format, width, height);
-  gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
-  gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
-  return made;
-}
-
-/** Writes whole rows; the last one is padded. @param {WebGL2RenderingContext} gl @param {WebGLTexture | null | undefined} to
- * @param {number} first @param {number} width texels @param {number} rows @param {Uint8Array} bytes */
-function upload(gl, to, first, width, rows, bytes) {
-  const words = new Uint32Array(4 * width * rows);
-  words.set(new Uint32Array(bytes.buffer, bytes.byteOffset, bytes.byteLength / 4));
-  gl.bindTexture(gl.TEXTURE_2D, to ?? null);
-  gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, first, width, rows, gl.RGBA_INTEGER, gl.UNSIGNED_INT, words);
-}
-
-/** @param {WebGL2RenderingContext} gl @param {number} unit @param {WebGLTexture | null | undefined} from @param {WebGLUniformLocation | null} at */
-function bind(gl, unit, from, at) {
-  gl.activeTexture(gl.TEXTURE0 + unit);
-  gl.bindTexture(gl.TEXTURE_2D, from ?? null);
-  gl.uniform1i(at, unit);
-}
-
-/** @param {WebGL2RenderingContext} gl @param {string} vertex @param {string} fragment */
-function program(gl, vertex, fragment) {
-  const linked = /** @type {WebGLProgram} */ (gl.createProgram());
-  for (const [kind, text] of /** @type {const} */ ([[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]])) {
-    const compiled = /** @type {WebGLShader} */ (gl.createShader(kind));
-    gl.shaderSource(compiled, text);
-    gl.compileShader(compiled);
-    if (!gl.getShaderParameter(compiled, gl.COMPILE_STATUS)) throw new Error(gl.getShaderInfoLog(compiled) ?? "a shader does not compile");
-    gl.attachShader(linked, compiled);
-  }
-  gl.linkProgram(linked);
-  if (!gl.getProgramParameter(linked, gl.LINK_STATUS)) throw new Error(gl.getProgramInfoLog(linked) ?? "a program does not link");
-  /** @type {Map<string, WebGLUniformLocation | null>} */
-  const known = new Map();
-  const at = (/** @type {string} */ name) => {
-    if (!known.has(name)) known.set(name, gl.getUniformLocation(linked, name));
-    return known.get(name) ?? null;
-  };
-  return { program: linked, at };
-}
+/** @param {unknown} error */
+const message = (error) => (error instanceof Error ? error.message : String(error));

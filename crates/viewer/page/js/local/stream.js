@@ -4,7 +4,7 @@ const HEADER = 32;
 const CORE = 32;
 
 /** @typedef {{ count: number, degree: number, block: number }} Header */
-/** @typedef {{ first: number, count: number, cores: Uint8Array, bands: Uint8Array }} Block */
+/** @typedef {{ first: number, count: number, cores: Uint8Array<ArrayBuffer>, bands: Uint8Array<ArrayBuffer> }} Block */
 
 /** @param {Response} response @param {(header: Header) => void} begin @param {(block: Block) => void} each */
 export async function readSplats(response, begin, each) {

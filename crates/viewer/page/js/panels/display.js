@@ -16,7 +16,8 @@ class DisplayPanel extends HTMLElement {
 
   about() {
     const body = el("div");
-    state.watch(["scene", "hello"], () => {
+    let drawn = "";
+    const tell = () => {
       const scene = state.get("scene");
       const warnings = state.get("hello")?.warnings ?? [];
       if (!scene) return;
@@ -24,10 +25,17 @@ class DisplayPanel extends HTMLElement {
         facts([
           ["Kind", scene.kind], [scene.kind === "field" ? "Parameters" : "Splats", scene.count.toLocaleString("en")],
           ...(scene.kind === "field" ? [] : /** @type {[string, string][]} */ ([["Harmonics", `degree ${scene.sh_degree}`]])),
-          ["Views", `${state.get("views").length}`],
+          ["Views", `${state.get("views").length}`], ["Drawn", drawn],
         ]),
         ...warnings.map((/** @type {string} */ text) => el("p", { className: "note", textContent: text })),
       );
+    };
+    state.watch(["scene", "hello"], tell);
+    stage().addEventListener("drawing", () => {
+      const now = drawnBy();
+      if (now === drawn) return;
+      drawn = now;
+      tell();
     });
     return section("Scene", body);
   }
@@ -145,6 +153,13 @@ class DisplayPanel extends HTMLElement {
     });
     return section("Inspect", el("div", { className: "row" }, start), body);
   }
+}
+
+/** Who draws, and with what. */
+function drawnBy() {
+  const { local, drawsLocally } = stage();
+  if (!local || !drawsLocally) return "on the server";
+  return `here, by ${local.api}${local.api === "WebGL2" && local.reason ? ` (${local.reason})` : ""}`;
 }
 
 /** The camera with its horizon across `up`. @param {Vec3} up */

@@ -1,24 +1,27 @@
-//! The kernels, put together from their parts.
+//! The kernels, put together from their parts: their text for whoever runs WGSL, such as a browser, and compiled for [`crate::gpu`].
 
-use irradia_compute::gpu::{Gpu, Kernel, Shader};
+#[cfg(feature = "gpu")]
+use irradia_compute::gpu::{Gpu, Kernel};
+use irradia_compute::shaders::{GRID, SCAN, SORT, Shader};
 
-const GRID: &str = irradia_compute::gpu::GRID;
-const VIEW: &str = include_str!("shaders/view.wgsl");
-const GEOMETRY: &str = include_str!("shaders/geometry.wgsl");
-const LOAD: &str = include_str!("shaders/load.wgsl");
-const HARMONICS: &str = include_str!("shaders/harmonics.wgsl");
-const TILES: &str = include_str!("shaders/tiles.wgsl");
-const FRAGMENT: &str = include_str!("shaders/fragment.wgsl");
-const UPDATE: &str = include_str!("shaders/update.wgsl");
+const VIEW: &str = include_str!("gpu/shaders/view.wgsl");
+const GEOMETRY: &str = include_str!("gpu/shaders/geometry.wgsl");
+const LOAD: &str = include_str!("gpu/shaders/load.wgsl");
+const HARMONICS: &str = include_str!("gpu/shaders/harmonics.wgsl");
+const TILES: &str = include_str!("gpu/shaders/tiles.wgsl");
+const FRAGMENT: &str = include_str!("gpu/shaders/fragment.wgsl");
+const UPDATE: &str = include_str!("gpu/shaders/update.wgsl");
 
 macro_rules! kernels {
     ($($(#[$doc:meta])* $name:ident: [$($part:expr),*],)*) => {
         /// The stages of a frame and of a training step, compiled.
+        #[cfg(feature = "gpu")]
         #[derive(Debug)]
-        pub(super) struct Kernels {
+        pub(crate) struct Kernels {
             $($(#[$doc])* pub $name: Kernel,)*
         }
 
+        #[cfg(feature = "gpu")]
         impl Kernels {
             pub fn new(gpu: &Gpu) -> Self {
                 Self { $($name: Kernel::new(gpu, &shader(stringify!($name))),)* }
@@ -26,9 +29,9 @@ macro_rules! kernels {
         }
 
         /// Every kernel's source.
-        pub(super) const SHADERS: &[Shader] = &[$(Shader {
+        pub const SHADERS: &[Shader] = &[$(Shader {
             name: stringify!($name),
-            parts: &[$($part,)* include_str!(concat!("shaders/", stringify!($name), ".wgsl"))],
+            parts: &[$($part,)* include_str!(concat!("gpu/shaders/", stringify!($name), ".wgsl"))],
         },)*];
     };
 }
@@ -58,6 +61,16 @@ kernels! {
     update_geometry: [GRID, VIEW, UPDATE],
 }
 
+/// Kernels of [`SHADERS`] that make a frame.
+const FRAME: [&str; 7] = ["project", "compact", "count", "emit", "ranges", "segments", "blend"];
+
+/// The source of every kernel of a frame, with those of prefix sums and of the sort.
+pub fn of_a_frame() -> impl Iterator<Item = &'static Shader> {
+    let own = SHADERS.iter().filter(|shader| FRAME.contains(&shader.name));
+    own.chain(&SCAN).chain(&SORT)
+}
+
+#[cfg(feature = "gpu")]
 fn shader(name: &str) -> Shader {
     let found = SHADERS.iter().find(|shader| shader.name == name);
     *found.expect("every kernel is in the table")

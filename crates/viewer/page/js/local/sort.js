@@ -1,0 +1,68 @@
+// Prefix sums and a stable radix sort with WebGPU: the twins of crates/compute/src/gpu/scan.rs and sort.rs.
+
+import { Words } from "./device.js";
+
+/** @typedef {import("./device.js").Gpu} Gpu */
+/** @typedef {import("./device.js").Kernel} Kernel */
+/** @typedef {import("./device.js").Work} Work */
+
+/** Words of a block of a prefix sum. */
+const SCAN_BLOCK = 2048;
+/** Keys of a block of the sort. */
+const SORT_BLOCK = 4096;
+/** Bits of a digit. */
+const DIGIT = 4;
+
+/** Exclusive prefix sums of words. */
+export class Scan {
+  /** @param {Gpu} gpu @param {Record<string, Kernel>} kernels */
+  constructor(gpu, kernels) {
+    this.kernels = kernels;
+    this.sums = new Words(gpu, "sums of blocks");
+  }
+
+  /** `before[i]` becomes the sum of the words of `values` before `i`. Each run of a submission has its own `params`, of four words.
+   * @param {Work} work @param {Words} params @param {Words} values @param {Words} before @param {number} count */
+  run(work, params, values, before, count) {
+    const blocks = Math.ceil(count / SCAN_BLOCK);
+    params.write(0, Uint32Array.of(count, blocks));
+    this.sums.reserve(blocks + 1);
+    const { scan_blocks, scan_sums, scan_apply } = this.kernels;
+    work.run(scan_blocks, [params, values, this.sums], blocks);
+    work.run(scan_sums, [params, this.sums], Math.min(blocks, 1));
+    work.run(scan_apply, [params, values, this.sums, before], blocks);
+  }
+}
+
+/** A stable sort of words with a word each. */
+export class Sort {
+  /** @param {Gpu} gpu @param {Record<string, Kernel>} kernels */
+  constructor(gpu, kernels) {
+    this.kernels = kernels;
+    this.scan = new Scan(gpu, kernels);
+    this.passes = Array.from({ length: 32 / DIGIT }, () => ({ params: new Words(gpu, "sort parameters", 4), scan: new Words(gpu, "scan parameters", 4) }));
+    this.counts = new Words(gpu, "counts of digits");
+    this.starts = new Words(gpu, "starts of digits");
+    this.other = [new Words(gpu, "sorted keys"), new Words(gpu, "sorted values")];
+  }
+
+  /** Sorts the first `count` keys, and their values alike, by their lowest bits. Once per submission.
+   * @param {Work} work @param {Words} keys @param {Words} values @param {number} count @param {number} bits */
+  run(work, keys, values, count, bits) {
+    const blocks = Math.ceil(count / SORT_BLOCK);
+    const digits = 1 << DIGIT;
+    for (const array of [this.counts, this.starts]) array.reserve(digits * blocks);
+    for (const array of this.other) array.reserve(count);
+    // An even number, so that what is sorted ends where it was.
+    const passes = 2 * Math.ceil(bits / DIGIT / 2);
+    const { sort_count, sort_scatter } = this.kernels;
+    let [from, to] = [[keys, values], this.other];
+    this.passes.slice(0, passes).forEach(({ params, scan }, i) => {
+      params.write(0, Uint32Array.of(count, blocks, DIGIT * i));
+      work.run(sort_count, [params, from[0], this.counts], blocks);
+      this.scan.run(work, scan, this.counts, this.starts, digits * blocks);
+      work.run(sort_scatter, [params, from[0], from[1], this.starts, to[0], to[1]], blocks);
+      [from, to] = [to, from];
+    });
+  }
+}

@@ -1,0 +1,142 @@
+// Draws splats with WebGPU, as the program draws them.
+
+import { shader } from "./assets.js";
+import { GROUP, Gpu, Words, Work } from "./device.js";
+import { Frame } from "./frame.js";
+
+/** Bytes of a splat without its higher bands, and of each of its bands, in words. */
+const CORE = 8;
+const BAND = 4;
+
+export class WebGpu {
+  api = "WebGPU";
+  accelerated = true;
+  /** Pictures are drawn whole: nothing goes on between them. */
+  busy = false;
+  ready = Promise.resolve();
+  /** Splats of the scene, those that have arrived, and those unpacked. */
+  total = 0;
+  drawn = 0;
+  unpacked = 0;
+  degree = 0;
+  /** By what the unpacked splats were tinted and clipped. */
+  dressed = "";
+  /** Width and height of the last picture. */
+  painted = [1, 1];
+  /** Grows with each selection. */
+  selection = 0;
+
+  /** @param {Gpu} gpu @param {Record<string, import("./device.js").Kernel>} kernels @param {GPURenderPipeline} presenting
+   * @param {GPUTextureFormat} format @param {() => void} changed */
+  constructor(gpu, kernels, presenting, format, changed) {
+    this.gpu = gpu;
+    this.changed = changed;
+    this.unpack = kernels.unpack;
+    this.frame = new Frame(gpu, kernels);
+    this.presenting = presenting;
+    this.canvas = document.createElement("canvas");
+    this.context = /** @type {GPUCanvasContext} */ (this.canvas.getContext("webgpu"));
+    this.context.configure({ device: gpu.device, format, alphaMode: "opaque" });
+    const array = (/** @type {string} */ label, /** @type {number} */ words = 0) => new Words(gpu, label, words);
+    this.cores = array("cores");
+    this.bands = array("bands");
+    this.selected = array("selected splats");
+    this.params = array("unpacking", 12);
+    this.size = array("size", 2);
+  }
+
+  /** Opens the device and compiles; throws where it cannot. @param {() => void} changed told when a picture would be another one
+   * @param {(reason: string) => void} fail told when the device fails later */
+  static async open(changed, fail) {
+    const gpu = await Gpu.open(fail);
+    const format = navigator.gpu.getPreferredCanvasFormat();
+    const present = async () => {
+      const module = gpu.device.createShaderModule({ label: "present", code: await shader("present.wgsl") });
+      return gpu.device.createRenderPipelineAsync({ label: "present", layout: "auto", vertex: { module }, fragment: { module, targets: [{ format }] } });
+    };
+    try {
+      const [kernels, presenting] = await Promise.all([gpu.kernels(), present()]);
+      return new WebGpu(gpu, kernels, presenting, format, changed);
+    } catch (error) {
+      gpu.device.destroy();
+      throw error;
+    }
+  }
+
+  /** Makes room; throws where there is too little. @param {number} count @param {number} degree */
+  begin(count, degree) {
+    [this.total, this.degree, this.drawn, this.unpacked, this.dressed] = [count, degree, 0, 0, ""];
+    this.cores.reserve(CORE * count);
+    this.bands.reserve(BAND * degree * count);
+    this.selected.reserve(Math.ceil(count / 32));
+    this.frame.reserve({ count, stride: count, degree });
+  }
+
+  /** @param {import("./stream.js").Block} block */
+  take({ first, count, cores, bands }) {
+    this.cores.write(CORE * first, cores);
+    if (this.degree) this.bands.write(BAND * this.degree * first, bands);
+    this.drawn = first + count;
+  }
+
+  /** @param {Uint8Array} bits of the selected splats */
+  select(bits) {
+    const whole = new Uint8Array(4 * Math.ceil(this.total / 32));
+    whole.set(bits.subarray(0, whole.length));
+    this.selected.write(0, whole);
+    this.selection += 1;
+  }
+
+  /** Kernels sort: nothing is to be known before. */
+  aim() {
+    this.changed();
+  }
+
+  /** Paints; resolves when `present` can show the picture, to whether there is one.
+   * @param {import("./renderer.js").Camera} camera @param {import("./renderer.js").Intrinsics} k @param {import("./renderer.js").Options} options */
+  async paint(camera, k, { near, background, antialias, clip, highlight }) {
+    const { gpu, drawn } = this;
+    this.dress(clip, highlight);
+    if (!(await this.frame.draw({ camera, k, near, background, antialias }, drawn))) return false;
+    this.painted = [k.width, k.height];
+    await gpu.queue.onSubmittedWorkDone();
+    return true;
+  }
+
+  /** Unpacks the splats that came since, or all where tint or clipping box are others.
+   * @param {import("./renderer.js").Options["clip"]} clip @param {boolean} highlight */
+  dress(clip, highlight) {
+    const { gpu, frame, drawn } = this;
+    const wanted = JSON.stringify([clip, highlight && this.selection]);
+    const first = wanted === this.dressed ? this.unpacked : 0;
+    [this.dressed, this.unpacked] = [wanted, drawn];
+    if (first === drawn) return;
+    const words = new Uint32Array(12);
+    const floats = new Float32Array(words.buffer);
+    floats.set(clip?.[0] ?? [-3e38, -3e38, -3e38], 0);
+    floats.set(clip?.[1] ?? [3e38, 3e38, 3e38], 4);
+    [words[3], words[7]] = [first, drawn];
+    words.set([this.total, this.degree, highlight ? 1 : 0], 8);
+    this.params.write(0, words);
+    const work = new Work(gpu);
+    work.run(this.unpack, [this.params, this.cores, this.bands, this.selected, frame.geometry, frame.harmonics], Math.ceil((drawn - first) / GROUP));
+    work.submit();
+  }
+
+  /** Brings the last picture to the canvas, which holds it until the browser has composed the page. */
+  present() {
+    const { device, queue } = this.gpu;
+    const [width, height] = this.painted;
+    if (this.canvas.width !== width || this.canvas.height !== height) [this.canvas.width, this.canvas.height] = [width, height];
+    this.size.write(0, Uint32Array.of(width, height));
+    const encoder = device.createCommandEncoder();
+    const view = this.context.getCurrentTexture().createView();
+    const pass = encoder.beginRenderPass({ colorAttachments: [{ view, loadOp: "clear", storeOp: "store" }] });
+    pass.setPipeline(this.presenting);
+    const entries = [this.size, this.frame.planes].map(({ buffer }, binding) => ({ binding, resource: { buffer } }));
+    pass.setBindGroup(0, device.createBindGroup({ layout: this.presenting.getBindGroupLayout(0), entries }));
+    pass.draw(3);
+    pass.end();
+    queue.submit([encoder.finish()]);
+  }
+}

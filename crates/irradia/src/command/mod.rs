@@ -4,6 +4,7 @@ pub mod compact;
 pub mod compare;
 pub mod convert;
 pub mod demo;
+pub mod doctor;
 pub mod edit;
 pub mod eval;
 pub mod files;

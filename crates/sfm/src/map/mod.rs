@@ -15,12 +15,13 @@ mod triangulation;
 mod types;
 mod verify;
 
+pub(crate) use finish::up;
+pub use focal::Source;
 pub use types::{
     LeftOut, MapOptions, Model, ModelPoint, PairKind, PhotoInfo, Progress, Reason, Reconstruction, VerifiedPair,
 };
-pub use verify::verify;
+pub use verify::{Cameras, verify};
 
-use crate::geometry::camera::DCamera;
 use crate::{Features, PairMatches};
 use tracks::Tracks;
 
@@ -40,6 +41,7 @@ pub fn reconstruct(
 ) -> Reconstruction {
     assert_eq!(photos.len(), features.len(), "one set of features a photograph");
     let (cameras, verified) = verify(photos, features, pairs, options, progress);
+    let guessed = cameras.iter().map(|camera| camera.1 == Source::Guess).collect();
     let tracks = Tracks::new(features, &verified);
     let mut models = Vec::new();
     let mut taken = vec![false; photos.len()];
@@ -63,8 +65,6 @@ pub fn reconstruct(
         models,
         left_out,
         pairs: verified,
+        guessed,
     }
 }
-
-/// The cameras before any adjustment: a focal length a group, the principal point in the centre.
-type Cameras = Vec<(DCamera, focal::Source)>;

@@ -133,6 +133,8 @@ pub struct Reconstruction {
     pub left_out: Vec<LeftOut>,
     /// The pairs that were used.
     pub pairs: Vec<VerifiedPair>,
+    /// `[groups]` whether the first focal length of a group was a mere guess: all values fit its pairs alike.
+    pub guessed: Vec<bool>,
 }
 
 /// Cameras, poses and points in one world: up is +Z, the origin is near the scene's middle, the cameras' distance is about 1.

@@ -7,7 +7,7 @@ use crate::folder::to_json;
 use irradia_formats::{PhotoFolder, read_photo_folder, write_atomic, write_png};
 use irradia_sfm::PairMatches;
 use irradia_sfm::doctor::{Diagnosis, Evidence, diagnose, shots};
-use irradia_sfm::map::{MapOptions, Model, PhotoInfo, Reconstruction, Source, verify};
+use irradia_sfm::map::{MapOptions, Model, PhotoInfo, Reconstruction, verify};
 use irradia_sfm::matching::PairOptions;
 use serde::Serialize;
 use std::collections::BTreeMap;
@@ -110,7 +110,7 @@ pub fn doctor(input: &DoctorInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> 
     let (cameras, verified) = verify(&infos, work.features(), &pairs, &MapOptions::default(), &mut |_| ());
     let found = Reconstruction {
         pairs: verified,
-        guessed: cameras.iter().map(|camera| camera.1 == Source::Guess).collect(),
+        cameras,
         ..Reconstruction::default()
     };
     let mut report = examine(&work, &infos, &pairs, &found, false);
@@ -139,7 +139,7 @@ pub(super) fn examine(
         colors: work.colors(),
         matches,
         pairs: &found.pairs,
-        guessed: &found.guessed,
+        cameras: &found.cameras,
         model,
         left_out: &found.left_out,
     };

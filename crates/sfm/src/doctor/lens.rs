@@ -3,7 +3,7 @@
 use super::{Diagnosis, Evidence, median};
 use crate::geometry::ransac::Limits;
 use crate::geometry::resection::Resection;
-use crate::map::Model;
+use crate::map::{Model, PairKind, Source};
 use glam::{DVec2, DVec3};
 use rayon::prelude::*;
 use std::collections::{BTreeSet, HashMap};
@@ -19,6 +19,9 @@ const ENOUGH: usize = 30;
 const AGREES: f64 = 3.0;
 /// Points that are tried, at most.
 const POINTS: usize = 400;
+
+/// Pairs that show depth, of all, from which on a focal length can be adjusted.
+const GENERAL: f64 = 0.25;
 
 /// Focal lengths by the metadata.
 pub(super) fn settings(evidence: &Evidence) -> Vec<Diagnosis> {
@@ -123,14 +126,22 @@ fn own_ratio(evidence: &Evidence, model: &Model, point_of: &HashMap<(u32, u32), 
 /// Cameras of which any focal length fits.
 pub(super) fn focal_unknown(evidence: &Evidence) -> Vec<Diagnosis> {
     let mut found = Vec::new();
-    for (group, guessed) in evidence.guessed.iter().enumerate() {
+    for (group, (_, source)) in evidence.cameras.iter().enumerate() {
         let held = evidence
             .model
             .is_some_and(|model| model.focal_held.get(group) == Some(&true));
-        let photos: Vec<usize> = (0..evidence.photos.len())
-            .filter(|p| evidence.photos[*p].group == group)
-            .collect();
-        if (*guessed || held) && photos.len() > 2 && !evidence.pairs.is_empty() {
+        let of_group = |photo: usize| evidence.photos[photo].group == group;
+        let photos: Vec<usize> = (0..evidence.photos.len()).filter(|p| of_group(*p)).collect();
+        let pairs = || {
+            evidence
+                .pairs
+                .iter()
+                .filter(|pair| pair.photos.iter().all(|p| of_group(*p as usize)))
+        };
+        let general = pairs().filter(|pair| pair.kind == PairKind::General).count();
+        // What the pairs leave open, many photographs of a scene with depth may still determine together.
+        let open = *source == Source::Guess && (general as f64) < GENERAL * pairs().count() as f64;
+        if (open || held) && photos.len() > 2 {
             found.push(Diagnosis::FocalUnknown { photos });
         }
     }

@@ -4,6 +4,7 @@
 //! of its family; thresholds are constants beside it, measured by the example `doctor` on injured and on clean captures.
 
 mod appearance;
+mod folds;
 mod lens;
 mod looks;
 mod motion;
@@ -14,11 +15,13 @@ mod turns;
 mod types;
 
 pub use appearance::Appearance;
+pub use folds::{Consistency, consistency};
 pub use shots::{Shot, shots};
-pub use turns::{Turns, contradictions, turns};
+pub use turns::{Turns, turns};
 pub use types::{Diagnosis, Kind};
 
-use crate::map::{LeftOut, Model, PairKind, PhotoInfo, Reason, VerifiedPair};
+use crate::geometry::camera::DCamera;
+use crate::map::{LeftOut, Model, PairKind, PhotoInfo, Reason, Source, VerifiedPair};
 use crate::{Features, PairMatches};
 use std::collections::BTreeMap;
 
@@ -37,8 +40,8 @@ pub struct Evidence<'a> {
     pub matches: &'a [PairMatches],
     /// Pairs after it.
     pub pairs: &'a [VerifiedPair],
-    /// `[groups]` whether the focal length of a group is a mere guess.
-    pub guessed: &'a [bool],
+    /// `[groups]` the camera of each group before any adjustment, and where its focal length comes from.
+    pub cameras: &'a [(DCamera, Source)],
     /// The largest model, if the photographs were mapped.
     pub model: Option<&'a Model>,
     /// What became of photographs without a pose, if the photographs were mapped.
@@ -118,7 +121,7 @@ pub fn diagnose(evidence: &Evidence) -> Vec<Diagnosis> {
         return Vec::new();
     }
     let graph = Graph::new(n, evidence.pairs, HOLDS);
-    let turns = turns(n, evidence.pairs);
+    let consistency = consistency(evidence.photos, evidence.features, evidence.cameras, evidence.pairs);
     let twice = motion::twice(evidence);
     let rotation_only = motion::rotation_only(evidence, &graph);
     let still = motion::stands_still(evidence);
@@ -140,8 +143,12 @@ pub fn diagnose(evidence: &Evidence) -> Vec<Diagnosis> {
     ]
     .concat();
     let overlap = overlap::overlap(evidence, &graph);
-    let ring = ring::ring(evidence, &graph, &turns);
-    let contradiction = turns::contradiction(evidence, &turns);
+    let ring = if evidence.model.is_some() || consistency.is_settled() {
+        ring::ring(evidence, &graph, &consistency.turns)
+    } else {
+        Vec::new()
+    };
+    let contradiction = folds::contradiction(evidence);
     let known = [
         contradiction,
         rotation_only,

@@ -25,14 +25,14 @@ const STILL_FRACTION: f64 = 0.08;
 const STILL_PAIRS: f64 = 0.1;
 
 /// Inliers of what moves, beside at least twice as many of the scene.
-const MOVING_MATCHES: usize = 10;
+const MOVING_MATCHES: usize = 12;
 /// Median distance from the scene's epipolar lines of what moves, in long sides.
 const MOVING_OFF: f64 = 0.012;
 /// Largest part of the picture, along each axis, of what moves.
 const MOVING_PART: f64 = 0.5;
 /// Pairs, and their fraction, from which on something moves.
 const MOVING_PAIRS: usize = 4;
-const MOVING_FRACTION: f64 = 0.03;
+const MOVING_FRACTION: f64 = 0.08;
 
 /// Errors in long sides at which a match agrees with a geometry: four pixels of a thousand, as in verification, and half as much
 /// again for what is not rigid.

@@ -1,8 +1,7 @@
-//! Rotations of all photographs from those of their pairs, and the pairs that contradict them.
+//! Rotations of all photographs from those of their pairs.
 //!
 //! Symbols: `R_i` is the rotation from the world to camera `i`; a pair says `R_j = R_ij R_i`.
 
-use super::{Diagnosis, Evidence, HOLDS};
 use crate::map::{PairKind, VerifiedPair};
 use glam::{DQuat, DVec4};
 use std::collections::BTreeMap;
@@ -16,11 +15,8 @@ const CLOSED: f64 = 0.17;
 const SCALES: [f64; 4] = [0.5, 0.25, 0.12, 0.08];
 /// Sweeps over all photographs for each scale.
 const SWEEPS: usize = 40;
-/// Disagreement from which on a pair contradicts the rest, radians. Two-view rotations of pairs that are right are within 10 degrees.
-const CONTRADICTS: f64 = 0.35;
-/// Contradicting pairs, and their fraction of all, from which on parts may be taken for one another.
-const PAIRS: usize = 4;
-const FRACTION: f64 = 0.02;
+/// Weight of a pair that shows a plane: two rotations fit it.
+const PLANAR: f64 = 0.2;
 
 /// Rotations from pairs alone.
 #[derive(Clone, Debug, PartialEq)]
@@ -33,13 +29,14 @@ pub struct Turns {
     pub disagreement: Vec<f64>,
 }
 
-/// The rotations that agree best with those of `pairs`: first along the tree of the best pairs, then as robust means (Hartley et
+/// The rotations that agree best with those of `pairs`, `rotations` from the first camera to the second of each: first along the tree of the best pairs, then as robust means (Hartley et
 /// al., "Rotation averaging", 2013, with Geman and McClure's weight).
-pub fn turns(photos: usize, pairs: &[VerifiedPair]) -> Turns {
-    let closed = closed_loops(photos, pairs);
+pub fn turns(photos: usize, pairs: &[VerifiedPair], rotations: &[DQuat]) -> Turns {
+    let said = rotations;
+    let closed = closed_loops(photos, pairs, said);
     let weight = |i: usize| {
         let matches = pairs[i].matches.len().min(FULL_WEIGHT) as f64;
-        matches * (0.1 + closed[i]) * if pairs[i].kind == PairKind::Planar { 0.5 } else { 1.0 }
+        matches * (0.1 + closed[i]) * if pairs[i].kind == PairKind::Planar { PLANAR } else { 1.0 }
     };
     let weights: Vec<f64> = (0..pairs.len()).map(weight).collect();
     let mut order: Vec<usize> = (0..pairs.len()).collect();
@@ -47,13 +44,12 @@ pub fn turns(photos: usize, pairs: &[VerifiedPair]) -> Turns {
     let branch = |i: usize| weights[i] * (pairs[i].matches.len() as f64).sqrt();
     order.sort_by(|a, b| branch(*b).total_cmp(&branch(*a)).then(a.cmp(b)));
     let mut partners: Vec<Vec<(usize, DQuat, f64)>> = vec![Vec::new(); photos];
-    for (pair, weight) in pairs.iter().zip(&weights) {
+    for ((pair, weight), b_from_a) in pairs.iter().zip(&weights).zip(said) {
         let [a, b] = pair.photos.map(|p| p as usize);
-        let b_from_a = pair.motion.rotation;
-        partners[b].push((a, b_from_a, *weight));
+        partners[b].push((a, *b_from_a, *weight));
         partners[a].push((b, b_from_a.inverse(), *weight));
     }
-    let (mut rotations, part) = along_tree(photos, pairs, &order);
+    let (mut rotations, part) = along_tree(photos, pairs, said, &order);
     for scale in SCALES {
         for _ in 0..SWEEPS {
             for photo in 0..photos {
@@ -73,11 +69,13 @@ pub fn turns(photos: usize, pairs: &[VerifiedPair]) -> Turns {
             }
         }
     }
+    let of = |pair: &VerifiedPair| pair.photos.map(|p| rotations[p as usize].unwrap_or(DQuat::IDENTITY));
     let disagreement = pairs
         .iter()
-        .map(|pair| {
-            let [a, b] = pair.photos.map(|p| rotations[p as usize].unwrap_or(DQuat::IDENTITY));
-            angle(pair.motion.rotation * a, b)
+        .zip(said)
+        .map(|(pair, b_from_a)| {
+            let [a, b] = of(pair);
+            angle(*b_from_a * a, b)
         })
         .collect();
     Turns {
@@ -92,7 +90,7 @@ fn angle(a: DQuat, b: DQuat) -> f64 {
 }
 
 /// `[pairs]` the fraction of the loops of three through each pair that close, in \[0, 1\]; half without any loop.
-fn closed_loops(photos: usize, pairs: &[VerifiedPair]) -> Vec<f64> {
+fn closed_loops(photos: usize, pairs: &[VerifiedPair], said: &[DQuat]) -> Vec<f64> {
     let mut of: Vec<BTreeMap<usize, usize>> = vec![BTreeMap::new(); photos];
     for (i, pair) in pairs.iter().enumerate() {
         let [a, b] = pair.photos.map(|p| p as usize);
@@ -103,8 +101,7 @@ fn closed_loops(photos: usize, pairs: &[VerifiedPair]) -> Vec<f64> {
         for (b, ab) in partners {
             for (c, bc) in &of[*b] {
                 let Some(ac) = of[a].get(c) else { continue };
-                let around = pairs[*bc].motion.rotation * pairs[*ab].motion.rotation;
-                let closes = angle(around, pairs[*ac].motion.rotation) < CLOSED;
+                let closes = angle(said[*bc] * said[*ab], said[*ac]) < CLOSED;
                 for (pair, others) in [(*ab, [*bc, *ac]), (*bc, [*ab, *ac]), (*ac, [*ab, *bc])] {
                     let weight = others.map(|o| pairs[o].matches.len()).into_iter().min().unwrap_or(0) as f64;
                     counts[pair][0] += if closes { weight } else { 0.0 };
@@ -120,10 +117,15 @@ fn closed_loops(photos: usize, pairs: &[VerifiedPair]) -> Vec<f64> {
 }
 
 /// Rotations along the tree of the first pairs of `order` that join parts; and each photograph's part.
-fn along_tree(photos: usize, pairs: &[VerifiedPair], order: &[usize]) -> (Vec<Option<DQuat>>, Vec<usize>) {
+fn along_tree(
+    photos: usize,
+    pairs: &[VerifiedPair],
+    said: &[DQuat],
+    order: &[usize],
+) -> (Vec<Option<DQuat>>, Vec<usize>) {
     let mut rotations: Vec<Option<DQuat>> = vec![None; photos];
     let mut part: Vec<usize> = (0..photos).collect();
-    for pair in order.iter().map(|i| &pairs[*i]) {
+    for (pair, b_from_a) in order.iter().map(|i| (&pairs[*i], said[*i])) {
         let [a, b] = pair.photos.map(|p| p as usize);
         if part[a] == part[b] {
             continue;
@@ -131,7 +133,7 @@ fn along_tree(photos: usize, pairs: &[VerifiedPair], order: &[usize]) -> (Vec<Op
         let (of_a, of_b) = (rotations[a].unwrap_or_default(), rotations[b].unwrap_or_default());
         (rotations[a], rotations[b]) = (Some(of_a), Some(of_b));
         // The part of b turns into the world of a: R_b' = R_ab R_a.
-        let turn = of_b.inverse() * pair.motion.rotation * of_a;
+        let turn = of_b.inverse() * b_from_a * of_a;
         let (from, to) = (part[b], part[a]);
         for photo in (0..photos).filter(|p| part[*p] == from) {
             rotations[photo] = rotations[photo].map(|r| (r * turn).normalize());
@@ -139,32 +141,6 @@ fn along_tree(photos: usize, pairs: &[VerifiedPair], order: &[usize]) -> (Vec<Op
         part.iter_mut().filter(|p| **p == from).for_each(|p| *p = to);
     }
     (rotations, part)
-}
-
-/// The pairs that contradict the rest, those with most matches first.
-pub fn contradictions(pairs: &[VerifiedPair], turns: &Turns) -> Vec<usize> {
-    let mut found: Vec<usize> = (0..pairs.len())
-        .filter(|i| turns.disagreement[*i] > CONTRADICTS && pairs[*i].matches.len() >= HOLDS)
-        .collect();
-    found.sort_by_key(|i| (std::cmp::Reverse(pairs[*i].matches.len()), *i));
-    found
-}
-
-/// Repeated structures: loops of pairs that cannot close.
-pub(super) fn contradiction(evidence: &Evidence, turns: &Turns) -> Vec<Diagnosis> {
-    let pairs = evidence.pairs;
-    let found = contradictions(pairs, turns);
-    let of = pairs.iter().filter(|pair| pair.matches.len() >= HOLDS).count();
-    if found.len() < PAIRS || (found.len() as f64) < FRACTION * of as f64 {
-        return Vec::new();
-    }
-    let first = found[0];
-    vec![Diagnosis::Contradiction {
-        pairs: found.iter().map(|i| pairs[*i].photos.map(|p| p as usize)).collect(),
-        degrees: turns.disagreement[first].to_degrees(),
-        matches: pairs[first].matches.len(),
-        of,
-    }]
 }
 
 #[cfg(test)]
@@ -184,6 +160,10 @@ mod tests {
             },
             angle: 0.1,
         }
+    }
+
+    fn said(pairs: &[VerifiedPair]) -> Vec<DQuat> {
+        pairs.iter().map(|pair| pair.motion.rotation).collect()
     }
 
     /// A ring of `n` cameras of which each is paired with the next `reach`.
@@ -206,13 +186,13 @@ mod tests {
     #[test]
     fn rotations_return_and_pairs_that_agree_do_not_contradict() {
         let (cameras, pairs) = ring(24, 3);
-        let found = turns(24, &pairs);
+        let found = turns(24, &pairs, &said(&pairs));
         let first = found.world_from_camera[0].unwrap();
         for (found, truth) in found.world_from_camera.iter().zip(&cameras) {
             let relative = first.inverse() * found.unwrap();
             assert!(angle(relative, cameras[0].inverse() * *truth) < 0.04);
         }
-        assert!(contradictions(&pairs, &found).is_empty());
+        assert!(found.disagreement.iter().all(|off| *off < 0.1));
         assert!(found.part.iter().all(|part| *part == found.part[0]));
     }
 
@@ -227,15 +207,17 @@ mod tests {
                 pairs.push(pair(i, j, twin.inverse() * cameras[i], 60));
             }
         }
-        let found = contradictions(&pairs, &turns(24, &pairs));
-        assert_eq!(found.len(), 24);
-        assert!(found.iter().all(|i| *i >= genuine), "{found:?}");
+        let found = turns(24, &pairs, &said(&pairs));
+        for (i, off) in found.disagreement.iter().enumerate() {
+            assert_eq!(*off > 1.0, i >= genuine, "{i} {off}");
+        }
     }
 
     #[test]
     fn photographs_without_pairs_have_no_rotation() {
-        let found = turns(3, &[pair(0, 2, DQuat::from_rotation_y(0.2), 30)]);
+        let pairs = [pair(0, 2, DQuat::from_rotation_y(0.2), 30)];
+        let found = turns(3, &pairs, &said(&pairs));
         assert!(found.world_from_camera[1].is_none() && found.world_from_camera[2].is_some());
-        assert_eq!(turns(0, &[]).part, []);
+        assert_eq!(turns(0, &[], &[]).part, []);
     }
 }

@@ -193,10 +193,10 @@ pub enum Diagnosis {
     Contradiction {
         /// The pairs that contradict the rest, those with most matches first.
         pairs: Vec<[usize; 2]>,
-        /// By how much the first disagrees, degrees.
-        degrees: f64,
-        /// Its matches.
+        /// Matches of the first.
         matches: usize,
+        /// The fraction of them that agrees with the rest.
+        agree: f64,
         /// Verified pairs in all.
         of: usize,
     },
@@ -445,16 +445,17 @@ impl Display for Sentence<'_> {
             ),
             Diagnosis::Contradiction {
                 pairs,
-                degrees,
                 matches,
+                agree,
                 of,
             } => write!(
                 f,
-                "{} of {of} pairs contradict the others, such as {} and {} by {degrees:.0} degrees ({matches} matches): parts that look \
-                 alike may be taken for one another, and the model may be folded; include what tells them apart",
+                "{} of {of} pairs contradict the others, such as {} and {}, where {:.0} % of {matches} matches agree with them: parts \
+                 that look alike may be taken for one another, and the model may be folded; include what tells them apart",
                 pairs.len(),
                 name(&pairs[0][0]),
-                name(&pairs[0][1])
+                name(&pairs[0][1]),
+                100.0 * agree
             ),
             Diagnosis::LeftOut { photo, reason } => write!(f, "{} is left out: {reason}", name(photo)),
         }

@@ -8,19 +8,17 @@ use clap::builder::RangedU64ValueParser;
 use irradia_runs::{DoctorInput, doctor};
 use std::path::PathBuf;
 
-/// Features of a photograph: half of what poses need find the same faults in half of the time.
-const FEATURES: usize = 2048;
-
 #[derive(clap::Args)]
 pub struct Args {
     /// Folder of photographs (JPEG, PNG)
     pub photos: PathBuf,
-    /// Folder for doctor.html, with small pictures, and doctor.json; nothing is written when absent
+    /// Folder for doctor.html, with small pictures, and doctor.json; nothing is written when absent. Features and matches are kept
+    /// there too: irradia pose with the same folder reuses them
     #[arg(long, value_name = "FOLDER")]
     pub out: Option<PathBuf>,
-    /// Maximum number of features of a photograph
-    #[arg(long, value_name = "N", default_value_t = FEATURES, value_parser = RangedU64ValueParser::<usize>::new().range(1..=65_536))]
-    pub max_features: usize,
+    /// Maximum number of features of a photograph; 4096 when absent
+    #[arg(long, value_name = "N", value_parser = RangedU64ValueParser::<usize>::new().range(1..=65_536))]
+    pub max_features: Option<usize>,
     /// Threads; all cores when absent. The result does not depend on it
     #[arg(long, value_name = "N", value_parser = thread_count())]
     pub threads: Option<usize>,
@@ -28,11 +26,9 @@ pub struct Args {
 
 pub fn run(args: &Args) -> Result<()> {
     use_threads(args.threads)?;
-    let input = DoctorInput {
-        photos: args.photos.clone(),
-        out: args.out.clone(),
-        max_features: args.max_features,
-    };
+    let mut input = DoctorInput::new(&args.photos);
+    input.out.clone_from(&args.out);
+    input.max_features = args.max_features.unwrap_or(input.max_features);
     let report = with_progress(|progress| doctor(&input, progress)).map_err(by_option)?;
     tell_findings(&report.findings, |line| say(line))?;
     let page = args

@@ -180,8 +180,8 @@ impl Capture {
             },
             "turntable" => {
                 let behind = Picture::noise(pictures[0].width, pictures[0].height, 99);
-                for (i, picture) in pictures.iter_mut().enumerate() {
-                    picture.put_behind(&behind, &self.source.background(i)?);
+                for (picture, background) in pictures.iter_mut().zip(self.source.backgrounds()?) {
+                    picture.put_behind(&behind, &background);
                 }
                 Expected::Capture {
                     kinds: &["stands-still"],
@@ -270,24 +270,27 @@ impl Source {
         }
     }
 
-    /// Where a picture shows background.
-    fn background(self, i: usize) -> Result<Vec<bool>, Box<dyn Error>> {
+    /// Where each picture shows background.
+    fn backgrounds(self) -> Result<Vec<Vec<bool>>, Box<dyn Error>> {
         if let Source::Real(..) = self {
-            let picture = &self.pictures()?[i];
-            return Ok(picture
-                .rgb
-                .chunks_exact(3)
-                .map(|p| p.iter().all(|v| *v > 235))
-                .collect());
+            let is_white = |picture: Picture| {
+                picture
+                    .rgb
+                    .chunks_exact(3)
+                    .map(|p| p.iter().all(|v| *v > 235))
+                    .collect()
+            };
+            return Ok(self.pictures()?.into_iter().map(is_white).collect());
         }
         let (scene, cameras) = self.scene();
-        let frame = scene.trace(&cameras[i], 1, 0);
-        Ok(frame
-            .depth
-            .data
-            .iter()
-            .map(|depth| *depth > 6.0 || *depth == 0.0)
-            .collect())
+        let depth = |camera: &Camera| scene.trace(camera, 1, 0).depth.data;
+        let is_far = |camera| {
+            depth(camera)
+                .into_iter()
+                .map(|depth| depth > 6.0 || depth == 0.0)
+                .collect()
+        };
+        Ok(cameras.iter().map(is_far).collect())
     }
 }
 

@@ -75,10 +75,10 @@ const MODES: [&str; 2] = ["pairs", "model"];
 
 /// The findings from pairs alone, and with the model.
 fn examined(photos: &Path, folder: &Path) -> Vec<(&'static str, Vec<Finding>)> {
+    // The features are found once.
     let quick = DoctorInput {
-        photos: photos.to_owned(),
-        out: Some(folder.join("doctor")),
-        max_features: 2048,
+        out: Some(folder.join("posed")),
+        ..DoctorInput::new(photos)
     };
     let pairs = doctor(&quick, &|_| {})
         .map(|report| report.findings)

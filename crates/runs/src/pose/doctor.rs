@@ -7,6 +7,7 @@ use crate::folder::to_json;
 use irradia_formats::{PhotoFolder, read_photo_folder, write_atomic, write_png};
 use irradia_sfm::PairMatches;
 use irradia_sfm::doctor::{Diagnosis, Evidence, diagnose, shots};
+use irradia_sfm::features::Sift;
 use irradia_sfm::map::{MapOptions, Model, PhotoInfo, Reconstruction, verify};
 use irradia_sfm::matching::PairOptions;
 use serde::Serialize;
@@ -37,6 +38,17 @@ pub struct DoctorInput {
     pub out: Option<PathBuf>,
     /// The most features of a photograph, at least 1.
     pub max_features: usize,
+}
+
+impl DoctorInput {
+    /// With the usual options; nothing is written.
+    pub fn new(photos: impl Into<PathBuf>) -> Self {
+        Self {
+            photos: photos.into(),
+            out: None,
+            max_features: Sift::default().max_features,
+        }
+    }
 }
 
 /// What is wrong with a capture; `doctor.json`.

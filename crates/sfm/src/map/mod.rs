@@ -66,14 +66,16 @@ pub fn reconstruct(
         };
         let near = near_in_tree(photos.len(), &verified, &tree);
         let skeleton = grown(photos, features, &cameras, &chosen(&|i| near[i]), options, progress);
-        if let Some(model) = skeleton.models.first() {
+        let registered = |found: &Grown| found.models.first().map_or(0, Model::registered) as f64;
+        let least = KEEPS * registered(&found);
+        let unfolds = |other: &Grown| registered(other) >= least && 2 * folds(other) <= folded;
+        let again = skeleton.models.first().map(|model| {
             let agreement = agreement(photos, features, &verified, model);
             let agrees = |i: usize| agreement[i].is_none_or(|fraction| fraction > AGREES);
-            let again = grown(photos, features, &cameras, &chosen(&agrees), options, progress);
-            let registered = |found: &Grown| found.models.first().map_or(0, Model::registered);
-            if registered(&again) as f64 >= KEEPS * registered(&found) as f64 && 2 * folds(&again) <= folded {
-                found = again;
-            }
+            grown(photos, features, &cameras, &chosen(&agrees), options, progress)
+        });
+        if let Some(unfolded) = again.into_iter().chain([skeleton]).find(unfolds) {
+            found = unfolded;
         }
     }
     let Grown { models, taken, tried } = found;
@@ -89,7 +91,7 @@ pub fn reconstruct(
 /// Neighbours that contradict a model from which on it is mapped again.
 const FOLDED: usize = 2;
 /// Fraction of the matches of a pair that agree with the model of neighbours, from which on it is used.
-const AGREES: f64 = 0.5;
+const AGREES: f64 = 0.8;
 /// Photographs that the second model must hold, of those of the first.
 const KEEPS: f64 = 0.9;
 

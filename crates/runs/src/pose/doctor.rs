@@ -1,7 +1,7 @@
 //! The capture doctor on files: `doctor.json`, and `doctor.html` with small pictures and a plan.
 
 use super::stages::Work;
-use super::{MIN_PHOTOS, PoseProgress, check_enough, photo_infos};
+use super::{PoseProgress, check_enough, photo_infos};
 use crate::RunError;
 use crate::folder::to_json;
 use irradia_formats::{PhotoFolder, read_photo_folder, write_atomic, write_png};
@@ -125,7 +125,7 @@ pub fn doctor(input: &DoctorInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> 
         cameras,
         ..Reconstruction::default()
     };
-    let mut report = examine(&work, &infos, &pairs, &found, false);
+    let mut report = examine(&work, &infos, &pairs, &found);
     add_unreadable(&mut report, &folder, &work);
     report.seconds = started.elapsed().as_secs_f64();
     if let Some(out) = &input.out {
@@ -134,15 +134,13 @@ pub fn doctor(input: &DoctorInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> 
     Ok(report)
 }
 
-/// Diagnoses what is known after verification, or after mapping.
+/// Diagnoses what is known after verification, or after mapping if there is a model.
 pub(super) fn examine(
     work: &Work,
     infos: &[PhotoInfo],
     matches: &[PairMatches],
     found: &Reconstruction,
-    mapped: bool,
 ) -> DoctorReport {
-    debug_assert!(infos.len() >= MIN_PHOTOS || !mapped);
     let model = found.models.first();
     let evidence = Evidence {
         photos: infos,
@@ -253,8 +251,8 @@ pub(super) fn write(out: &Path, folder: &PhotoFolder, work: &Work, report: &Doct
         fs::create_dir_all(&pictures).map_err(RunError::io("create", &pictures))?;
     }
     for (name, photo) in shown {
-        let (size, grey) = small(&folder.photos[work.photos()[photo]])?;
-        write_png(&pictures.join(format!("{name}.png")), size[0], size[1], 3, &grey)?;
+        let (size, rgb) = small(&folder.photos[work.photos()[photo]])?;
+        write_png(&pictures.join(format!("{name}.png")), size[0], size[1], 3, &rgb)?;
     }
     let json = to_json(report);
     // Within a script element only `<` can end the data; strings of JSON may escape any character.

@@ -195,7 +195,7 @@ pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Resu
         }
     });
     clock.end("poses");
-    let examined = doctor::examine(&work, &infos, &pairs, &reconstruction, true);
+    let examined = doctor::examine(&work, &infos, &pairs, &reconstruction);
     doctor::write(out, &folder, &work, &examined)?;
     clock.end("doctor");
     if reconstruction.models.is_empty() {

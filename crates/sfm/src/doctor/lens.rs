@@ -12,11 +12,13 @@ use std::collections::{BTreeSet, HashMap};
 const SETTING: f64 = 1.08;
 /// Candidates for the ratio of a photograph's focal length to that of its camera.
 const RATIOS: [f64; 11] = [0.45, 0.54, 0.65, 0.77, 0.88, 1.0, 1.14, 1.3, 1.55, 1.85, 2.2];
-/// How many more points must agree at another focal length, and how many at least.
-const MORE: f64 = 1.3;
+/// The cost at another focal length, by that at the camera's own, at which the other is believed: a step nearer makes up for much of
+/// a zoom, so that nearly as many points agree, but less well.
+const BETTER: f64 = 0.6;
+/// Points that agree, at least.
 const ENOUGH: usize = 30;
 /// Largest reprojection error of such a point, px.
-const AGREES: f64 = 3.0;
+const AGREES: f64 = 2.0;
 /// Points that are tried, at most.
 const POINTS: usize = 400;
 
@@ -108,7 +110,7 @@ fn own_ratio(evidence: &Evidence, model: &Model, point_of: &HashMap<(u32, u32), 
     if points.len() < ENOUGH {
         return None;
     }
-    let agree = RATIOS.map(|ratio| {
+    let fits = RATIOS.map(|ratio| {
         let scaled = points.iter().map(|(at, point)| (*at / ratio, *point)).collect();
         let limits = Limits {
             samples: 400,
@@ -116,11 +118,11 @@ fn own_ratio(evidence: &Evidence, model: &Model, point_of: &HashMap<(u32, u32), 
             seed: photo as u64,
         };
         let found = Resection::new(scaled, AGREES / (camera.focal() * ratio)).solve(Vec::new(), limits);
-        found.map_or(0, |found| found.inliers)
+        found.map_or((f64::INFINITY, 0), |found| (found.cost, found.inliers))
     });
     let own = RATIOS.iter().position(|ratio| *ratio == 1.0).expect("listed");
-    let best = (0..RATIOS.len()).max_by_key(|i| (agree[*i], std::cmp::Reverse(i.abs_diff(own))))?;
-    (best != own && agree[best] >= ENOUGH && agree[best] as f64 > MORE * agree[own] as f64).then_some(RATIOS[best])
+    let best = (0..RATIOS.len()).min_by(|a, b| fits[*a].0.total_cmp(&fits[*b].0))?;
+    (fits[best].1 >= ENOUGH && fits[best].0 < BETTER * fits[own].0).then_some(RATIOS[best])
 }
 
 /// Cameras of which any focal length fits.

@@ -121,10 +121,14 @@ pub fn diagnose(evidence: &Evidence) -> Vec<Diagnosis> {
         return Vec::new();
     }
     let graph = Graph::new(n, evidence.pairs, HOLDS);
-    let consistency = consistency(evidence.photos, evidence.features, evidence.cameras, evidence.pairs);
-    let twice = motion::twice(evidence);
     let rotation_only = motion::rotation_only(evidence, &graph);
     let still = motion::stands_still(evidence);
+    // Pairs on a turntable seem taken from one place.
+    let twice = if still.is_empty() {
+        motion::twice(evidence)
+    } else {
+        Vec::new()
+    };
     let moving = if still.is_empty() {
         motion::moving(evidence)
     } else {
@@ -143,10 +147,15 @@ pub fn diagnose(evidence: &Evidence) -> Vec<Diagnosis> {
     ]
     .concat();
     let overlap = overlap::overlap(evidence, &graph);
-    let ring = if evidence.model.is_some() || consistency.is_settled() {
-        ring::ring(evidence, &graph, &consistency.turns)
-    } else {
-        Vec::new()
+    let ring = match evidence.model {
+        Some(_) => ring::ring(evidence, &graph, &[]),
+        None => {
+            let found = consistency(evidence.photos, evidence.features, evidence.cameras, evidence.pairs);
+            match found.is_settled() {
+                true => ring::ring(evidence, &graph, &found.turns.world_from_camera),
+                false => Vec::new(),
+            }
+        }
     };
     let contradiction = folds::contradiction(evidence);
     let known = [

@@ -1,6 +1,6 @@
 //! Captures that go around something, or look around: gaps, and ends that do not meet.
 
-use super::{Diagnosis, Evidence, Graph, Turns};
+use super::{Diagnosis, Evidence, Graph};
 use crate::map::up;
 use glam::{DQuat, DVec3};
 
@@ -18,8 +18,9 @@ const SIDE: f64 = 30.0;
 /// Horizontal part of a viewing direction that tells an azimuth.
 const LEVEL: f64 = 0.3;
 
-/// Gaps between neighbouring viewing directions that no pair of photographs spans.
-pub(super) fn ring(evidence: &Evidence, graph: &Graph, turns: &Turns) -> Vec<Diagnosis> {
+/// Gaps between neighbouring viewing directions that no pair of photographs spans. Without a model, `turns` holds the rotation from
+/// each camera to the world.
+pub(super) fn ring(evidence: &Evidence, graph: &Graph, turns: &[Option<DQuat>]) -> Vec<Diagnosis> {
     let seen = azimuths(evidence, graph, turns);
     let n = seen.len();
     if n < RING {
@@ -69,16 +70,13 @@ fn is_spanned(seen: &[(f64, usize)], graph: &Graph, i: usize) -> bool {
 
 /// Azimuths of viewing directions in degrees, ascending, with their photographs: those of the model, else those of the largest
 /// part of the pairs.
-fn azimuths(evidence: &Evidence, graph: &Graph, turns: &Turns) -> Vec<(f64, usize)> {
+fn azimuths(evidence: &Evidence, graph: &Graph, turns: &[Option<DQuat>]) -> Vec<(f64, usize)> {
     let largest = graph.parts().into_iter().next().unwrap_or_default();
     let rotations: Vec<(usize, DQuat)> = match evidence.model {
         Some(model) => (0..model.poses.len())
             .filter_map(|p| Some((p, model.poses[p]?.rotation)))
             .collect(),
-        None => largest
-            .into_iter()
-            .filter_map(|p| Some((p, turns.world_from_camera[p]?)))
-            .collect(),
+        None => largest.into_iter().filter_map(|p| Some((p, turns[p]?))).collect(),
     };
     let up = up(rotations
         .iter()

@@ -14,9 +14,9 @@ mod seed;
 mod tracks;
 mod triangulation;
 mod types;
+mod unfold;
 mod verify;
 
-use agree::{CONTRADICTS, near_in_tree, spanning_tree};
 pub use agree::{agreement, contradictions, strengths};
 pub(crate) use finish::up;
 pub use focal::Source;
@@ -44,40 +44,14 @@ pub fn reconstruct(
 ) -> Reconstruction {
     assert_eq!(photos.len(), features.len(), "one set of features a photograph");
     let (cameras, verified) = verify(photos, features, pairs, options, progress);
-    let mut found = grown(photos, features, &cameras, &verified, options, progress);
-    // Parts that look alike share less than what is the same: the strongest pairs must agree with the model.
-    let strengths = strengths(photos, features, &verified);
-    let tree = spanning_tree(photos.len(), &verified, &strengths);
-    let folds = |found: &Grown| {
-        let agreement = found
-            .models
-            .first()
-            .map_or(Vec::new(), |model| agreement(photos, features, &verified, model));
-        let contradicts = |i: &&usize| agreement.get(**i).is_some_and(|a| a.is_some_and(|a| a < CONTRADICTS));
-        tree.iter().filter(contradicts).count()
+    let input = Input {
+        photos,
+        features,
+        cameras: &cameras,
+        pairs: &verified,
+        options,
     };
-    let folded = folds(&found);
-    if folded >= FOLDED {
-        let chosen = |keep: &dyn Fn(usize) -> bool| -> Vec<VerifiedPair> {
-            (0..verified.len())
-                .filter(|i| keep(*i))
-                .map(|i| verified[i].clone())
-                .collect()
-        };
-        let near = near_in_tree(photos.len(), &verified, &tree);
-        let skeleton = grown(photos, features, &cameras, &chosen(&|i| near[i]), options, progress);
-        let registered = |found: &Grown| found.models.first().map_or(0, Model::registered) as f64;
-        let least = KEEPS * registered(&found);
-        let unfolds = |other: &Grown| registered(other) >= least && 2 * folds(other) <= folded;
-        let again = skeleton.models.first().map(|model| {
-            let agreement = agreement(photos, features, &verified, model);
-            let agrees = |i: usize| agreement[i].is_none_or(|fraction| fraction > AGREES);
-            grown(photos, features, &cameras, &chosen(&agrees), options, progress)
-        });
-        if let Some(unfolded) = again.into_iter().chain([skeleton]).find(unfolds) {
-            found = unfolded;
-        }
-    }
+    let found = unfold::unfolded(&input, grown(&input, &verified, progress), progress);
     let Grown { models, taken, tried } = found;
     let left_out = finish::left_out(photos, features, pairs, &verified, &taken, &tried, options);
     Reconstruction {
@@ -87,13 +61,6 @@ pub fn reconstruct(
         cameras,
     }
 }
-
-/// Neighbours that contradict a model from which on it is mapped again.
-const FOLDED: usize = 2;
-/// Fraction of the matches of a pair that agree with the model of neighbours, from which on it is used.
-const AGREES: f64 = 0.8;
-/// Photographs that the second model must hold, of those of the first.
-const KEEPS: f64 = 0.9;
 
 /// Models, and what was tried.
 struct Grown {
@@ -105,15 +72,25 @@ struct Grown {
     tried: Vec<usize>,
 }
 
-/// All models from the matches of `pairs`.
-fn grown(
-    photos: &[PhotoInfo],
-    features: &[Features],
-    cameras: &Cameras,
-    pairs: &[VerifiedPair],
-    options: &MapOptions,
-    progress: &mut dyn FnMut(Progress),
-) -> Grown {
+/// What models are grown from.
+struct Input<'a> {
+    photos: &'a [PhotoInfo],
+    features: &'a [Features],
+    cameras: &'a Cameras,
+    /// All verified pairs.
+    pairs: &'a [VerifiedPair],
+    options: &'a MapOptions,
+}
+
+/// All models from the matches of `pairs`, which may be some of those of `input`.
+fn grown(input: &Input, pairs: &[VerifiedPair], progress: &mut dyn FnMut(Progress)) -> Grown {
+    let Input {
+        photos,
+        features,
+        cameras,
+        options,
+        ..
+    } = *input;
     let tracks = Tracks::new(features, pairs);
     let mut models = Vec::new();
     let mut taken = vec![false; photos.len()];

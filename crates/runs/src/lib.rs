@@ -81,7 +81,10 @@ pub use journal::logged_errors;
 pub use levels::{LEVELS, Level, level_file, read_levels, write_levels};
 pub use orbit::Outlook;
 pub use path::{CameraPath, Film, PathKey};
-pub use pose::{CameraReport, LeftOutPhoto, PoseInput, PoseProgress, PoseReport, StageReport, is_film, pose};
+pub use pose::{
+    CameraReport, DoctorInput, DoctorReport, Finding, LeftOutPhoto, PoseInput, PoseProgress, PoseReport, StageReport,
+    doctor, is_film, pose,
+};
 pub use protocol::Protocol;
 pub use provenance::{data_fingerprint, program_fingerprint};
 pub use request::{DEFAULT_RECIPE, HOW_TO_GET_LPIPS, Reading, TrainInput, TrainRequest, read_recipe};

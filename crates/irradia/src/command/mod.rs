@@ -5,6 +5,7 @@ pub mod compare;
 pub mod convert;
 pub mod demo;
 pub mod devices;
+pub mod doctor;
 pub mod edit;
 pub mod eval;
 pub mod files;

@@ -1,12 +1,17 @@
-//! Shared numerics: SIMD lanes with run-time dispatch, planar arrays, radix sort, nearest neighbours of byte vectors and Adam.
+//! Shared numerics: SIMD lanes with run-time dispatch, planar arrays, radix sort, nearest neighbours of byte vectors and Adam;
+//! and, with the feature `gpu`, the same on any GPU.
 //!
 //! All `unsafe` code is in `simd::x86` and `nearest::x86`.
 
 pub mod adam;
+mod device;
+#[cfg(feature = "gpu")]
+pub mod gpu;
 pub mod nearest;
 pub mod planes;
 pub mod simd;
 pub mod sort;
 
+pub use device::{Device, DeviceChoice, DeviceError};
 pub use planes::Planes;
 pub use simd::Level;

@@ -2,6 +2,7 @@ use crate::Selection;
 use glam::{DVec3, Vec3};
 use irradia_scene::{Camera, GaussianCloud};
 use rayon::prelude::*;
+use std::borrow::Cow;
 
 /// A scene that is being edited.
 #[derive(Clone, Debug, PartialEq)]
@@ -46,13 +47,18 @@ impl Draft {
     }
 
     /// The splats without the hidden ones, as they are drawn and written.
-    pub fn shown(&self) -> GaussianCloud {
-        if self.hidden.is_empty() {
-            return self.cloud.clone();
+    pub fn shown(&self) -> Cow<'_, GaussianCloud> {
+        match self.hidden.is_empty() {
+            true => Cow::Borrowed(&self.cloud),
+            false => Cow::Owned(gather(&self.cloud, &self.visible().indices())),
         }
-        let mut shown = self.hidden.clone();
-        shown.invert();
-        gather(&self.cloud, &shown.indices())
+    }
+
+    /// The splats that are not hidden.
+    pub fn visible(&self) -> Selection {
+        let mut visible = self.hidden.clone();
+        visible.invert();
+        visible
     }
 
     /// Median distance of the splats from their median, world units; 0 for a point.

@@ -64,8 +64,7 @@ impl FloaterScores {
 /// The scores of every splat; hidden ones have none.
 pub fn floater_scores(draft: &Draft) -> Vec<FloaterScores> {
     let cloud = &draft.cloud;
-    let mut shown = draft.hidden.clone();
-    shown.invert();
+    let shown = draft.visible();
     let numbers = shown.indices();
     if numbers.len() <= NEIGHBOURS {
         return vec![FloaterScores::default(); draft.len()];

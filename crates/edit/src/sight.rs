@@ -122,9 +122,7 @@ impl Observer {
 
 /// The number of the draft's cameras that see each splat.
 pub(crate) fn views_that_see(draft: &Draft) -> Vec<u32> {
-    let mut shown = draft.hidden.clone();
-    shown.invert();
-    let mut observer = Observer::new(draft, &shown);
+    let mut observer = Observer::new(draft, &draft.visible());
     let mut views = vec![0; draft.len()];
     for camera in &draft.cameras {
         let weights = observer.weights(camera);

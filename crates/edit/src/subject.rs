@@ -1,6 +1,7 @@
 //! What the cameras look at.
 
 use crate::Draft;
+use crate::draft::median;
 use glam::Vec3;
 use irradia_scene::Camera;
 use irradia_splat::init::focus_point;
@@ -12,13 +13,8 @@ pub fn subject(draft: &Draft) -> Option<([f64; 3], f64)> {
         return None;
     }
     let focus = focus_point(&draft.cameras);
-    let mut radii: Vec<f32> = draft
-        .cameras
-        .iter()
-        .map(|camera| framed_radius(camera, focus))
-        .collect();
-    let middle = radii.len() / 2;
-    let radius = *radii.select_nth_unstable_by(middle, f32::total_cmp).1;
+    let radii = draft.cameras.iter().map(|camera| framed_radius(camera, focus));
+    let radius = median(radii.collect());
     let world = draft.cloud.world_from_dataset;
     Some((
         world.invert(focus.as_dvec3()).to_array(),

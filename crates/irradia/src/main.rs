@@ -52,6 +52,8 @@ enum Command {
     Compact(command::compact::Args),
     /// Edit a scene: select, delete, move, recolour, remove floaters, merge, ..
     Edit(command::edit::Args),
+    /// List the GPUs of this machine, by whose names --device knows them
+    Devices,
     /// Write a ray-traced scene as a dataset: images, depth, normals, points, cameras
     Synth(command::demo::SynthArgs),
 }
@@ -84,6 +86,7 @@ fn main() -> ExitCode {
         Command::Convert(args) => command::convert::convert(&args),
         Command::Compact(args) => command::compact::run(&args),
         Command::Edit(args) => command::edit::run(&args),
+        Command::Devices => command::devices::run(),
         Command::Synth(args) => command::demo::synth(&args),
     };
     match result {

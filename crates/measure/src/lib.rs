@@ -5,6 +5,8 @@
 //! double precision, and each verifies the other.
 #![forbid(unsafe_code)]
 
+#[cfg(feature = "gpu")]
+pub mod gpu;
 pub mod loss;
 pub mod metric;
 mod real;

@@ -8,7 +8,6 @@ use irradia_measure::psnr;
 use irradia_scene::{GaussianCloud, Similarity};
 use irradia_splat::{RenderOptions, Renderer, Splats};
 use irradia_train::model::Model;
-use std::borrow::Cow;
 use std::path::Path;
 
 /// Cameras around the scene from which it is compared.
@@ -58,12 +57,11 @@ pub fn convert(input: &Path, output: &Path, options: &WriteOptions, compares: bo
 pub(crate) fn in_world(mut cloud: GaussianCloud, world_from_dataset: &Similarity) -> GaussianCloud {
     if cloud.world_from_dataset != *world_from_dataset {
         // The file has the dataset's unit, about the origin of the world.
-        let (scale, log_scale) = (world_from_dataset.scale as f32, world_from_dataset.scale.ln() as f32);
-        let lengths = cloud.means.as_flattened_mut().iter_mut();
-        lengths.for_each(|v| *v *= scale);
-        let logarithms = cloud.log_scales.as_flattened_mut().iter_mut();
-        logarithms.for_each(|v| *v += log_scale);
-        cloud.world_from_dataset = *world_from_dataset;
+        cloud.world_from_dataset = Similarity {
+            scale: 1.0,
+            center: world_from_dataset.center,
+        };
+        cloud.bring_to_world(*world_from_dataset);
     }
     cloud
 }
@@ -77,10 +75,7 @@ fn compare(input: &Path, before: &GaussianCloud, output: &Path) -> Result<Vec<f6
         antialias: before.antialiased,
         ..RenderOptions::default()
     };
-    let [before, after] = [before, &after].map(|cloud| Model::Splats {
-        splats: Cow::Owned(Splats::from_cloud(cloud)),
-        residual: None,
-    });
+    let [before, after] = [before, &after].map(|cloud| Model::of_splats(Splats::from_cloud(cloud)));
     let cameras = cameras_beside(input, &world);
     let cameras = orbit(before.splats(), cameras.as_deref(), COMPARED_VIEWS, Some(COMPARED_SIZE));
     let mut renderer = Renderer::new();

@@ -7,10 +7,8 @@ use crate::{RunError, RunFolder, SCENE, Scene, scene_of, write_image};
 use irradia_edit::{Applied, Draft, Edit, EditList, Provenance, Transform, apply};
 use irradia_formats::{SplatFormat, WriteOptions, read_splat_file, write_atomic, write_splats, write_splats_with};
 use irradia_scene::GaussianCloud;
-use irradia_splat::{RenderOptions, Splats};
+use irradia_splat::Splats;
 use irradia_train::checkpoint::{splats_of, with_splats};
-use irradia_train::model::Model;
-use std::borrow::Cow;
 use std::fs;
 use std::path::{Path, PathBuf};
 
@@ -268,26 +266,13 @@ impl Editing {
         };
         let camera = before.orbit(1, Some(size))[0];
         write_image(folder.join("before.png"), &before.render(&camera).color)?;
-        let after = self.scene(options);
+        let after = Scene::of_draft(&self.draft, options);
         let camera = match self.moved.is_identity() {
             true => camera,
             // The camera that moved along.
             false => after.orbit(1, Some(size))[0],
         };
         write_image(folder.join("after.png"), &after.render(&camera).color)
-    }
-
-    /// The scene as it is drawn.
-    fn scene(&self, options: RenderOptions) -> Scene {
-        Scene {
-            model: Model::Splats {
-                splats: Cow::Owned(Splats::from_cloud(&self.draft.shown())),
-                residual: None,
-            },
-            options,
-            cameras: (!self.draft.cameras.is_empty()).then(|| self.draft.cameras.clone().into()),
-            world_from_dataset: self.draft.cloud.world_from_dataset,
-        }
     }
 }
 

@@ -6,7 +6,8 @@ use crate::{RunError, scene_of};
 use irradia_formats::{SplatFormat, WriteOptions, read_splats, splat_file_size, write_splats_with};
 use irradia_scene::{Camera, GaussianCloud, resize_area};
 use irradia_splat::levels::merged;
-use irradia_splat::{RenderOptions, Renderer, Splats, ViewParams};
+use irradia_splat::{RenderOptions, Renderer, Splats};
+use irradia_train::model::Model;
 use std::path::{Path, PathBuf};
 
 /// Levels beside a scene; each has half of the splats of the one before.
@@ -68,10 +69,11 @@ pub fn write_levels(input: &Path, output: &Path, options: &WriteOptions) -> Resu
     };
     let cameras = compared_cameras(&input, &cloud, &whole);
     let mut renderer = Renderer::new();
-    let full: Vec<Vec<u8>> = cameras
-        .iter()
-        .map(|camera| picture(&mut renderer, &whole, camera, &render))
-        .collect();
+    let mut picture = |splats: &Splats, camera: &Camera| {
+        let frame = Model::of_splats(splats).render(&mut renderer, camera, &render);
+        frame.color.to_u8()
+    };
+    let full: Vec<Vec<u8>> = cameras.iter().map(|camera| picture(&whole, camera)).collect();
     let (mut levels, mut last) = (Vec::new(), whole.clone());
     for (level, path) in (1..).zip(paths) {
         let count = whole.len().div_ceil(1 << level);
@@ -87,7 +89,7 @@ pub fn write_levels(input: &Path, output: &Path, options: &WriteOptions) -> Resu
             let [width, height] = [far.intrinsics.width, far.intrinsics.height];
             let shrunk = resize_area(full, 3, [k.width, k.height], [width, height]);
             for (sum, splats) in sums.iter_mut().zip([&last, &whole.gather(&thinned), &whole]) {
-                *sum += psnr(&picture(&mut renderer, splats, &far, &render), &shrunk);
+                *sum += psnr(&picture(splats, &far), &shrunk);
             }
         }
         let [psnr, subsample_psnr, whole_psnr] = sums.map(|sum| sum / cameras.len().max(1) as f64);
@@ -140,17 +142,6 @@ fn compared_cameras(input: &Path, cloud: &GaussianCloud, splats: &Splats) -> Vec
         }
         _ => orbit(Some(splats), None, VIEWS, Some(SIZE)),
     }
-}
-
-/// 8 bits, `[H, W, 3]`.
-fn picture(renderer: &mut Renderer, splats: &Splats, camera: &Camera, options: &RenderOptions) -> Vec<u8> {
-    renderer.render(splats, &ViewParams::new(camera), options);
-    let color = renderer.color();
-    let pixels = color.len() / 3;
-    let value = |i: usize| color[i % 3 * pixels + i / 3];
-    (0..3 * pixels)
-        .map(|i| (value(i).clamp(0.0, 1.0) * 255.0).round() as u8)
-        .collect()
 }
 
 /// Of pictures of 8 bits, dB; at most that of a single difference.

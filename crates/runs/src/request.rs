@@ -1,6 +1,7 @@
 //! Training requests: raw input, and the validated request.
 
 use crate::{Background, RunError, RunFolder, scene_of};
+use irradia_compute::DeviceChoice;
 use irradia_formats::{DEFAULT_MAX_SIDE, DatasetFormat, DatasetOptions, Holdout, read_dataset, read_splats};
 use irradia_scene::{Dataset, sh};
 use irradia_splat::Splats;
@@ -179,9 +180,16 @@ pub struct TrainInput {
     /// A scene whose splats the training begins with, a file or a run's folder, in the coordinates of the dataset.
     #[serde(default)]
     pub from: Option<PathBuf>,
+    /// Where splats are trained: `cpu`, `gpu`, `auto` (a real GPU if there is one), or a part of a GPU's name.
+    #[serde(default = "default_device")]
+    pub device: String,
     /// Whether to replace an existing run in `out`.
     #[serde(skip)]
     pub overwrite: bool,
+}
+
+fn default_device() -> String {
+    DeviceChoice::default().to_string()
 }
 
 fn default_recipe() -> String {
@@ -208,6 +216,7 @@ impl TrainInput {
             reading: Reading::default(),
             background: None,
             from: None,
+            device: default_device(),
             overwrite: false,
         }
     }

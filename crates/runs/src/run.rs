@@ -5,6 +5,7 @@ use crate::journal::Journal;
 use crate::lock::FolderLock;
 use crate::snapshot::{SnapshotServer, Snapshots};
 use crate::{RunError, RunFolder, TrainRequest, background};
+use irradia_compute::{Device, DeviceChoice};
 use irradia_measure::Lpips;
 use irradia_scene::Dataset;
 use irradia_train::event::Observer;
@@ -266,6 +267,7 @@ impl Run {
 
     fn save_unfinished(&mut self) -> Result<(), RunError> {
         if !self.trainer.finished() && self.trainer.clock.step > 0 {
+            self.trainer.read_back()?;
             self.journal.save_now(&self.trainer)?;
         }
         Ok(())
@@ -284,6 +286,15 @@ fn first_trainer(request: &TrainRequest, dataset: Arc<Dataset>, options: TrainOp
     })
 }
 
+/// Opens the device of this name; see [`TrainInput::device`](crate::TrainInput::device).
+///
+/// # Errors
+/// When there is none of this name, or its driver refuses.
+pub fn open_device(name: &str) -> Result<Device, RunError> {
+    let Ok(choice) = name.parse::<DeviceChoice>();
+    Device::open(&choice).map_err(|error| RunError::setting("device", name, error.to_string()))
+}
+
 /// The trainer's options of the request, with the LPIPS network read.
 fn train_options(request: &TrainRequest) -> Result<TrainOptions, RunError> {
     let input = &request.input;
@@ -292,6 +303,7 @@ fn train_options(request: &TrainRequest) -> Result<TrainOptions, RunError> {
         steps: input.steps,
         memory: input.memory.or_else(usual_limit),
         lpips: input.lpips.as_ref().map(Lpips::load).transpose()?.map(Arc::new),
+        device: open_device(&input.device)?,
     })
 }
 

@@ -3,6 +3,7 @@
 use crate::RunError;
 use crate::folder::{FIELD, RESIDUAL, SCENE, cameras_beside, world_beside};
 use crate::orbit::{Outlook, orbit, outlook};
+use irradia_edit::Draft;
 use irradia_field::{Field, Sampler};
 use irradia_formats::{SplatFormat, is_sog_folder, read_splats};
 use irradia_scene::{Camera, Dataset, Similarity};
@@ -67,6 +68,16 @@ impl Scene {
             cameras: cameras_beside(path, &world_from_dataset).map(Into::into),
             world_from_dataset,
         })
+    }
+
+    /// What is shown of a scene that is being edited.
+    pub fn of_draft(draft: &Draft, options: RenderOptions) -> Self {
+        Self {
+            model: Model::of_splats(Splats::from_cloud(&draft.shown())),
+            options,
+            cameras: (!draft.cameras.is_empty()).then(|| draft.cameras.clone().into()),
+            world_from_dataset: draft.cloud.world_from_dataset,
+        }
     }
 
     /// `dataset`, whose files have the coordinates of the scene's, in the world of this scene.

@@ -46,6 +46,7 @@ impl GaussianCloud {
             && self.opacity_logits.len() == n
             && self.sh.len() == n * self.sh_coefficients() * 3
     }
+
     /// Gives harmonics of `degree`: higher bands are dropped, new ones are zero.
     pub fn set_degree(&mut self, degree: u32) {
         if self.sh_degree == degree {

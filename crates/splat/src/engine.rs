@@ -5,17 +5,29 @@
 //! splats (density control, initialisation, files) takes the state with [`Engine::state_mut`], rarely.
 
 use crate::densify::mcmc;
+#[cfg(feature = "gpu")]
+use crate::gpu::{DeviceGradient, GpuTraining};
 use crate::regularize::{self, Regularized, Regularizers};
 use crate::render::{
     CameraGradient, ChunkBounds, FramePlanes, OutputGradient, RenderOptions, Renderer, SplatGradients, ViewParams,
 };
 use crate::{Optimizer, Rates, SplatState, Splats, Statistics, Surface};
+#[cfg(feature = "gpu")]
+use irradia_compute::gpu::Array;
+use irradia_compute::{Device, DeviceError};
 use irradia_scene::{Camera, sh};
 use rayon::prelude::*;
+use std::sync::OnceLock;
 
-/// The state of splats in training with the renderer and the gradients of the last frame, on the CPU.
+/// The state of splats in training with the renderer and the gradients of the last frame, on the CPU or on a GPU.
+///
+/// What has no form on the GPU, frames with added colours or moved splats, brings the state back to the CPU, where it stays.
 pub struct Engine {
-    state: SplatState,
+    /// Empty while that of the GPU is newer.
+    state: OnceLock<SplatState>,
+    #[cfg(feature = "gpu")]
+    gpu: Option<Box<GpuTraining>>,
+    filters: bool,
     renderer: Renderer,
     gradients: SplatGradients,
     /// The splats of the last frame, if they were not the state's.
@@ -81,7 +93,10 @@ impl Engine {
     /// For `state`, with no frame rendered.
     pub fn new(state: SplatState) -> Self {
         Self {
-            state,
+            state: OnceLock::from(state),
+            #[cfg(feature = "gpu")]
+            gpu: None,
+            filters: false,
             renderer: Renderer::new(),
             gradients: SplatGradients::default(),
             moved: None,
@@ -90,57 +105,146 @@ impl Engine {
         }
     }
 
+    /// Continues on `device`.
+    ///
+    /// # Errors
+    /// When the device refuses the kernels.
+    pub fn use_device(&mut self, device: &Device) -> Result<(), DeviceError> {
+        self.use_cpu();
+        match device {
+            Device::Cpu => {}
+            #[cfg(feature = "gpu")]
+            Device::Gpu(gpu) => self.gpu = Some(Box::new(GpuTraining::new(gpu.clone())?)),
+        }
+        Ok(())
+    }
+
+    /// What has gone wrong on the device: the state and everything made from it are then unspecified.
+    ///
+    /// # Errors
+    /// When something has.
+    pub fn check_device(&self) -> Result<(), DeviceError> {
+        #[cfg(feature = "gpu")]
+        if let Some(gpu) = &self.gpu {
+            return gpu.renderer.gpu().check();
+        }
+        Ok(())
+    }
+
+    /// Continues on the CPU.
+    fn use_cpu(&mut self) {
+        #[cfg(feature = "gpu")]
+        {
+            self.state();
+            if self.gpu.take().is_some() {
+                self.set_filter();
+            }
+        }
+    }
+
     /// Number of splats.
     pub fn len(&self) -> usize {
-        self.state.len()
+        #[cfg(feature = "gpu")]
+        if let (None, Some(gpu)) = (self.state.get(), &self.gpu) {
+            return gpu.len();
+        }
+        self.state().len()
     }
 
     /// Whether there are none.
     pub fn is_empty(&self) -> bool {
-        self.state.is_empty()
+        self.len() == 0
     }
 
-    /// Parameters, moments and statistics.
+    /// Parameters, moments and statistics; read back from a GPU on the first call after an update.
     pub fn state(&self) -> &SplatState {
-        &self.state
+        self.state.get_or_init(|| self.read_back())
+    }
+
+    #[cfg(feature = "gpu")]
+    fn read_back(&self) -> SplatState {
+        self.gpu.as_ref().expect("the state is somewhere").download()
+    }
+
+    #[cfg(not(feature = "gpu"))]
+    fn read_back(&self) -> SplatState {
+        unreachable!("without a GPU the state is here")
     }
 
     /// Parameters, moments and statistics, to be edited or replaced between two steps.
     pub fn state_mut(&mut self) -> &mut SplatState {
+        self.state();
         self.edited = true;
-        &mut self.state
+        #[cfg(feature = "gpu")]
+        if let Some(gpu) = &mut self.gpu {
+            gpu.stale = true;
+        }
+        self.state.get_mut().expect("just filled")
     }
 
     /// From the next frame on, convolves every splat with the state's 3D smoothing filter, or with none.
     pub fn use_filter(&mut self, on: bool) {
-        let filter = if on { self.state.filter.plane(0) } else { &[] };
+        #[cfg(feature = "gpu")]
+        if let Some(gpu) = &mut self.gpu {
+            gpu.stale |= on || self.filters;
+        }
+        self.filters = on;
+        self.set_filter();
+    }
+
+    /// Gives the renderer of the CPU its filter.
+    fn set_filter(&mut self) {
+        self.state();
+        let filter = if self.filters {
+            known(&self.state).filter.plane(0)
+        } else {
+            &[]
+        };
         self.renderer.set_filter(filter);
         self.edited = true;
     }
 
     /// Renders a frame.
     pub fn render(&mut self, placement: Placement, options: &RenderOptions) {
-        self.place(placement.moved);
-        let (splats, bounds) = placed(&self.state, self.moved.as_ref(), &self.bounds);
-        self.renderer
-            .render_within(splats, bounds, &ViewParams::new(&placement.camera), options);
+        if placement.moved.is_some() {
+            self.use_cpu();
+        }
+        self.moved = placement.moved;
+        self.render_view(&ViewParams::new(&placement.camera), options);
+    }
+
+    /// Renders a frame of the splats that were placed last, for any pinhole camera.
+    pub fn render_view(&mut self, view: &ViewParams, options: &RenderOptions) {
+        #[cfg(feature = "gpu")]
+        if let Some(gpu) = &mut self.gpu {
+            if gpu.stale {
+                let state = self.state.get().expect("what was edited is here");
+                gpu.upload(state, self.filters);
+            }
+            gpu.render(view, options);
+            return;
+        }
+        self.update_bounds();
+        let (splats, bounds) = placed(known(&self.state), self.moved.as_ref(), &self.bounds);
+        self.renderer.render_within(splats, bounds, view, options);
     }
 
     /// The first half of a frame with added colours; [`Self::composite`] is the second.
     pub fn project(&mut self, placement: Placement, options: &RenderOptions) {
-        self.place(placement.moved);
-        let (splats, bounds) = placed(&self.state, self.moved.as_ref(), &self.bounds);
+        self.use_cpu();
+        self.moved = placement.moved;
+        self.update_bounds();
+        let (splats, bounds) = placed(known(&self.state), self.moved.as_ref(), &self.bounds);
         self.renderer
             .project_within(splats, bounds, &ViewParams::new(&placement.camera), options);
     }
 
-    /// Takes the splats of a frame, and brings the state's bounds up to date if those are not its own.
-    fn place(&mut self, moved: Option<Splats>) {
-        self.moved = moved;
+    /// Brings the bounds of the state's splats up to date, if those are drawn.
+    fn update_bounds(&mut self) {
         if self.moved.is_none() && std::mem::take(&mut self.edited) {
             let renderer = &self.renderer;
             self.bounds
-                .update(renderer.level, &self.state.splats, renderer.filter(), |_| true);
+                .update(renderer.level, &known(&self.state).splats, renderer.filter(), |_| true);
         }
     }
 
@@ -157,38 +261,92 @@ impl Engine {
 
     /// The last frame.
     pub fn frame(&self) -> FramePlanes<'_> {
+        #[cfg(feature = "gpu")]
+        if let Some(gpu) = &self.gpu {
+            return gpu.renderer.frame();
+        }
         self.renderer.frame()
     }
 
     /// Splats that touched the last frame.
     pub fn visible(&self) -> usize {
+        #[cfg(feature = "gpu")]
+        if let Some(gpu) = &self.gpu {
+            return gpu.renderer.visible();
+        }
         self.renderer.visible()
     }
 
     /// Intersections of splats and tiles in the last frame.
     pub fn intersections(&self) -> usize {
+        #[cfg(feature = "gpu")]
+        if let Some(gpu) = &self.gpu {
+            return gpu.renderer.intersections();
+        }
         self.renderer.intersections()
     }
 
-    /// Splat-pixel pairs visited by blending in the last frame. Counting walks all tiles: not for every step.
+    /// Splat-pixel pairs visited by blending in the last frame, on a GPU those of whole tiles. Counting walks all tiles: not for every
+    /// step.
     pub fn pairs(&self) -> u64 {
+        #[cfg(feature = "gpu")]
+        if let Some(gpu) = &self.gpu {
+            return gpu.renderer.pairs();
+        }
         self.renderer.pairs()
     }
 
     /// Computes the gradients of the last frame, which stay here until [`Self::update`].
     pub fn backward(&mut self, v_out: &OutputGradient) {
-        let splats = self.moved.as_ref().unwrap_or(&self.state.splats);
+        #[cfg(feature = "gpu")]
+        if let Some(gpu) = &mut self.gpu {
+            return gpu.backward(v_out);
+        }
+        let splats = self.moved.as_ref().unwrap_or(&known(&self.state).splats);
         self.renderer.backward(splats, v_out, &mut self.gradients);
     }
 
-    /// Number of splats whose gradient was not finite in the last backward pass.
+    /// The planes of the last frame on a GPU, and room for those of its gradients, `[3 + 1 + 1 (+ 1), H, W]`: colour, alpha, depth, and the
+    /// error to gather. `None` on the CPU.
+    #[cfg(feature = "gpu")]
+    pub fn device_frame(&mut self) -> Option<[&Array; 2]> {
+        self.gpu.as_mut().map(|gpu| gpu.frame_and_gradients())
+    }
+
+    /// As [`Self::backward`], of the gradients written to [`Self::device_frame`].
+    ///
+    /// # Panics
+    /// When the engine is on the CPU.
+    #[cfg(feature = "gpu")]
+    pub fn backward_on_device(&mut self, of: &DeviceGradient) {
+        self.gpu.as_mut().expect("there is a device frame").propagate(of);
+    }
+
+    /// Number of splats whose gradient was not finite in the last backward pass; on a GPU, in the one before.
     pub fn non_finite(&self) -> usize {
+        #[cfg(feature = "gpu")]
+        if let Some(gpu) = &self.gpu {
+            return gpu.non_finite();
+        }
         self.gradients.non_finite
     }
 
     /// Gradient of the camera, if the last backward pass was asked for it.
     pub fn camera_gradient(&self) -> Option<CameraGradient> {
+        #[cfg(feature = "gpu")]
+        if let Some(gpu) = &self.gpu {
+            return gpu.camera_gradient();
+        }
         self.gradients.camera
+    }
+
+    /// The splats' gradients of the last backward pass, read back from a GPU: for tests and tools.
+    pub fn read_gradients(&mut self) -> &SplatGradients {
+        #[cfg(feature = "gpu")]
+        if let Some(gpu) = &self.gpu {
+            gpu.read_gradients(&mut self.gradients);
+        }
+        &self.gradients
     }
 
     /// The splats' gradients of the last backward pass: for a socket that moved the splats, to propagate further back.
@@ -209,19 +367,25 @@ impl Engine {
 
     /// Applies statistics, regularisers, Adam, noise and the condition cap, in this order, with the last gradients.
     pub fn update(&mut self, update: &Update) {
+        #[cfg(feature = "gpu")]
+        if let Some(gpu) = &mut self.gpu {
+            gpu.update(update);
+            self.state = OnceLock::new();
+            return;
+        }
+        let state = self.state.get_mut().expect("on the CPU the state is here");
         let (level, gradients) = (self.renderer.level, &mut self.gradients);
         if let (Some(statistics), Some([width, height])) = (update.statistics, self.renderer.size()) {
             let renderer = &self.renderer;
             let extent = |i: usize| renderer.screen_extent(i).map_or(0.0, |e| e[0].max(e[1]));
-            self.state
-                .gather_statistics(statistics, gradients, width, height, extent);
+            state.gather_statistics(statistics, gradients, width, height, extent);
         }
         // With weights of zero, splats out of view have no gradient.
         let regularizers = (!update.regularizers.is_zero()).then_some(&update.regularizers);
         if let Some(weights) = regularizers {
             regularize::add_gradients(
                 level,
-                &self.state.splats,
+                &state.splats,
                 weights,
                 update.regularized,
                 update.regularizer_unit,
@@ -230,9 +394,9 @@ impl Engine {
         }
         let regularized = regularizers.map_or(Regularized::Visible, |_| update.regularized);
         if update.trained_fraction < 1.0 {
-            regularize::freeze_small(&self.state.splats, update.trained_fraction, regularized, gradients);
+            regularize::freeze_small(&state.splats, update.trained_fraction, regularized, gradients);
         }
-        self.state.step(
+        state.step(
             level,
             gradients,
             regularized,
@@ -241,10 +405,10 @@ impl Engine {
             update.optimizer,
         );
         if let Some(Noise { amount, seed, step }) = update.noise {
-            mcmc::add_noise(&mut self.state, amount, seed, step);
+            mcmc::add_noise(state, amount, seed, step);
         }
         if let Some(limit) = update.condition_cap {
-            regularize::cap_condition(&mut self.state.splats, limit);
+            regularize::cap_condition(&mut state.splats, limit);
         }
         let only_active = !update.optimizer.dense
             && regularized == Regularized::Visible
@@ -252,15 +416,20 @@ impl Engine {
             && update.condition_cap.is_none();
         let (renderer, counts) = (&self.renderer, &self.gradients.counts);
         self.bounds
-            .update(renderer.level, &self.state.splats, renderer.filter(), |chunk| {
+            .update(renderer.level, &state.splats, renderer.filter(), |chunk| {
                 !only_active || counts[chunk] > 0
             });
     }
 
     /// The splats of the last frame.
     fn rendered(&self) -> &Splats {
-        self.moved.as_ref().unwrap_or(&self.state.splats)
+        self.moved.as_ref().unwrap_or(&known(&self.state).splats)
     }
+}
+
+/// The state of an engine on the CPU.
+fn known(state: &OnceLock<SplatState>) -> &SplatState {
+    state.get().expect("on the CPU the state is here")
 }
 
 /// The splats of a frame, and their bounds if they have any.

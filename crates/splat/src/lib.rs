@@ -5,6 +5,8 @@ pub mod contribution;
 pub mod densify;
 mod engine;
 pub mod filter;
+#[cfg(feature = "gpu")]
+mod gpu;
 pub mod init;
 pub mod levels;
 mod nearest;
@@ -17,6 +19,8 @@ mod state;
 pub(crate) use principal::eigen;
 
 pub use engine::{Engine, Noise, Placement, Update};
+#[cfg(feature = "gpu")]
+pub use gpu::{DeviceGradient, GpuRenderer};
 pub use nearest::{Nearest, Neighbour};
 pub use render::{
     CameraGradient, FramePlanes, Gather, OutputGradient, RenderOptions, Renderer, SplatGradients, ViewParams,

@@ -2,6 +2,7 @@ use glam::{Quat, Vec3};
 use irradia_compute::Planes;
 use irradia_scene::{GaussianCloud, sh};
 use rayon::prelude::*;
+use std::borrow::Cow;
 
 /// The surface element that a splat represents.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -26,6 +27,18 @@ pub struct Splats {
     pub opacity_logits: Planes,
     /// Spherical harmonics, plane `3 k + c` is coefficient k of channel c; `3 (degree + 1)^2` planes.
     pub sh: Planes,
+}
+
+impl From<Splats> for Cow<'_, Splats> {
+    fn from(splats: Splats) -> Self {
+        Cow::Owned(splats)
+    }
+}
+
+impl<'a> From<&'a Splats> for Cow<'a, Splats> {
+    fn from(splats: &'a Splats) -> Self {
+        Cow::Borrowed(splats)
+    }
 }
 
 /// Names of the columns, in the order of [`Splats::columns`].

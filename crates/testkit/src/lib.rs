@@ -4,9 +4,11 @@
 mod compare;
 pub mod differences;
 mod golden;
+mod gpu;
 pub mod shared;
 pub mod torch;
 
 pub use compare::{Difference, max_abs_difference, relative_difference};
 pub use golden::Golden;
+pub use gpu::{gpu_or_skip, validate_shader};
 pub use shared::shared;

@@ -163,7 +163,6 @@ mod tests {
     use glam::{Quat, Vec3};
     use irradia_scene::{Intrinsics, Pose};
     use irradia_splat::Splats;
-    use std::borrow::Cow;
     use std::sync::Arc;
 
     /// Three photographs of a scene that renders black: exact, fully masked, and off by a fifth everywhere.
@@ -200,10 +199,7 @@ mod tests {
 
     #[test]
     fn an_exact_frame_and_a_blank_mask_leave_the_mean_finite() {
-        let model = Model::Splats {
-            splats: Cow::Owned(Splats::zeros(0, 0)),
-            residual: None,
-        };
+        let model = Model::of_splats(Splats::zeros(0, 0));
         let mut views = Vec::new();
         for half_fit in [
             HalfFit::default(),

@@ -161,7 +161,6 @@ mod tests {
     use glam::Vec3;
     use irradia_scene::{Intrinsics, Pose, Rng};
     use irradia_splat::Splats;
-    use std::borrow::Cow;
 
     /// Opaque blobs of many colours in front of a camera.
     fn scene() -> (Model<'static>, Camera) {
@@ -180,8 +179,7 @@ mod tests {
             Pose::look_at(Vec3::new(0.0, 0.0, -3.0), Vec3::ZERO, Vec3::NEG_Y),
             Intrinsics::from_fov_x(96, 64, 0.7),
         );
-        let splats = Cow::Owned(splats);
-        (Model::Splats { splats, residual: None }, camera)
+        (Model::of_splats(splats), camera)
     }
 
     #[test]

@@ -4,6 +4,7 @@
 mod audit;
 pub mod checkpoint;
 pub mod compare;
+mod device;
 mod edges;
 pub mod eval;
 pub mod event;
@@ -20,6 +21,7 @@ mod misfits;
 pub mod model;
 mod objective;
 pub mod paces;
+pub mod painter;
 mod photos;
 pub mod recipe;
 pub mod report;

@@ -1,5 +1,6 @@
 //! Start here: [`Trainer::step`] is one step from batch to update.
 
+use crate::device::{DeviceLoss, use_device};
 use crate::event::{Event, StepReport};
 use crate::exposure_probe;
 use crate::field_step::{first_field, is_field};
@@ -8,7 +9,7 @@ use crate::free_space::FreeSpace;
 use crate::half_fit::HalfFit;
 use crate::memory::{MemoryPlan, Needs};
 use crate::model::Model;
-use crate::objective::{Objective, Reference};
+use crate::objective::{Objective, ObjectiveValues, Reference};
 use crate::photos::{PhotoCache, Prepared};
 use crate::recipe::{AdamKind, Choice, DensityControl, LengthUnit, Param, Recipe};
 use crate::schedule::{Clock, Round, StepMetrics, StepPlan, plan, upcoming_views};
@@ -17,6 +18,7 @@ use crate::times::Times;
 use crate::transients::Hidden;
 use cpu_time::ProcessTime;
 use irradia_compute::adam::AdamStep;
+use irradia_compute::{Device, DeviceError};
 use irradia_field::{FieldError, FieldState, KnownDepth};
 use irradia_measure::{DepthSample, Lpips};
 use irradia_scene::{Camera, Dataset, LoadError, Rng, sh};
@@ -71,6 +73,9 @@ pub enum TrainError {
         /// What else would do.
         otherwise: String,
     },
+    /// The device cannot be used, or failed.
+    #[error(transparent)]
+    Device(#[from] DeviceError),
     /// A checkpoint does not fit.
     #[error("{0}")]
     Checkpoint(String),
@@ -87,16 +92,19 @@ pub struct TrainOptions {
     pub memory: Option<usize>,
     /// Weights of the perceptual loss; without them a recipe's perceptual loss is skipped.
     pub lpips: Option<Arc<Lpips>>,
+    /// Where splats are trained.
+    pub device: Device,
 }
 
 impl Default for TrainOptions {
-    /// Seed 0, the recipe's steps, and no limit on memory.
+    /// Seed 0, the recipe's steps, no limit on memory, on the CPU.
     fn default() -> Self {
         Self {
             seed: 0,
             steps: None,
             memory: None,
             lpips: None,
+            device: Device::Cpu,
         }
     }
 }
@@ -151,6 +159,7 @@ pub struct Trainer {
     /// Known depths of the views on which a field is trained, by view, width and height.
     pub(crate) depths: HashMap<(usize, u32, u32), Arc<[KnownDepth]>>,
     objective: Objective,
+    device_loss: DeviceLoss,
     free_space: FreeSpace,
 }
 
@@ -218,6 +227,8 @@ impl Trainer {
             ..Needs::of(&dataset, &recipe, options.lpips.as_ref().map(|lpips| lpips.net()))
         };
         let memory = MemoryPlan::new(&needs, options.memory)?;
+        let mut engine = Engine::new(SplatState::new(Splats::zeros(0, sh::MAX_DEGREE)));
+        let decisions = use_device(&mut engine, &options.device, &recipe)?;
         Ok(Self {
             clock: Clock::new(&recipe),
             pace: options.steps.map_or(1.0, |steps| total / steps.max(1) as f64),
@@ -229,11 +240,12 @@ impl Trainer {
             cap: cap(&recipe, &cameras).min(memory.splats),
             memory,
             pixels: mean_pixels(&cameras),
-            decisions: Vec::new(),
+            decisions,
             depths: HashMap::new(),
             objective: Objective::new(options.lpips.clone()),
+            device_loss: DeviceLoss::new(&options.device)?,
             free_space: FreeSpace::new(&dataset, recipe.free_space),
-            engine: Engine::new(SplatState::new(Splats::zeros(0, sh::MAX_DEGREE))),
+            engine,
             field: None,
             sockets: Sockets::default(),
             trained: dataset.train.clone(),
@@ -301,6 +313,7 @@ impl Trainer {
         } else {
             self.splat_step(events)?
         };
+        self.engine.check_device()?;
         let before = self.clock.time;
         let entered = self.tick(metrics) && !self.finished();
         let total = self.recipe.total_steps() as f64;
@@ -355,27 +368,16 @@ impl Trainer {
             background,
             depths: &self.known_depths(view, &camera, &plan),
         };
-        let frame = FramePlanes {
-            color: self.sockets.frame_color(&self.engine),
-            ..self.engine.frame()
+        let camera_gradient = self.sockets.needs_camera_gradient();
+        let on_device = self.sockets.exposure.is_none().then(|| {
+            let has_lpips = self.options.lpips.is_some();
+            self.device_loss
+                .step(&mut self.engine, &reference, &plan, camera_gradient, has_lpips)
+        });
+        let loss = match on_device.flatten() {
+            Some(loss) => loss,
+            None => self.step_losses(&reference, view, &plan, &mut rng),
         };
-        let loss = self.objective.evaluate(frame, &reference, &plan, &mut rng);
-        if plan.gathers == Some(Statistics::Error) {
-            self.objective.error(frame.color, &photo, background.is_some());
-            if plan.edge_share > 0.0 {
-                self.objective.add_edges(&photo, plan.edge_share);
-            }
-        }
-        self.sockets
-            .step_after_blending(&self.engine, view, self.objective.v_color_mut(), &plan);
-        let mut v_out = self.objective.gradient();
-        v_out.camera = self.sockets.needs_camera_gradient();
-        v_out.gather = match plan.gathers {
-            Some(Statistics::AbsoluteGradient) => Gather::Absolute,
-            Some(Statistics::Error) => self.objective.gather_error(),
-            Some(Statistics::Gradient) | None => Gather::Nothing,
-        };
-        self.engine.backward(&v_out);
         self.sockets
             .step_before_blending(&mut self.engine, view, &camera, self.extent, &plan);
         self.engine.update(&self.update(&plan));
@@ -411,6 +413,33 @@ impl Trainer {
             non_finite: self.engine.non_finite(),
         };
         Ok((report, metrics))
+    }
+
+    /// The losses of the last frame, on the host, and its backward pass.
+    fn step_losses(&mut self, reference: &Reference, view: usize, plan: &StepPlan, rng: &mut Rng) -> ObjectiveValues {
+        let frame = FramePlanes {
+            color: self.sockets.frame_color(&self.engine),
+            ..self.engine.frame()
+        };
+        let loss = self.objective.evaluate(frame, reference, plan, rng);
+        if plan.gathers == Some(Statistics::Error) {
+            self.objective
+                .error(frame.color, reference.photo, reference.background.is_some());
+            if plan.edge_share > 0.0 {
+                self.objective.add_edges(reference.photo, plan.edge_share);
+            }
+        }
+        self.sockets
+            .step_after_blending(&self.engine, view, self.objective.v_color_mut(), plan);
+        let mut v_out = self.objective.gradient();
+        v_out.camera = self.sockets.needs_camera_gradient();
+        v_out.gather = match plan.gathers {
+            Some(Statistics::AbsoluteGradient) => Gather::Absolute,
+            Some(Statistics::Error) => self.objective.gather_error(),
+            Some(Statistics::Gradient) | None => Gather::Nothing,
+        };
+        self.engine.backward(&v_out);
+        loss
     }
 
     /// The splat update of this step.

@@ -10,7 +10,6 @@ use irradia_scene::Dataset;
 use irradia_splat::Splats;
 use irradia_splat::init::{InitOptions, from_points};
 use irradia_train::model::{Model, RenderOptions};
-use std::borrow::Cow;
 use std::path::Path;
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -144,10 +143,7 @@ impl Subject {
         };
         let cameras: Arc<[_]> = dataset.views.iter().map(|view| view.camera).collect();
         let scene = Scene {
-            model: Model::Splats {
-                splats: Cow::Owned(splats),
-                residual: None,
-            },
+            model: Model::of_splats(splats),
             options: RenderOptions::default(),
             cameras: Some(cameras),
             world_from_dataset: dataset.world_from_dataset,

@@ -58,9 +58,7 @@ pub(super) fn brush(draft: &Draft, camera: &Viewpoint, points: &[[f64; 2]], radi
 pub(super) fn visible_only(draft: &Draft, camera: &Viewpoint, visible: bool, mut selection: Selection) -> Selection {
     if visible {
         let camera = camera.camera(&draft.cloud.world_from_dataset);
-        let mut shown = draft.hidden.clone();
-        shown.invert();
-        let weights = Observer::new(draft, &shown).weights(&camera);
+        let weights = Observer::new(draft, &draft.visible()).weights(&camera);
         selection.intersect(&Selection::of(draft.len(), |i| weights[i] >= SEEN));
     }
     selection

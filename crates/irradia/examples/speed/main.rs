@@ -9,6 +9,8 @@
 //!
 //! CPU time is given beside wall time: on a shared machine it is more stable.
 
+#[cfg(feature = "gpu")]
+mod gpu;
 mod machine;
 #[path = "../machine/peak.rs"]
 mod peak;
@@ -33,7 +35,11 @@ fn main() -> Result<()> {
         ["frame", scene] => frame(scene),
         ["scale"] => scale::run(&[100_000, 1_000_000, 5_000_000]),
         ["scale", ..] => scale::run(&args[1..].iter().map(|n| n.parse()).collect::<Result<Vec<_>, _>>()?),
-        _ => bail!("usage: steps DATA [STEPS], blend, frame SCENE.ply, or scale [SPLATS ..]"),
+        #[cfg(feature = "gpu")]
+        ["gpu", ..] => gpu::run(&args[1..]),
+        _ => bail!(
+            "usage: steps DATA [STEPS], blend, frame SCENE.ply, scale [SPLATS ..], or gpu [SPLATS@WIDTHxHEIGHT ..]"
+        ),
     }
 }
 

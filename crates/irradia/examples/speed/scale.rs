@@ -161,7 +161,7 @@ fn parts(engine: &mut Engine, camera: &Camera, repeats: u32, limits: &Limits) {
 }
 
 /// The rates are so small that the scene stays as it is.
-fn update(dense: bool, regularizers: Regularizers) -> Update {
+pub fn update(dense: bool, regularizers: Regularizers) -> Update {
     let rate = 1e-9;
     Update {
         statistics: Some(Statistics::Error),
@@ -338,13 +338,13 @@ fn turned(angle: f32) -> Pose {
 }
 
 /// The camera that sees the whole scene, or with `zoom` below 1 only its middle.
-fn camera(width: u32, height: u32, zoom: f32) -> Camera {
+pub fn camera(width: u32, height: u32, zoom: f32) -> Camera {
     let intrinsics = Intrinsics::from_fov_x(width, height, 1.3 * zoom);
     Camera::new(turned(0.0), intrinsics)
 }
 
 /// `number` splats: two fifths on a floor of 12 x 8, the others on thirty spheres above it; +Y is down.
-fn scene(number: usize) -> Splats {
+pub fn scene(number: usize) -> Splats {
     let mut rng = Rng::new(7, 3);
     let spheres: Vec<(Vec3, f32)> = (0..30)
         .map(|_| {

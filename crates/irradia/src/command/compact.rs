@@ -2,7 +2,7 @@
 
 use super::convert::QualityArg;
 use super::share::parse_size;
-use super::{DataArgs, by_option, thread_count, use_threads};
+use super::{DataArgs, by_option, note_lines, size_line, thread_count, use_threads};
 use crate::terminal::{note, say};
 use anyhow::Result;
 use irradia_runs::formats::WriteOptions;
@@ -87,13 +87,10 @@ pub fn run(args: &Args) -> Result<()> {
 
 /// Before and after, a line each.
 fn lines(done: &Compacted) -> String {
-    let [before, after] = done.bytes.map(|bytes| bytes as f64 / 1e6);
-    let [from, to] = done.formats;
-    let percent = 100.0 * after / before.max(1e-9);
     let [splats, left] = done.splats;
-    let mut text = format!(
-        "\n  size           {before:.3} MB {from} -> {after:.3} MB {to} ({percent:.1} %)\
-         \n  splats         {splats} -> {left}, {} of them with harmonics",
+    let mut text = size_line(done.bytes, done.formats);
+    text += &format!(
+        "\n  splats         {splats} -> {left}, {} of them with harmonics",
         done.with_harmonics
     );
     let mut add = |name: &str, [before, after]: [f64; 2]| {
@@ -103,10 +100,7 @@ fn lines(done: &Compacted) -> String {
     if let Some(psnr) = done.held_out_psnr {
         add("held-out PSNR", psnr);
     }
-    for note in &done.notes {
-        text += &format!("\n  note: {note}");
-    }
-    text
+    text + &note_lines(&done.notes)
 }
 
 #[cfg(test)]

@@ -1,6 +1,6 @@
 //! `irradia convert`
 
-use super::share;
+use super::{note_lines, share, size_line};
 use crate::Usage;
 use crate::terminal::say;
 use anyhow::Result;
@@ -103,10 +103,7 @@ fn level_lines(level: u32, made: &Level) -> String {
 
 /// What the conversion cost, a line each.
 fn lines(conversion: &Conversion) -> String {
-    let [before, after] = conversion.bytes.map(|bytes| bytes as f64 / 1e6);
-    let [from, to] = conversion.formats;
-    let percent = 100.0 * after / before.max(1e-9);
-    let mut text = format!("\n  size           {before:.3} MB {from} -> {after:.3} MB {to} ({percent:.1} %)");
+    let mut text = size_line(conversion.bytes, conversion.formats);
     if let Some(psnr) = &conversion.psnr {
         // Of all pixels together: views that are equal must not hide the others.
         let error = psnr.iter().map(|db| 10f64.powf(-0.1 * db)).sum::<f64>() / psnr.len() as f64;
@@ -120,8 +117,5 @@ fn lines(conversion: &Conversion) -> String {
             false => format!("\n  PSNR           all {} views around it are equal", psnr.len()),
         };
     }
-    for note in &conversion.notes {
-        text += &format!("\n  note: {note}");
-    }
-    text
+    text + &note_lines(&conversion.notes)
 }

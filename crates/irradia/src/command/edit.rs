@@ -1,7 +1,7 @@
 //! `irradia edit`
 
 use super::convert::QualityArg;
-use super::{thread_count, use_threads, warn};
+use super::{note_lines, thread_count, use_threads, warn};
 use crate::Usage;
 use crate::terminal::say;
 use anyhow::{Context, Result};
@@ -105,7 +105,7 @@ pub fn run(args: &Args) -> Result<()> {
     };
     let shown = editing.draft().len() - editing.draft().hidden.count();
     let edits: String = editing.made().iter().map(line).collect();
-    let notes: String = notes.iter().map(|note| format!("\n  note: {note}")).collect();
+    let notes = note_lines(&notes);
     say(format_args!("{title}: {shown} splats{edits}{notes}"))
 }
 

@@ -4,6 +4,7 @@ pub mod compact;
 pub mod compare;
 pub mod convert;
 pub mod demo;
+pub mod devices;
 pub mod edit;
 pub mod eval;
 pub mod files;
@@ -22,6 +23,7 @@ use crate::Usage;
 use crate::terminal::note;
 use anyhow::{Context, Result};
 use clap::builder::RangedU64ValueParser;
+use irradia_runs::formats::SplatFormat;
 use irradia_runs::scene::Dataset;
 use irradia_runs::{Reading, RunError};
 use std::path::{Path, PathBuf};
@@ -109,6 +111,19 @@ pub fn warn(warnings: &[String]) {
     for warning in warnings {
         note(format_args!("warning: {warning}"));
     }
+}
+
+/// The line of a summary that says how the size of a file changed; `bytes` and `formats` before and after.
+pub fn size_line(bytes: [u64; 2], formats: [SplatFormat; 2]) -> String {
+    let [before, after] = bytes.map(|bytes| bytes as f64 / 1e6);
+    let [from, to] = formats;
+    let percent = 100.0 * after / before.max(1e-9);
+    format!("\n  size           {before:.3} MB {from} -> {after:.3} MB {to} ({percent:.1} %)")
+}
+
+/// Notes at the end of a summary, a line each.
+pub fn note_lines(notes: &[String]) -> String {
+    notes.iter().map(|note| format!("\n  note: {note}")).collect()
 }
 
 /// Parser of `--threads`.

@@ -9,6 +9,7 @@ use crate::interrupt::stop_flag;
 use crate::terminal::{note, one_line, say};
 use anyhow::{Result, anyhow};
 use clap::builder::RangedU64ValueParser;
+use irradia_compute::DeviceChoice;
 use irradia_runs::{Background, DEFAULT_RECIPE, Finished, Run, RunError, RunFolder, TrainInput};
 use irradia_train::event::Observer;
 use std::path::{Path, PathBuf};
@@ -51,6 +52,10 @@ pub struct Args {
     /// Threads; all cores when absent. The result does not depend on it
     #[arg(long, value_name = "N", value_parser = thread_count())]
     pub threads: Option<usize>,
+    /// Where splats are trained: cpu, gpu, auto (a real GPU if there is one), or a part of a GPU's name; see irradia devices. cpu when
+    /// absent, or as the run began with --resume
+    #[arg(long, value_name = "DEVICE")]
+    pub device: Option<String>,
     /// Stop at this held-out PSNR
     #[arg(long, value_name = "DB")]
     pub until_psnr: Option<f64>,
@@ -153,6 +158,7 @@ fn replay(run: &Path, args: &Args) -> Result<TrainInput> {
         input.data.clone_from(data);
     }
     input.memory = args.memory.or(input.memory);
+    input.device = args.device.clone().unwrap_or(input.device);
     input.lpips = lpips_for(input.lpips, args)?;
     input.unseen_lpips = input.unseen_lpips.filter(|path| path.exists());
     input.overwrite = args.overwrite;
@@ -183,6 +189,10 @@ fn input(args: &Args) -> Result<TrainInput> {
         reading: args.reading.reading(),
         background: args.background,
         from: args.from.clone(),
+        device: args
+            .device
+            .clone()
+            .unwrap_or_else(|| DeviceChoice::default().to_string()),
         overwrite: args.overwrite,
         ..TrainInput::new(given(&args.data), given(&args.out))
     })
@@ -219,6 +229,7 @@ fn resume(folder: &Path, args: &Args) -> Result<()> {
     }
     input.until_psnr = args.until_psnr.or(input.until_psnr);
     input.memory = args.memory.or(input.memory);
+    input.device = args.device.clone().unwrap_or(input.device);
     input.lpips = lpips_for(input.lpips, args)?;
     let request = input.check().map_err(by_option)?;
     let dataset = request.read_dataset()?;

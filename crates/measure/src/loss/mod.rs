@@ -220,6 +220,12 @@ impl<T: Scalar> PhotometricLoss<T> {
 }
 
 impl LossValues {
+    /// From sums over `count` values: absolute and squared differences, and `1 - SSIM`.
+    #[cfg(feature = "gpu")]
+    pub(crate) fn of_sums([l1, mse, dissimilarity]: [f64; 3], weights: &LossWeights, count: f64) -> Self {
+        Self::of(&Sums { l1, mse, dissimilarity }, weights, count)
+    }
+
     fn of(sums: &Sums, weights: &LossWeights, count: f64) -> Self {
         let (l1, mse) = (sums.l1 / count, sums.mse / count);
         // Sums of `1 - SSIM`, which are 0 where there is nothing to compare.
@@ -246,7 +252,7 @@ impl<T: Scalar> Target<'_, T> {
 
 impl<T> Target<'_, T> {
     /// Sum of the pixels' weights.
-    fn weight(&self) -> f64 {
+    pub(crate) fn weight(&self) -> f64 {
         match self.mask {
             Some(mask) => mask.iter().map(|m| u64::from(*m)).sum::<u64>() as f64 / 255.0,
             None => (self.width * self.height) as f64,

@@ -12,7 +12,6 @@ use irradia_train::half_fit::HalfFit;
 use irradia_train::memory::usual_limit;
 use irradia_train::model::{Model, RenderOptions};
 use irradia_train::{Recipe, TrainOptions, Trainer};
-use std::borrow::Cow;
 use std::sync::Arc;
 
 /// The recipe by which splats are trained further.
@@ -135,10 +134,7 @@ impl<'a> Tries<'a> {
 
     /// `splats` to be rendered.
     pub fn model<'s>(&self, splats: &'s Splats) -> Model<'s> {
-        Model::Splats {
-            splats: Cow::Borrowed(splats),
-            residual: None,
-        }
+        Model::of_splats(splats)
     }
 
     /// `splats` to be written.
@@ -184,7 +180,7 @@ impl<'a> Tries<'a> {
             seed: self.input.seed,
             steps: Some(self.input.steps),
             memory: usual_limit(),
-            lpips: None,
+            ..TrainOptions::default()
         };
         let first = self.begin.len();
         let mut trainer = Trainer::from_splats(self.dataset.clone(), self.recipe.clone(), options, self.begin.clone())?;
@@ -247,8 +243,9 @@ impl<'a> Tries<'a> {
             keep(&mut state, &judged.change, count);
             Ok(self.through(&state.splats)?.1 as f64)
         };
-        let (all, half) = (bytes_with(first)?, bytes_with(first / 2)?);
-        let slope = ((all - half) / (first - first / 2) as f64).max(1.0);
+        let half_count = (first / 2).max(1);
+        let (all, half) = (bytes_with(first)?, bytes_with(half_count)?);
+        let slope = ((all - half) / (first - half_count).max(1) as f64).max(1.0);
         let mut count = first;
         if all > most as f64 {
             count = (first as f64 - (all - most as f64) / slope) as usize;

@@ -46,7 +46,7 @@ impl ViewParams {
 
     /// The camera's total gradient from its direct part and that of the centre, on which viewing directions depend:
     /// `center = -R^-1 t`, so `d center = -R^-1 (dR center + dt)`.
-    pub(super) fn gradient(
+    pub(crate) fn gradient(
         &self,
         mut rotation: [[f64; 3]; 3],
         mut translation: [f64; 3],

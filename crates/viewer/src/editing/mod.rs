@@ -126,7 +126,7 @@ impl Editing {
     /// When nothing has been edited, and the file of the scene cannot be read any more.
     pub fn cloud(&self) -> Result<GaussianCloud, FormatError> {
         match self.current() {
-            Some((draft, _)) => Ok(draft.shown()),
+            Some((draft, _)) => Ok(draft.shown().into_owned()),
             None => read_splats(&self.source),
         }
     }

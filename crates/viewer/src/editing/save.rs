@@ -31,13 +31,17 @@ impl Saved {
     }
 }
 
-/// The name of a scene's file without its format; of a folder of images that of the folder.
-pub(crate) fn stem_of(source: &Path) -> String {
-    let path = match source.file_name().is_some_and(|name| name == "meta.json") {
+/// A scene's file, or its folder of images.
+fn entry_of(source: &Path) -> &Path {
+    match source.file_name().is_some_and(|name| name == "meta.json") {
         true => source.parent().unwrap_or(source),
         false => source,
-    };
-    let name = path
+    }
+}
+
+/// The name of a scene's file without its format; of a folder of images that of the folder.
+pub(crate) fn stem_of(source: &Path) -> String {
+    let name = entry_of(source)
         .file_name()
         .map(|name| name.to_string_lossy().into_owned())
         .unwrap_or_default();
@@ -52,11 +56,7 @@ pub(crate) fn stem_of(source: &Path) -> String {
 /// Writes the list, the scene and the scenes that were split off; to the same files as before if the session was saved.
 pub(super) fn save(session: &Session, source: &Path, before: Option<&Saved>) -> Result<Saved, EditingError> {
     let stem = stem_of(source);
-    let folder = match source.file_name().is_some_and(|name| name == "meta.json") {
-        true => source.parent().and_then(Path::parent),
-        false => source.parent(),
-    };
-    let folder = folder.unwrap_or(Path::new(""));
+    let folder = entry_of(source).parent().unwrap_or(Path::new(""));
     let is_run = RunFolder::containing(source).is_some();
     let names = |number: usize| {
         let end = if number == 1 {

@@ -9,9 +9,7 @@ use irradia_edit::{Draft, Selection, Transform};
 use irradia_runs::Scene;
 use irradia_runs::formats::read_splats;
 use irradia_splat::{RenderOptions, Splats};
-use irradia_train::model::Model;
 use serde_json::{Value, json};
-use std::borrow::Cow;
 use std::sync::Arc;
 
 /// Entries of the list that pages are told: those around the last one made.
@@ -141,7 +139,7 @@ impl Bench {
             };
             self.masks += 1;
             self.mask = if selected.is_some() { self.masks } else { 0 };
-            let scene = is_new.then(|| scene_of(draft, self.options));
+            let scene = is_new.then(|| Scene::of_draft(draft, self.options));
             subject.show(scene, placement, selected.as_ref().map(shown));
         }
         self.shown = Some((draft.clone(), selected));
@@ -193,21 +191,4 @@ fn box_around(draft: &Draft, selected: &Selection) -> Option<[[f32; 3]; 2]> {
         [last / 100, last - last / 100].map(|at| *values.select_nth_unstable_by(at, f32::total_cmp).1)
     });
     Some([0, 1].map(|side| bounds.map(|bound| bound[side])))
-}
-
-/// The scene to draw.
-fn scene_of(draft: &Draft, options: RenderOptions) -> Scene {
-    let cloud = match draft.hidden.is_empty() {
-        true => Cow::Borrowed(&draft.cloud),
-        false => Cow::Owned(draft.shown()),
-    };
-    Scene {
-        model: Model::Splats {
-            splats: Cow::Owned(Splats::from_cloud(&cloud)),
-            residual: None,
-        },
-        options,
-        cameras: (!draft.cameras.is_empty()).then(|| draft.cameras.clone().into()),
-        world_from_dataset: cloud.world_from_dataset,
-    }
 }

@@ -2,7 +2,7 @@
 // and what a drag of it means; drawing is in `overlay.js`.
 
 import { project } from "../camera.js";
-import { add, axes, cross, dot, length, normalize, rotate, scale, subtract, turn } from "../math.js";
+import { across, add, axes, cross, dot, length, normalize, rotate, scale, subtract, turn } from "../math.js";
 
 /** @typedef {import("../camera.js").Camera} Camera */
 /** @typedef {import("../camera.js").Intrinsics} Intrinsics */
@@ -48,7 +48,7 @@ export function handles(shown, { center, frame }, pixel) {
 
 /** The points of a ring about `axis`. @param {Vec3} center @param {Vec3} axis @param {number} radius @returns {Vec3[]} */
 export function ring(center, axis, radius) {
-  const side = normalize(cross(axis, Math.abs(axis[0]) < 0.6 ? [1, 0, 0] : [0, 1, 0]));
+  const side = across(axis);
   const other = cross(axis, side);
   return Array.from({ length: 49 }, (_, i) => {
     const angle = (i / 48) * 2 * Math.PI;
@@ -119,9 +119,9 @@ function ray({ camera, k }, x, y) {
 
 /** Where a ray meets a plane; null where it runs along it. @param {Vec3} origin @param {Vec3} direction @param {Vec3} point @param {Vec3} normal */
 function meet(origin, direction, point, normal) {
-  const across = dot(direction, normal);
-  if (Math.abs(across) < FLAT * length(direction)) return null;
-  const t = dot(subtract(point, origin), normal) / across;
+  const slope = dot(direction, normal);
+  if (Math.abs(slope) < FLAT * length(direction)) return null;
+  const t = dot(subtract(point, origin), normal) / slope;
   return t > 0 ? add(origin, scale(direction, t)) : null;
 }
 
@@ -170,7 +170,7 @@ export class Drag {
     const at = meet(camera.position, ray(this.shown, x, y), this.place.center, this.axis);
     if (at) {
       const offset = subtract(at, this.place.center);
-      const side = normalize(cross(this.axis, Math.abs(this.axis[0]) < 0.6 ? [1, 0, 0] : [0, 1, 0]));
+      const side = across(this.axis);
       return { flat: false, angle: Math.atan2(dot(offset, cross(this.axis, side)), dot(offset, side)) };
     }
     const middle = project(camera, k, this.place.center) ?? [0, 0, 1];

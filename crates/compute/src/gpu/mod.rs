@@ -1,0 +1,268 @@
+//! Compute on any GPU: WGSL on `wgpu` (Vulkan, Metal, DX12), with no toolkit to install.
+//!
+//! A [`Gpu`] owns the device; an [`Array`] is memory there, of 32-bit words; a [`Kernel`] is a compiled shader, and [`Work`]
+//! records kernels that run one after another. Every stage has a twin on the CPU. Sums are made in a fixed order, without
+//! floating-point atomics: the same bytes from run to run on the same device.
+
+mod array;
+mod kernel;
+mod profile;
+mod scan;
+mod sort;
+
+pub use array::Array;
+pub use kernel::{Kernel, Shader, Work};
+pub use scan::Scan;
+pub use sort::Sort;
+
+use crate::DeviceError;
+use profile::Profile;
+use std::collections::BTreeMap;
+use std::fmt;
+use std::sync::{Arc, Mutex, OnceLock, PoisonError};
+
+/// `group_index`: the number of a workgroup, for kernels that [`Work::run`] runs.
+pub const GRID: &str = include_str!("shaders/grid.wgsl");
+
+/// Threads of a workgroup, where a kernel has no reason for another number: what every implementation offers at least.
+pub const GROUP: u32 = 256;
+
+/// What kind of processor an adapter is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum AdapterKind {
+    /// A graphics card.
+    Discrete,
+    /// Beside the CPU, with its memory.
+    Integrated,
+    /// Of a virtual machine, or unknown.
+    Other,
+    /// The CPU itself, such as Mesa's llvmpipe.
+    Software,
+}
+
+impl fmt::Display for AdapterKind {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        f.write_str(match self {
+            AdapterKind::Discrete => "graphics card",
+            AdapterKind::Integrated => "integrated GPU",
+            AdapterKind::Other => "GPU",
+            AdapterKind::Software => "software, on the CPU",
+        })
+    }
+}
+
+/// An adapter of this machine.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct AdapterInfo {
+    /// As its driver calls it.
+    pub name: String,
+    /// What it is.
+    pub kind: AdapterKind,
+    /// Vulkan, Metal or DX12.
+    pub api: String,
+    /// The driver and its version.
+    pub driver: String,
+    /// Bytes of the largest array.
+    pub largest_array: u64,
+    /// Bytes of memory that a workgroup shares.
+    pub shared_memory: u32,
+    /// Fewest and most threads of a subgroup; 0 where there are none.
+    pub subgroup: [u32; 2],
+    /// Whether it has everything that irradia needs.
+    pub is_usable: bool,
+}
+
+/// Which adapter to take.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Wanted {
+    /// A real GPU, not software.
+    Real,
+    /// Any, a real one first.
+    Any,
+    /// The first whose name contains this, ignoring case.
+    Named(String),
+}
+
+/// An open device. Its work is made in the order in which it is submitted.
+pub struct Gpu {
+    device: wgpu::Device,
+    queue: wgpu::Queue,
+    info: AdapterInfo,
+    failure: Arc<Mutex<Option<String>>>,
+    profile: OnceLock<Profile>,
+}
+
+impl fmt::Debug for Gpu {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        f.debug_tuple("Gpu").field(&self.info).finish()
+    }
+}
+
+/// Bytes that a workgroup of the largest kernel shares.
+const SHARED: u32 = 22 << 10;
+/// Storage arrays that a kernel binds at most.
+const BINDINGS: u32 = 12;
+
+fn instance() -> wgpu::Instance {
+    wgpu::Instance::new(wgpu::InstanceDescriptor {
+        backends: wgpu::Backends::PRIMARY,
+        ..wgpu::InstanceDescriptor::new_without_display_handle()
+    })
+}
+
+/// The adapters of this machine, graphics cards first.
+fn list() -> Vec<(wgpu::Adapter, AdapterInfo)> {
+    let adapters = pollster::block_on(instance().enumerate_adapters(wgpu::Backends::PRIMARY));
+    let mut list: Vec<_> = adapters
+        .into_iter()
+        .map(|adapter| {
+            let info = describe(&adapter);
+            (adapter, info)
+        })
+        .collect();
+    list.sort_by_key(|(_, info)| info.kind);
+    list
+}
+
+fn describe(adapter: &wgpu::Adapter) -> AdapterInfo {
+    let (info, limits) = (adapter.get_info(), adapter.limits());
+    let has_subgroups = adapter.features().contains(wgpu::Features::SUBGROUP);
+    AdapterInfo {
+        name: info.name,
+        kind: match info.device_type {
+            wgpu::DeviceType::DiscreteGpu => AdapterKind::Discrete,
+            wgpu::DeviceType::IntegratedGpu => AdapterKind::Integrated,
+            wgpu::DeviceType::Cpu => AdapterKind::Software,
+            wgpu::DeviceType::VirtualGpu | wgpu::DeviceType::Other => AdapterKind::Other,
+        },
+        api: match info.backend {
+            wgpu::Backend::Dx12 => "DX12".to_owned(),
+            other => format!("{other:?}"),
+        },
+        driver: format!("{} {}", info.driver, info.driver_info).trim().to_owned(),
+        largest_array: limits.max_storage_buffer_binding_size.min(limits.max_buffer_size),
+        shared_memory: limits.max_compute_workgroup_storage_size,
+        subgroup: match has_subgroups {
+            true => [info.subgroup_min_size, info.subgroup_max_size],
+            false => [0; 2],
+        },
+        is_usable: limits.max_storage_buffers_per_shader_stage >= BINDINGS
+            && limits.max_compute_invocations_per_workgroup >= GROUP
+            && limits.max_compute_workgroup_storage_size >= SHARED,
+    }
+}
+
+impl Gpu {
+    /// The adapters of this machine, graphics cards first.
+    pub fn adapters() -> Vec<AdapterInfo> {
+        list().into_iter().map(|(_, info)| info).collect()
+    }
+
+    /// Opens an adapter.
+    ///
+    /// # Errors
+    /// When there is none of the wanted kind, or its driver refuses.
+    pub fn open(wanted: &Wanted) -> Result<Arc<Self>, DeviceError> {
+        let is_wanted = |info: &AdapterInfo| match wanted {
+            Wanted::Real => info.is_usable && info.kind != AdapterKind::Software,
+            Wanted::Any => info.is_usable,
+            Wanted::Named(name) => info.name.to_lowercase().contains(&name.to_lowercase()),
+        };
+        let Some((adapter, info)) = list().into_iter().find(|(_, info)| is_wanted(info)) else {
+            return Err(DeviceError::None(match wanted {
+                Wanted::Real => "was found".to_owned(),
+                Wanted::Any => "was found; Mesa's software Vulkan would do (mesa-vulkan-drivers)".to_owned(),
+                Wanted::Named(name) => format!("is called {name:?}"),
+            }));
+        };
+        let descriptor = wgpu::DeviceDescriptor {
+            label: Some("irradia"),
+            required_features: adapter.features() & wgpu::Features::TIMESTAMP_QUERY,
+            required_limits: adapter.limits(),
+            memory_hints: wgpu::MemoryHints::Performance,
+            ..Default::default()
+        };
+        let (device, queue) =
+            pollster::block_on(adapter.request_device(&descriptor)).map_err(|error| DeviceError::Refused {
+                name: info.name.clone(),
+                reason: one_line(&error.to_string()),
+            })?;
+        let failure = Arc::new(Mutex::new(None));
+        let note = |failure: &Arc<Mutex<Option<String>>>, reason: String| {
+            let mut failure = failure.lock().unwrap_or_else(PoisonError::into_inner);
+            // The first is the cause.
+            failure.get_or_insert(one_line(&reason));
+        };
+        let lost = failure.clone();
+        device.set_device_lost_callback(move |reason, message| {
+            if reason != wgpu::DeviceLostReason::Destroyed {
+                note(&lost, format!("it was lost: {message}"));
+            }
+        });
+        let failed = failure.clone();
+        device.on_uncaptured_error(Arc::new(move |error: wgpu::Error| note(&failed, error.to_string())));
+        Ok(Arc::new(Self {
+            device,
+            queue,
+            info,
+            failure,
+            profile: OnceLock::new(),
+        }))
+    }
+
+    /// What was opened.
+    pub fn info(&self) -> &AdapterInfo {
+        &self.info
+    }
+
+    /// What went wrong on the device since it was opened; from then on, arrays hold unspecified words.
+    ///
+    /// # Errors
+    /// When something did.
+    pub fn check(&self) -> Result<(), DeviceError> {
+        match &*self.failure.lock().unwrap_or_else(PoisonError::into_inner) {
+            None => Ok(()),
+            Some(reason) => Err(DeviceError::Failed {
+                name: self.info.name.clone(),
+                reason: reason.clone(),
+            }),
+        }
+    }
+
+    /// Reports a failure that the device itself does not see, and those that tests make up.
+    pub fn fail(&self, reason: &str) {
+        let mut failure = self.failure.lock().unwrap_or_else(PoisonError::into_inner);
+        failure.get_or_insert(one_line(reason));
+    }
+
+    /// From now on measures each kernel by the device's clock, and waits for every submission. Whether the device has such a clock.
+    pub fn start_profile(&self) -> bool {
+        let has_clock = self.device.features().contains(wgpu::Features::TIMESTAMP_QUERY);
+        if has_clock {
+            self.profile.get_or_init(|| Profile::new(&self.device, &self.queue));
+        }
+        has_clock
+    }
+
+    /// Seconds and calls of each kernel since [`Gpu::start_profile`] or the last call; empty if the device has no clock.
+    pub fn take_profile(&self) -> BTreeMap<&'static str, (f64, u64)> {
+        let profile = self.profile.get();
+        profile.map_or_else(BTreeMap::new, |profile| {
+            std::mem::take(&mut *profile.spent.lock().unwrap_or_else(PoisonError::into_inner))
+        })
+    }
+
+    /// Waits until everything submitted is done.
+    pub fn wait(&self) {
+        if let Err(error) = self.device.poll(wgpu::PollType::wait_indefinitely()) {
+            self.fail(&error.to_string());
+        }
+    }
+}
+
+fn one_line(text: &str) -> String {
+    text.split_whitespace().collect::<Vec<_>>().join(" ")
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,53 @@
+use super::{Array, GRID, Gpu, Kernel, Shader, Work};
+
+const GROUP_SCAN: &str = include_str!("shaders/scan_group.wgsl");
+pub(super) const SHADERS: [Shader; 3] = [
+    Shader {
+        name: "scan_blocks",
+        parts: &[GRID, include_str!("shaders/scan_blocks.wgsl")],
+    },
+    Shader {
+        name: "scan_sums",
+        parts: &[GROUP_SCAN, include_str!("shaders/scan_sums.wgsl")],
+    },
+    Shader {
+        name: "scan_apply",
+        parts: &[GRID, GROUP_SCAN, include_str!("shaders/scan_apply.wgsl")],
+    },
+];
+
+/// Words of a block.
+const BLOCK: usize = 2048;
+
+/// Exclusive prefix sums of words, by blocks: their sums, the sums before each block, the sums before each word.
+#[derive(Debug)]
+pub struct Scan {
+    kernels: [Kernel; 3],
+    sums: Array,
+}
+
+impl Scan {
+    /// Compiles.
+    pub fn new(gpu: &Gpu) -> Self {
+        Self {
+            kernels: SHADERS.each_ref().map(|shader| Kernel::new(gpu, shader)),
+            sums: Array::zeros(gpu, "sums of blocks", 0),
+        }
+    }
+
+    /// Room for the parameters of one [`Scan::run`] of a submission.
+    pub fn params(gpu: &Gpu) -> Array {
+        Array::zeros(gpu, "scan parameters", 4)
+    }
+
+    /// `before[i]` becomes the sum of the words of `values` before `i`, for `i < count`. Each run of a submission has its own `params`.
+    pub fn run(&mut self, work: &mut Work, params: &Array, values: &Array, before: &Array, count: usize) {
+        let (gpu, blocks) = (work.gpu(), count.div_ceil(BLOCK));
+        params.write(gpu, 0, &[count as u32, blocks as u32]);
+        self.sums.reserve(gpu, blocks + 1);
+        let [of_blocks, of_sums, apply] = &self.kernels;
+        work.run(of_blocks, &[params, values, &self.sums], blocks);
+        work.run(of_sums, &[params, &self.sums], usize::from(blocks > 0));
+        work.run(apply, &[params, values, &self.sums, before], blocks);
+    }
+}

@@ -1,0 +1,17 @@
+// Sum of the values of a workgroup's threads up to this one. `shared_sums` is the kernel's.
+fn inclusive_scan(own: u32, at: u32) -> u32 {
+    // What was read there before.
+    workgroupBarrier();
+    shared_sums[at] = own;
+    for (var reach = 1u; reach < 256u; reach *= 2u) {
+        workgroupBarrier();
+        var left = 0u;
+        if at >= reach {
+            left = shared_sums[at - reach];
+        }
+        workgroupBarrier();
+        shared_sums[at] += left;
+    }
+    workgroupBarrier();
+    return shared_sums[at];
+}

@@ -1,0 +1,64 @@
+use super::*;
+
+/// The device on which tests run: software where there is no other. Without any, tests are skipped, loudly.
+fn gpu() -> Option<Arc<Gpu>> {
+    irradia_testkit::gpu_or_skip(|| Gpu::open(&Wanted::Any))
+}
+
+#[test]
+fn prefix_sums_of_few_and_many_words_are_those_of_a_loop() {
+    let Some(gpu) = gpu() else { return };
+    let (mut scan, params) = (Scan::new(&gpu), Scan::params(&gpu));
+    gpu.check().unwrap();
+    for count in [1, 255, 2048, 2049, 300_000, 600_001] {
+        let values: Vec<u32> = (0..count as u32).map(|i| i.wrapping_mul(2_654_435_761) >> 24).collect();
+        let from = Array::of(&gpu, "values", &values);
+        let to = Array::zeros(&gpu, "before", count);
+        let mut work = Work::new(&gpu);
+        scan.run(&mut work, &params, &from, &to, count);
+        work.submit();
+        let mut sum = 0;
+        for (i, (value, before)) in values.iter().zip(to.to_vec::<u32>(&gpu, count)).enumerate() {
+            assert_eq!(before, sum, "{i} of {count}");
+            sum += value;
+        }
+    }
+    gpu.check().unwrap();
+}
+
+#[test]
+fn sorting_keeps_the_order_of_equal_keys() {
+    let Some(gpu) = gpu() else { return };
+    let mut sort = Sort::new(&gpu, 32);
+    gpu.check().unwrap();
+    for (count, bits) in [(1, 32), (17, 8), (4096, 32), (100_003, 32), (100_003, 13)] {
+        let mask = u32::MAX >> (32 - bits);
+        let keys: Vec<u32> = (0..count as u32)
+            .map(|i| (i ^ 0x5a5a).wrapping_mul(2_654_435_761) & mask & !(i & 6))
+            .collect();
+        let key_array = Array::of(&gpu, "keys", &keys);
+        let value_array = Array::of(&gpu, "values", &(0..count as u32).collect::<Vec<_>>());
+        let mut work = Work::new(&gpu);
+        sort.run(&mut work, &key_array, &value_array, count, bits);
+        work.submit();
+        let mut expected: Vec<u32> = (0..count as u32).collect();
+        expected.sort_by_key(|i| keys[*i as usize]);
+        let got = value_array.to_vec::<u32>(&gpu, count);
+        assert!(got == expected, "{count} keys of {bits} bits");
+        let sorted = key_array.to_vec::<u32>(&gpu, count);
+        assert!(sorted.iter().zip(&got).all(|(key, i)| *key == keys[*i as usize]));
+    }
+    gpu.check().unwrap();
+}
+
+#[test]
+fn a_shader_that_does_not_compile_is_a_failure_and_not_a_panic() {
+    let Some(gpu) = gpu() else { return };
+    let shader = Shader {
+        name: "broken",
+        parts: &["fn main( {"],
+    };
+    Kernel::new(&gpu, &shader);
+    let error = gpu.check().unwrap_err().to_string();
+    assert!(error.contains("failed") && !error.contains('\n'), "{error}");
+}

@@ -1,0 +1,161 @@
+//! A frame and a training step on the GPU, stage by stage, beside the CPU's.
+
+use crate::scale::{camera, scene, update};
+use anyhow::{Result, bail};
+use irradia_compute::gpu::{Gpu, Wanted};
+use irradia_compute::{Device, DeviceChoice};
+use irradia_measure::gpu::{Beside, DeviceFrame, GpuLoss};
+use irradia_measure::{LossWeights, Target, Truth};
+use irradia_splat::regularize::Regularizers;
+use irradia_splat::{DeviceGradient, Engine, RenderOptions, SplatState, Statistics};
+use std::sync::Arc;
+use std::time::Instant;
+
+/// Each case is a number of splats and a size, such as `1000000@1920x1080`; without any, those of RESULTS.md.
+pub fn run(cases: &[String]) -> Result<()> {
+    println!("{}", Device::Gpu(Gpu::open(&Wanted::Any)?));
+    let usual = [100_000, 1_000_000, 3_000_000].into_iter();
+    let cases: Vec<(usize, [u32; 2])> = match cases {
+        [] => usual
+            .flat_map(|number| [[1920, 1080], [3840, 2160]].map(|size| (number, size)))
+            .collect(),
+        cases => cases.iter().map(|case| parsed(case)).collect::<Result<_>>()?,
+    };
+    for (number, size) in cases {
+        measure(number, size)?;
+    }
+    Ok(())
+}
+
+fn parsed(case: &str) -> Result<(usize, [u32; 2])> {
+    let parts = case
+        .split_once('@')
+        .and_then(|(number, size)| Some((number, size.split_once('x')?)));
+    let Some((number, (width, height))) = parts else {
+        bail!("{case}: expected SPLATS@WIDTHxHEIGHT")
+    };
+    Ok((number.parse()?, [width.parse()?, height.parse()?]))
+}
+
+/// Seconds of a frame, and of a step with loss, backward pass and update.
+struct Spent {
+    frame: f64,
+    step: f64,
+}
+
+fn measure(number: usize, [width, height]: [u32; 2]) -> Result<()> {
+    let state = SplatState::new(scene(number));
+    println!("{number} splats, {width} x {height}");
+    // The clock stops the device after every kernel: whole frames and steps are timed on one without.
+    let Device::Gpu(timed) = Device::open(&DeviceChoice::Gpu)? else {
+        unreachable!("a GPU was asked for")
+    };
+    let Device::Gpu(profiled) = Device::open(&DeviceChoice::Gpu)? else {
+        unreachable!("a GPU was asked for")
+    };
+    let (spent, engine) = time(&timed, &state, [width, height], None)?;
+    println!(
+        "  {} in view, {} entries; a frame {:.2} ms ({:.0} frames/s), a step {:.2} ms ({:.1} steps/s)",
+        engine.visible(),
+        engine.intersections(),
+        1e3 * spent.frame,
+        1.0 / spent.frame,
+        1e3 * spent.step,
+        1.0 / spent.step
+    );
+    drop(engine);
+    if profiled.start_profile() {
+        time(&profiled, &state, [width, height], Some(4))?;
+        let mut spent: Vec<_> = profiled.take_profile().into_iter().collect();
+        spent.sort_by(|a, b| b.1.0.total_cmp(&a.1.0));
+        for (name, (seconds, calls)) in spent {
+            println!("  {name:<18} {:>9.3} ms a step, {} calls", 250.0 * seconds, calls / 4);
+        }
+    }
+    let cpu = cpu_step(state, [width, height]);
+    println!("  the CPU's step {:.2} ms", 1e3 * cpu);
+    timed.check()?;
+    Ok(())
+}
+
+/// Repeats for about two seconds, or `repeats` steps.
+fn time(
+    gpu: &Arc<Gpu>,
+    state: &SplatState,
+    [width, height]: [u32; 2],
+    repeats: Option<u32>,
+) -> Result<(Spent, Engine)> {
+    let mut engine = Engine::new(state.clone());
+    engine.use_device(&Device::Gpu(gpu.clone()))?;
+    let mut loss = GpuLoss::new(gpu.clone())?;
+    let photo = vec![127u8; 3 * (width * height) as usize];
+    let (camera, options, update) = (
+        camera(width, height, 1.0),
+        RenderOptions::default(),
+        update(false, Regularizers::default()),
+    );
+    let mut step = |engine: &mut Engine| {
+        engine.render(camera.into(), &options);
+        let [planes, v_planes] = engine.device_frame().expect("on the GPU");
+        let target = Target {
+            width: width as usize,
+            height: height as usize,
+            truth: Truth::Rgb8(&photo),
+            mask: None,
+        };
+        let beside = Beside {
+            depths: &[],
+            depth_weight: 0.0,
+            error: true,
+        };
+        loss.evaluate(
+            &DeviceFrame { planes, v_planes },
+            &target,
+            &LossWeights::photometric(0.2),
+            &beside,
+        );
+        engine.backward_on_device(&DeviceGradient {
+            alpha: false,
+            depth: false,
+            gather: Some(Statistics::Error),
+            camera: false,
+        });
+        engine.update(&update);
+    };
+    let each = |engine: &mut Engine, work: &mut dyn FnMut(&mut Engine)| {
+        if repeats.is_none() {
+            work(engine);
+            gpu.wait();
+        }
+        let (started, mut done) = (Instant::now(), 0);
+        while repeats.map_or(started.elapsed().as_secs_f64() < 2.0, |repeats| done < repeats) {
+            work(engine);
+            done += 1;
+        }
+        gpu.wait();
+        started.elapsed().as_secs_f64() / f64::from(done)
+    };
+    let step = each(&mut engine, &mut step);
+    let frame = match repeats {
+        None => each(&mut engine, &mut |engine| engine.render(camera.into(), &options)),
+        Some(_) => 0.0,
+    };
+    Ok((Spent { frame, step }, engine))
+}
+
+/// Seconds of a step without its loss.
+fn cpu_step(state: SplatState, [width, height]: [u32; 2]) -> f64 {
+    let mut engine = Engine::new(state);
+    let camera = camera(width, height, 1.0);
+    let v_color = vec![1e-6; 3 * (width * height) as usize];
+    let update = update(false, Regularizers::default());
+    let (wall, _) = crate::time(2, || {
+        engine.render(camera.into(), &RenderOptions::default());
+        engine.backward(&irradia_splat::OutputGradient::of_color(&v_color));
+        engine.update(&irradia_splat::Update {
+            statistics: Some(Statistics::Gradient),
+            ..update
+        });
+    });
+    1e-3 * wall
+}

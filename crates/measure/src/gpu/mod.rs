@@ -1,0 +1,348 @@
+//! The losses of a training step on any GPU: L1, SSIM and squares against a photograph of 8 bits, sparse depths, and the error of each
+//! pixel. The twin of [`crate::PhotometricLoss`] and of the metric [`crate::DepthLoss`].
+
+use crate::{DepthSample, LossValues, LossWeights, Target, Truth};
+use irradia_compute::DeviceError;
+use irradia_compute::gpu::{Array, GRID, Gpu, Kernel, Shader, Work};
+use std::sync::Arc;
+
+const COMMON: &str = include_str!("shaders/common.wgsl");
+const PHOTO: &str = include_str!("shaders/photo.wgsl");
+const SUM: &str = include_str!("shaders/sum_group.wgsl");
+const SHADERS: [Shader; 3] = [
+    Shader {
+        name: "ssim_maps",
+        parts: &[GRID, COMMON, PHOTO, SUM, include_str!("shaders/ssim_maps.wgsl")],
+    },
+    Shader {
+        name: "gradient",
+        parts: &[GRID, COMMON, PHOTO, SUM, include_str!("shaders/gradient.wgsl")],
+    },
+    Shader {
+        name: "total",
+        parts: &[COMMON, SUM, include_str!("shaders/total.wgsl")],
+    },
+];
+
+/// Width and height of a tile, pixels.
+const TILE: usize = 16;
+/// Planes of a frame's gradients: red, green, blue, alpha, depth, error.
+pub const GRADIENT_PLANES: usize = 6;
+
+/// Bits of `Target.flags` in `common.wgsl`.
+mod flag {
+    pub const MASK: u32 = 1;
+    pub const SSIM: u32 = 2;
+    pub const ERROR: u32 = 4;
+}
+
+/// A frame on the device, and room for its gradients.
+#[derive(Clone, Copy)]
+pub struct DeviceFrame<'a> {
+    /// Planes `[5, H, W]`: red, green, blue, alpha, depth.
+    pub planes: &'a Array,
+    /// Planes `[GRADIENT_PLANES, H, W]`.
+    pub v_planes: &'a Array,
+}
+
+/// What is compared beside colours.
+#[derive(Clone, Copy, Debug)]
+pub struct Beside<'a> {
+    /// Known depths in world units; those that are not positive and finite, or lie outside the image, do not count.
+    pub depths: &'a [DepthSample],
+    /// Weight of their loss.
+    pub depth_weight: f32,
+    /// Whether the plane of errors is wanted: the mean absolute difference of each pixel.
+    pub error: bool,
+}
+
+/// The values of the losses.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct DeviceValues {
+    /// Of colours.
+    pub photometric: LossValues,
+    /// Of depth, unweighted.
+    pub depth: f64,
+}
+
+/// Computes the losses and their gradients; reuses its memory.
+#[derive(Debug)]
+pub struct GpuLoss {
+    gpu: Arc<Gpu>,
+    kernels: [Kernel; 3],
+    task: Array,
+    photo: Array,
+    mask: Array,
+    maps: Array,
+    sums: Array,
+    samples: Array,
+    totals: Array,
+}
+
+impl GpuLoss {
+    /// Compiles the kernels.
+    ///
+    /// # Errors
+    /// When the device refuses one.
+    pub fn new(gpu: Arc<Gpu>) -> Result<Self, DeviceError> {
+        let array = |label| Array::zeros(&gpu, label, 0);
+        let loss = Self {
+            kernels: SHADERS.each_ref().map(|shader| Kernel::new(&gpu, shader)),
+            task: Array::zeros(&gpu, "target", 12),
+            photo: array("photograph"),
+            mask: array("mask"),
+            maps: array("maps of SSIM"),
+            sums: array("sums of tiles"),
+            samples: array("samples of depth"),
+            totals: Array::zeros(&gpu, "totals", 5),
+            gpu,
+        };
+        loss.gpu.check()?;
+        Ok(loss)
+    }
+
+    /// Compares `frame`, sets its gradients, and reads the values back.
+    ///
+    /// # Panics
+    /// When the truth is not of 8 bits, or its length differs from the target's size: a bug in the caller.
+    pub fn evaluate(
+        &mut self,
+        frame: &DeviceFrame,
+        target: &Target,
+        weights: &LossWeights,
+        beside: &Beside,
+    ) -> DeviceValues {
+        let gpu = &*self.gpu;
+        let (width, height) = (target.width, target.height);
+        let Truth::Rgb8(truth) = target.truth else {
+            panic!("a photograph of 8 bits");
+        };
+        assert_eq!(truth.len(), 3 * width * height, "a photograph of the target's size");
+        let count = 3.0 * target.weight();
+        let tiles = [width, height].map(|side| side.div_ceil(TILE));
+        let groups = 3 * tiles[0] * tiles[1];
+        write_bytes(gpu, &mut self.photo, truth);
+        let mut flags = 0;
+        if let Some(mask) = target.mask {
+            write_bytes(gpu, &mut self.mask, mask);
+            flags |= flag::MASK;
+        }
+        if weights.ssim != 0.0 {
+            flags |= flag::SSIM;
+        }
+        if beside.error {
+            flags |= flag::ERROR;
+        }
+        let samples = packed(beside.depths, width * height);
+        self.samples.reserve(gpu, samples.len());
+        self.samples.write(gpu, 0, &samples);
+        // With nothing to compare, gradients are zero.
+        let gain = |factor: f64, weight: f32| {
+            if count > 0.0 {
+                (factor * f64::from(weight) / count) as f32
+            } else {
+                0.0
+            }
+        };
+        let gains = [
+            gain(1.0, weights.l1),
+            gain(-1.0, weights.ssim),
+            gain(2.0, weights.mse),
+            beside.depth_weight,
+        ]
+        .map(f32::to_bits);
+        let sizes = [
+            width as u32,
+            height as u32,
+            tiles[0] as u32,
+            (tiles[0] * tiles[1]) as u32,
+        ];
+        let more = [flags, samples.len() as u32 / 3, 0, 0];
+        self.task.write(gpu, 0, &[sizes, gains, more]);
+        self.maps.reserve(gpu, 9 * width * height);
+        self.sums.reserve(gpu, 3 * groups);
+
+        let mut work = Work::new(gpu);
+        let [maps, gradient, total] = &self.kernels;
+        if weights.ssim != 0.0 {
+            let arrays = [
+                &self.task,
+                frame.planes,
+                &self.photo,
+                &self.mask,
+                &self.maps,
+                &self.sums,
+            ];
+            work.run(maps, &arrays, groups);
+        }
+        work.run(
+            gradient,
+            &[
+                &self.task,
+                frame.planes,
+                &self.photo,
+                &self.mask,
+                &self.maps,
+                &self.sums,
+                frame.v_planes,
+            ],
+            groups,
+        );
+        work.run(
+            total,
+            &[
+                &self.task,
+                frame.planes,
+                &self.sums,
+                &self.samples,
+                frame.v_planes,
+                &self.totals,
+            ],
+            1,
+        );
+        work.submit();
+        let mut totals = [0.0f32; 5];
+        self.totals.read(gpu, 0, &mut totals);
+        let [l1, mse, dissimilarity, depth, norm] = totals.map(f64::from);
+        DeviceValues {
+            photometric: LossValues::of_sums([l1, mse, dissimilarity], weights, if count > 0.0 { count } else { 1.0 }),
+            depth: if norm > 0.0 { depth / norm } else { 0.0 },
+        }
+    }
+}
+
+/// Samples that may count, by pixel: pixel, depth and weight.
+fn packed(samples: &[DepthSample], pixels: usize) -> Vec<u32> {
+    let good = |value: f32| value > 0.0 && value.is_finite();
+    let mut counted: Vec<&DepthSample> = samples
+        .iter()
+        .filter(|s| good(s.depth) && good(s.weight) && (s.pixel as usize) < pixels)
+        .collect();
+    counted.sort_by_key(|s| s.pixel);
+    counted
+        .into_iter()
+        .flat_map(|s| [s.pixel, s.depth.to_bits(), s.weight.to_bits()])
+        .collect()
+}
+
+/// Writes bytes as words, four each.
+fn write_bytes(gpu: &Gpu, to: &mut Array, bytes: &[u8]) {
+    to.reserve(gpu, bytes.len().div_ceil(4));
+    let (words, rest) = bytes.as_chunks::<4>();
+    to.write(gpu, 0, words);
+    if !rest.is_empty() {
+        let mut last = [0; 4];
+        last[..rest.len()].copy_from_slice(rest);
+        to.write(gpu, words.len(), &[last]);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{DepthKind, DepthLoss, PhotometricLoss};
+    use irradia_compute::gpu::Wanted;
+    use irradia_scene::Rng;
+
+    #[test]
+    fn every_shader_is_valid() {
+        for shader in SHADERS {
+            irradia_testkit::validate_shader(shader.name, &shader.source());
+        }
+    }
+
+    #[test]
+    fn losses_and_gradients_agree_with_the_cpu() {
+        let Some(gpu) = irradia_testkit::gpu_or_skip(|| Gpu::open(&Wanted::Any)) else {
+            return;
+        };
+        let mut loss = GpuLoss::new(gpu.clone()).unwrap();
+        let mut rng = Rng::new(3, 3);
+        for (width, height) in [(1, 1), (37, 21), (83, 61)] {
+            let pixels = width * height;
+            let truth: Vec<u8> = (0..3 * pixels).map(|_| rng.range(0.0, 255.9) as u8).collect();
+            let mask: Vec<u8> = (0..pixels).map(|i| [0, 255, 255, 128][i % 4]).collect();
+            let planes: Vec<f32> = (0..5 * pixels)
+                .map(|i| {
+                    if i < 4 * pixels {
+                        rng.range(0.0, 1.1)
+                    } else {
+                        rng.range(0.5, 3.0)
+                    }
+                })
+                .collect();
+            let samples: Vec<DepthSample> = (0..pixels as u32)
+                .map(|i| DepthSample {
+                    // Some pixels twice, one outside.
+                    pixel: (i / 2 * 5) % (pixels as u32 + 1),
+                    depth: 0.5 + i as f32 % 3.0,
+                    weight: i as f32 % 2.0 + 0.5,
+                })
+                .collect();
+            for (ssim, mask) in [(0.2, None), (0.2, Some(&mask[..])), (0.0, None)] {
+                let weights = LossWeights {
+                    mse: 0.3,
+                    ..LossWeights::photometric(ssim)
+                };
+                let target = Target {
+                    width,
+                    height,
+                    truth: Truth::Rgb8(&truth),
+                    mask,
+                };
+                let mut expected = vec![0.0f32; 6 * pixels];
+                let (v_color, rest) = expected.split_at_mut(3 * pixels);
+                let values = PhotometricLoss::new().evaluate(&planes[..3 * pixels], &target, &weights, v_color);
+                let (v_alpha, rest) = rest.split_at_mut(pixels);
+                let (v_depth, errors) = rest.split_at_mut(pixels);
+                let depth = DepthLoss::default().evaluate(
+                    &planes[4 * pixels..],
+                    &planes[3 * pixels..4 * pixels],
+                    &samples,
+                    DepthKind::Metric,
+                    0.7,
+                    v_depth,
+                    v_alpha,
+                );
+                for (i, error) in errors.iter_mut().enumerate() {
+                    if mask.is_none_or(|mask| mask[i] > 0) {
+                        let of = |c: usize| (planes[c * pixels + i] - f32::from(truth[3 * i + c]) / 255.0).abs();
+                        *error = (of(0) + of(1) + of(2)) / 3.0;
+                    }
+                }
+                let frame = DeviceFrame {
+                    planes: &Array::of(&gpu, "frame", &planes),
+                    v_planes: &Array::of(&gpu, "gradients", &vec![9.0f32; 6 * pixels]),
+                };
+                let beside = Beside {
+                    depths: &samples,
+                    depth_weight: 0.7,
+                    error: true,
+                };
+                let got = loss.evaluate(&frame, &target, &weights, &beside);
+                let near =
+                    |a: f64, b: f64, what: &str| assert!((a - b).abs() < 1e-5 * b.abs().max(1.0), "{what}: {a} {b}");
+                near(got.photometric.total, values.total, "total");
+                near(got.photometric.l1, values.l1, "L1");
+                near(got.photometric.mse, values.mse, "squares");
+                near(got.depth, depth.loss, "depth");
+                assert_eq!(got.photometric.ssim.is_some(), values.ssim.is_some());
+                let gradients: Vec<f32> = frame.v_planes.to_vec(&gpu, 6 * pixels);
+                for plane in 0..6 {
+                    let (got, expected) = (
+                        &gradients[plane * pixels..][..pixels],
+                        &expected[plane * pixels..][..pixels],
+                    );
+                    let scale = expected.iter().fold(1e-9f32, |m, v| m.max(v.abs()));
+                    for (i, (a, b)) in got.iter().zip(expected).enumerate() {
+                        assert!(
+                            (a - b).abs() < 2e-4 * scale,
+                            "{width} x {height}, plane {plane}, pixel {i}: {a} {b}"
+                        );
+                    }
+                }
+            }
+        }
+        gpu.check().unwrap();
+    }
+}

@@ -1,0 +1,101 @@
+// The gradient of the loss in a tile and a channel: `finish` in `loss/ssim.rs`. Gradients of alpha and depth begin at zero.
+@group(0) @binding(0) var<uniform> task: Target;
+@group(0) @binding(1) var<storage, read> frame: array<f32>;
+@group(0) @binding(2) var<storage, read> photo: array<u32>;
+@group(0) @binding(3) var<storage, read> mask: array<u32>;
+@group(0) @binding(4) var<storage, read> maps: array<f32>;
+@group(0) @binding(5) var<storage, read_write> sums: array<f32>;
+// Planes: red, green, blue, alpha, depth, error.
+@group(0) @binding(6) var<storage, read_write> v_frame: array<f32>;
+
+const THREADS: u32 = 64u;
+var<workgroup> derivatives: array<vec3f, 676>;
+var<workgroup> rows: array<vec3f, 416>;
+var<workgroup> shared_values: array<vec3f, 64>;
+
+@compute @workgroup_size(64)
+fn main(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups: vec3u, @builtin(local_invocation_index) at: u32) {
+    let number = group_index(group, groups);
+    let channel = number / task.size.w;
+    let tile = number % task.size.w;
+    let corner = vec2i(vec2u(tile % task.size.z, tile / task.size.z) * TILE) - i32(RADIUS);
+    let size = vec2i(task.size.xy);
+    let pixels = task.size.x * task.size.y;
+    let has_ssim = (task.flags.x & FLAG_SSIM) != 0u;
+    let column = at % TILE;
+    let row = 4u * (at / TILE);
+    var adjoint = array<vec3f, 4>();
+    if has_ssim {
+        for (var i = at; i < SEEN * SEEN; i += THREADS) {
+            let place = corner + vec2i(vec2u(i % SEEN, i / SEEN));
+            derivatives[i] = vec3f(0.0);
+            if channel < 3u && all(place >= vec2i(0)) && all(place < size) {
+                let plane = 3u * channel * pixels + u32(place.y * size.x + place.x);
+                derivatives[i] = vec3f(maps[plane], maps[plane + pixels], maps[plane + 2u * pixels]);
+            }
+        }
+        workgroupBarrier();
+        // Four neighbours at a time: 14 values serve 4 windows.
+        for (var i = at; i < SEEN * TILE / 4u; i += THREADS) {
+            let along = i / 4u;
+            let first = 4u * (i % 4u);
+            var sums_of_four = array<vec3f, 4>();
+            for (var k = 0u; k < 14u; k++) {
+                let abc = derivatives[along * SEEN + first + k];
+                for (var q = 0u; q < 4u; q++) {
+                    sums_of_four[q] += window_weight(k, q) * abc;
+                }
+            }
+            for (var q = 0u; q < 4u; q++) {
+                rows[along * TILE + first + q] = sums_of_four[q];
+            }
+        }
+        workgroupBarrier();
+        for (var k = 0u; k < 14u; k++) {
+            let abc = rows[(row + k) * TILE + column];
+            for (var q = 0u; q < 4u; q++) {
+                adjoint[q] += window_weight(k, q) * abc;
+            }
+        }
+    }
+    var differences = vec2f(0.0);
+    for (var q = 0u; q < 4u; q++) {
+        let pixel = corner + i32(RADIUS) + vec2i(vec2u(column, row + q));
+        if channel < 3u && all(pixel < size) {
+            differences += finish(adjoint[q], u32(pixel.y * size.x + pixel.x), channel);
+        }
+    }
+    let sum = sum_group(vec3f(differences, 0.0), at);
+    if at == 0u && channel < 3u {
+        sums[3u * number] = sum.x;
+        sums[3u * number + 1u] = sum.y;
+        if !has_ssim {
+            sums[3u * number + 2u] = 0.0;
+        }
+    }
+}
+
+// Writes the gradient at a pixel; returns its absolute and squared difference.
+fn finish(abc: vec3f, to: u32, channel: u32) -> vec2f {
+    let pixels = task.size.x * task.size.y;
+    let xy = pair_at(to, channel);
+    let d = xy.x - xy.y;
+    let v = task.gains.x * sign(d) + task.gains.z * d;
+    let v_ssim = abc.x + xy.x * abc.y + xy.y * abc.z;
+    v_frame[channel * pixels + to] = weight_at(to) * (2.0 * task.gains.y * v_ssim + v);
+    if channel == 0u {
+        v_frame[3u * pixels + to] = 0.0;
+        v_frame[4u * pixels + to] = 0.0;
+        if (task.flags.x & FLAG_ERROR) != 0u {
+            // The mean absolute difference, for density control; hidden pixels have none.
+            var error = 0.0;
+            if weight_at(to) > 0.0 {
+                for (var c = 0u; c < 3u; c++) {
+                    error += abs(frame[c * pixels + to] - truth_at(to, c));
+                }
+            }
+            v_frame[5u * pixels + to] = error / 3.0;
+        }
+    }
+    return vec2f(abs(d), d * d);
+}

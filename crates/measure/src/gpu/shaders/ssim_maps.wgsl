@@ -1,0 +1,95 @@
+// SSIM of a tile in one channel, and its derivatives by mu_x, by the mean of squares (halved) and by that of products, as
+// `differentiate` in `loss/ssim.rs` has them.
+@group(0) @binding(0) var<uniform> task: Target;
+@group(0) @binding(1) var<storage, read> frame: array<f32>;
+@group(0) @binding(2) var<storage, read> photo: array<u32>;
+@group(0) @binding(3) var<storage, read> mask: array<u32>;
+// [channel, 3, pixel].
+@group(0) @binding(4) var<storage, read_write> maps: array<f32>;
+// [group, 3]: sums of absolute and squared differences, of 1 - SSIM.
+@group(0) @binding(5) var<storage, read_write> sums: array<f32>;
+
+const C1: f32 = 0.0001;
+const C2: f32 = 0.0009;
+
+const THREADS: u32 = 64u;
+var<workgroup> pairs: array<vec2f, 676>;
+// After the window along x: render, truth, squares, products.
+var<workgroup> rows: array<vec4f, 416>;
+var<workgroup> shared_values: array<vec3f, 64>;
+
+@compute @workgroup_size(64)
+fn main(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups: vec3u, @builtin(local_invocation_index) at: u32) {
+    let number = group_index(group, groups);
+    let channel = number / task.size.w;
+    let tile = number % task.size.w;
+    let corner = vec2i(vec2u(tile % task.size.z, tile / task.size.z) * TILE) - i32(RADIUS);
+    let size = vec2i(task.size.xy);
+    for (var i = at; i < SEEN * SEEN; i += THREADS) {
+        let place = corner + vec2i(vec2u(i % SEEN, i / SEEN));
+        pairs[i] = vec2f(0.0);
+        if channel < 3u && all(place >= vec2i(0)) && all(place < size) {
+            pairs[i] = pair_at(u32(place.y * size.x + place.x), channel);
+        }
+    }
+    workgroupBarrier();
+    // Four neighbours at a time: 14 values serve 4 windows.
+    for (var i = at; i < SEEN * TILE / 4u; i += THREADS) {
+        let row = i / 4u;
+        let column = 4u * (i % 4u);
+        var sums_of_four = array<vec4f, 4>();
+        for (var k = 0u; k < 14u; k++) {
+            let xy = pairs[row * SEEN + column + k];
+            let moments = vec4f(xy, dot(xy, xy), xy.x * xy.y);
+            for (var q = 0u; q < 4u; q++) {
+                sums_of_four[q] += window_weight(k, q) * moments;
+            }
+        }
+        for (var q = 0u; q < 4u; q++) {
+            rows[row * TILE + column + q] = sums_of_four[q];
+        }
+    }
+    workgroupBarrier();
+    let column = at % TILE;
+    let row = 4u * (at / TILE);
+    var means = array<vec4f, 4>();
+    for (var k = 0u; k < 14u; k++) {
+        let moments = rows[(row + k) * TILE + column];
+        for (var q = 0u; q < 4u; q++) {
+            means[q] += window_weight(k, q) * moments;
+        }
+    }
+    var dissimilarity = 0.0;
+    for (var q = 0u; q < 4u; q++) {
+        let pixel = corner + i32(RADIUS) + vec2i(vec2u(column, row + q));
+        if channel < 3u && all(pixel < size) {
+            dissimilarity += differentiate(means[q], u32(pixel.y * size.x + pixel.x), channel);
+        }
+    }
+    let sum = sum_group(vec3f(0.0, 0.0, dissimilarity), at);
+    if at == 0u && channel < 3u {
+        sums[3u * number + 2u] = sum.z;
+    }
+}
+
+// Writes the derivatives at a pixel, from the window's means; returns its weighted 1 - SSIM.
+fn differentiate(mean: vec4f, to: u32, channel: u32) -> f32 {
+    let m = weight_at(to);
+    let product = mean.x * mean.y;
+    let squares = mean.x * mean.x + mean.y * mean.y;
+    let n1 = 2.0 * product + C1;
+    let d1 = squares + C1;
+    let n2 = 2.0 * (mean.w - product) + C2;
+    let d2 = max(mean.z - squares, 0.0) + C2;
+    let inverse = 1.0 / (d1 * d2);
+    let scale = m * inverse;
+    let ssim = n1 * n2 * scale;
+    let by_d2 = ssim * (d1 * inverse);
+    let by_d1 = ssim * (d2 * inverse);
+    let pixels = task.size.x * task.size.y;
+    let plane = 3u * channel * pixels + to;
+    maps[plane] = mean.y * scale * (n2 - n1) + mean.x * (by_d2 - by_d1);
+    maps[plane + pixels] = -by_d2;
+    maps[plane + 2u * pixels] = n1 * scale;
+    return m - ssim;
+}

@@ -1,0 +1,434 @@
+//! Frames on the GPU.
+
+use super::shaders::Kernels;
+use crate::render::{FramePlanes, RenderOptions};
+use crate::{Splats, ViewParams};
+use irradia_compute::DeviceError;
+use irradia_compute::gpu::{Array, GROUP, Gpu, Scan, Sort, Work};
+use std::sync::{Arc, OnceLock};
+
+/// Width and height of a tile, pixels.
+const TILE: u32 = 16;
+/// Entries of a segment, between whose beginnings the state of pixels is kept.
+const SEGMENT: usize = 256;
+/// Words of a segment's state: five channels of each pixel of a tile.
+const SEGMENT_STATE: usize = 5 * (TILE * TILE) as usize;
+/// Planes of a frame: red, green, blue, alpha, depth.
+pub(super) const FRAME_PLANES: usize = 5;
+/// Planes of the geometry: means, quaternions, ln scales, opacity logit.
+pub(super) const GEOMETRY: usize = 11;
+
+/// Bits of `View.flags` in `view.wgsl`.
+pub(super) mod flag {
+    pub const ANTIALIAS: u32 = 1;
+    pub const FILTER: u32 = 2;
+    pub const CLAMP: u32 = 4;
+    pub const TRAINS: u32 = 8;
+    pub const DEPTH: u32 = 16;
+    pub const ALPHA: u32 = 32;
+    pub const GATHER_ABSOLUTE: u32 = 64;
+    pub const GATHER_ERROR: u32 = 128;
+    pub const CAMERA: u32 = 256;
+}
+
+/// A renderer on the GPU: the twin of [`crate::Renderer`], with its conventions and formulas; sums are rounded in another order.
+pub struct GpuRenderer {
+    pub(super) gpu: Arc<Gpu>,
+    pub(super) kernels: Kernels,
+    /// Words of `View` in `view.wgsl`.
+    pub(super) view: Array,
+    pub(super) geometry: Array,
+    pub(super) harmonics: Array,
+    pub(super) filter: Array,
+    /// Number of splats, stride of their planes, SH degree.
+    pub(super) shape: [usize; 3],
+    filters: bool,
+    pub(super) footprints: Array,
+    pub(super) visible: Array,
+    pub(super) touched: Array,
+    pub(super) found: Array,
+    pub(super) order: Array,
+    pub(super) firsts: Array,
+    pub(super) slots: Array,
+    pub(super) splat_of_slot: Array,
+    pub(super) ranges: Array,
+    pub(super) first_segments: Array,
+    pub(super) tile_of_segment: Array,
+    pub(super) reached: Array,
+    pub(super) states: Array,
+    pub(super) planes: Array,
+    places: Array,
+    depths: Array,
+    counts: Array,
+    tiles: Array,
+    segment_counts: Array,
+    scan: Scan,
+    scan_params: [Array; 3],
+    sort_depths: Sort,
+    sort_tiles: Sort,
+    pub(super) last: Option<Last>,
+    host: OnceLock<Vec<f32>>,
+}
+
+/// The last frame.
+#[derive(Clone, Debug)]
+pub(super) struct Last {
+    pub view: ViewParams,
+    pub options: RenderOptions,
+    /// Whether the backward pass may follow.
+    pub trains: bool,
+    /// Visible splats, and entries of tiles.
+    pub found: [usize; 2],
+    /// Splats whose gradient was not finite in the backward pass before this frame.
+    pub non_finite: usize,
+}
+
+impl Last {
+    pub fn pixels(&self) -> usize {
+        self.view.width as usize * self.view.height as usize
+    }
+
+    fn tiles(&self) -> [u32; 2] {
+        [self.view.width, self.view.height].map(|size| size.div_ceil(TILE))
+    }
+
+    /// Segments at most.
+    pub fn segments(&self) -> usize {
+        let [x, y] = self.tiles();
+        self.found[1] / SEGMENT + x as usize * y as usize
+    }
+}
+
+impl GpuRenderer {
+    /// Compiles the kernels.
+    ///
+    /// # Errors
+    /// When the device refuses one.
+    pub fn new(gpu: Arc<Gpu>) -> Result<Self, DeviceError> {
+        let array = |label| Array::zeros(&gpu, label, 0);
+        let renderer = Self {
+            kernels: Kernels::new(&gpu),
+            view: Array::zeros(&gpu, "view", VIEW_WORDS),
+            geometry: array("geometry"),
+            harmonics: array("harmonics"),
+            filter: array("filter"),
+            shape: [0; 3],
+            filters: false,
+            footprints: array("footprints"),
+            visible: array("visible splats"),
+            touched: array("touched tiles"),
+            found: Array::zeros(&gpu, "found", 4),
+            order: array("order of splats"),
+            firsts: array("first slots"),
+            slots: array("slots"),
+            splat_of_slot: array("splats of slots"),
+            ranges: array("ranges of tiles"),
+            first_segments: array("first segments"),
+            tile_of_segment: array("tiles of segments"),
+            reached: array("reached segments"),
+            states: array("states of pixels"),
+            planes: array("frame"),
+            places: array("places of visible splats"),
+            depths: array("depths"),
+            counts: array("counts of tiles"),
+            tiles: array("tiles"),
+            segment_counts: array("counts of segments"),
+            scan: Scan::new(&gpu),
+            scan_params: [(); 3].map(|()| Scan::params(&gpu)),
+            sort_depths: Sort::new(&gpu, 32),
+            sort_tiles: Sort::new(&gpu, 32),
+            last: None,
+            host: OnceLock::new(),
+            gpu,
+        };
+        renderer.gpu.check()?;
+        Ok(renderer)
+    }
+
+    /// The device.
+    pub fn gpu(&self) -> &Arc<Gpu> {
+        &self.gpu
+    }
+
+    /// Takes the splats of the frames to come, and the variances of their 3D smoothing filter, if any.
+    pub fn upload(&mut self, splats: &Splats, filter: &[f32]) {
+        let (gpu, stride) = (&self.gpu, splats.stride());
+        self.shape = [splats.len(), stride, splats.sh_degree() as usize];
+        self.geometry.reserve(gpu, GEOMETRY * stride);
+        self.harmonics.reserve(gpu, splats.sh.as_slice().len());
+        write_geometry(gpu, &self.geometry, 0, splats);
+        self.harmonics.write(gpu, 0, splats.sh.as_slice());
+        self.filters = !filter.is_empty();
+        self.filter.reserve(gpu, filter.len());
+        self.filter.write(gpu, 0, filter);
+        self.footprints.reserve(gpu, 12 * stride);
+        for array in [
+            &mut self.visible,
+            &mut self.touched,
+            &mut self.places,
+            &mut self.depths,
+            &mut self.order,
+            &mut self.counts,
+            &mut self.firsts,
+        ] {
+            array.reserve(gpu, stride);
+        }
+        self.last = None;
+    }
+
+    /// Renders the uploaded splats.
+    pub fn render(&mut self, view: &ViewParams, options: &RenderOptions) {
+        self.draw(view, options, false);
+    }
+
+    /// As [`Self::render`]; if it `trains`, the backward pass may follow.
+    ///
+    /// The number of entries is read back once, after projection: arrays are then as large as needed, and nothing is dropped.
+    pub(super) fn draw(&mut self, view: &ViewParams, options: &RenderOptions, trains: bool) {
+        let gpu = self.gpu.clone();
+        let [count, ..] = self.shape;
+        let groups = |items: usize| items.div_ceil(GROUP as usize);
+        self.host = OnceLock::new();
+        let mut last = Last {
+            view: view.clone(),
+            options: *options,
+            trains,
+            found: [0; 2],
+            non_finite: 0,
+        };
+        self.view.write(&gpu, 0, &self.view_words(&last, 0));
+
+        let mut work = Work::new(&gpu);
+        work.clear(&self.found, 2);
+        let kernels = &self.kernels;
+        work.run(
+            &kernels.project,
+            &[
+                &self.view,
+                &self.geometry,
+                &self.harmonics,
+                &self.filter,
+                &self.footprints,
+                &self.visible,
+                &self.touched,
+                &self.found,
+            ],
+            groups(count),
+        );
+        self.scan
+            .run(&mut work, &self.scan_params[0], &self.visible, &self.places, count);
+        work.run(
+            &kernels.compact,
+            &[
+                &self.view,
+                &self.visible,
+                &self.places,
+                &self.footprints,
+                &self.depths,
+                &self.order,
+            ],
+            groups(count),
+        );
+        work.submit();
+        let mut found = [0u32; 3];
+        self.found.read(&gpu, 0, &mut found);
+        self.found.write(&gpu, 2, &[0u32]);
+        let [visible, entries, non_finite] = found.map(|n| n as usize);
+        last.found = [visible, entries];
+        last.non_finite = non_finite;
+
+        let [tiles_x, tiles_y] = last.tiles();
+        let tiles = tiles_x as usize * tiles_y as usize;
+        let pixels = last.pixels();
+        self.view.write(&gpu, 0, &self.view_words(&last, 0));
+        for array in [&mut self.tiles, &mut self.slots, &mut self.splat_of_slot] {
+            array.reserve(&gpu, entries);
+        }
+        // Behind the tiles, what belongs to none.
+        self.ranges.reserve(&gpu, 2 * (tiles + 1));
+        for array in [&mut self.segment_counts, &mut self.first_segments, &mut self.reached] {
+            array.reserve(&gpu, tiles + 1);
+        }
+        if trains {
+            self.tile_of_segment.reserve(&gpu, last.segments());
+            self.states.reserve(&gpu, SEGMENT_STATE * last.segments());
+        }
+        self.planes.reserve(&gpu, FRAME_PLANES * pixels);
+
+        let mut work = Work::new(&gpu);
+        self.sort_depths
+            .run(&mut work, &self.depths, &self.order, visible, u32::BITS);
+        let kernels = &self.kernels;
+        work.run(
+            &kernels.count,
+            &[&self.view, &self.order, &self.touched, &self.counts],
+            groups(visible),
+        );
+        self.scan
+            .run(&mut work, &self.scan_params[1], &self.counts, &self.firsts, visible);
+        work.run(
+            &kernels.emit,
+            &[
+                &self.view,
+                &self.order,
+                &self.firsts,
+                &self.touched,
+                &self.footprints,
+                &self.tiles,
+                &self.slots,
+                &self.splat_of_slot,
+            ],
+            groups(visible),
+        );
+        let bits = u32::BITS - (tiles as u32).leading_zeros();
+        self.sort_tiles.run(&mut work, &self.tiles, &self.slots, entries, bits);
+        work.clear(&self.ranges, 2 * (tiles + 1));
+        work.run(
+            &kernels.ranges,
+            &[&self.view, &self.tiles, &self.ranges],
+            groups(entries),
+        );
+        work.run(
+            &kernels.segments,
+            &[&self.view, &self.ranges, &self.segment_counts],
+            groups(tiles + 1),
+        );
+        self.scan.run(
+            &mut work,
+            &self.scan_params[2],
+            &self.segment_counts,
+            &self.first_segments,
+            tiles + 1,
+        );
+        work.run(
+            &kernels.blend,
+            &[
+                &self.view,
+                &self.ranges,
+                &self.slots,
+                &self.splat_of_slot,
+                &self.footprints,
+                &self.first_segments,
+                &self.tile_of_segment,
+                &self.reached,
+                &self.states,
+                &self.planes,
+            ],
+            tiles,
+        );
+        work.submit();
+        self.last = Some(last);
+    }
+
+    /// The last frame, which is read back on the first call.
+    ///
+    /// # Panics
+    /// When nothing was rendered.
+    pub fn frame(&self) -> FramePlanes<'_> {
+        let last = self.last.as_ref().expect("render comes first");
+        let pixels = last.pixels();
+        let host = self
+            .host
+            .get_or_init(|| self.planes.to_vec(&self.gpu, FRAME_PLANES * pixels));
+        FramePlanes {
+            color: &host[..3 * pixels],
+            alpha: &host[3 * pixels..4 * pixels],
+            depth: if last.options.depth { &host[4 * pixels..] } else { &[] },
+        }
+    }
+
+    /// Splats that touched the last frame.
+    pub fn visible(&self) -> usize {
+        self.last.as_ref().map_or(0, |last| last.found[0])
+    }
+
+    /// Intersections of splats and tiles in the last frame.
+    pub fn intersections(&self) -> usize {
+        self.last.as_ref().map_or(0, |last| last.found[1])
+    }
+
+    /// Splat-pixel pairs of the last frame, pixels in whole tiles.
+    pub fn pairs(&self) -> u64 {
+        self.intersections() as u64 * u64::from(TILE * TILE)
+    }
+
+    /// The words of `View`, with further flags.
+    pub(super) fn view_words(&self, last: &Last, flags: u32) -> [u32; VIEW_WORDS] {
+        let Last {
+            view, options, trains, ..
+        } = last;
+        let [count, stride, degree] = self.shape;
+        let mut floats = Vec::with_capacity(28);
+        for (row, t) in view.rotation.iter().zip(view.translation) {
+            floats.extend(row.iter().chain([&t]).map(|v| *v as f32));
+        }
+        floats.extend(view.center().map(|v| v as f32));
+        floats.push(view.near as f32);
+        floats.extend(view.focal.iter().chain(&view.principal).map(|v| *v as f32));
+        floats.extend(view.tangent_limits().as_flattened().iter().map(|v| *v as f32));
+        floats.extend(options.background.iter().chain([&0.0]));
+        let [tiles_x, tiles_y] = last.tiles();
+        let bits = [
+            (options.antialias, flag::ANTIALIAS),
+            (self.filters, flag::FILTER),
+            (true, flag::CLAMP),
+            (*trains, flag::TRAINS),
+        ];
+        let own_flags: u32 = bits.iter().filter(|(on, _)| *on).map(|(_, bit)| bit).sum();
+        // As the twin draws whole chunks.
+        let drawn = options
+            .first
+            .div_ceil(crate::render::CHUNK)
+            .saturating_mul(crate::render::CHUNK)
+            .min(count);
+        let integers = [
+            view.width,
+            view.height,
+            tiles_x,
+            tiles_y,
+            count as u32,
+            stride as u32,
+            options.sh_degree.min(degree as u32),
+            drawn as u32,
+            last.found[0] as u32,
+            last.found[1] as u32,
+            0,
+            0,
+            own_flags | flags,
+            0,
+            0,
+            0,
+        ];
+        let mut words = [0; VIEW_WORDS];
+        for (to, word) in words.iter_mut().zip(floats.iter().map(|v| v.to_bits()).chain(integers)) {
+            *to = word;
+        }
+        words
+    }
+}
+
+/// Words of `View` in `view.wgsl`.
+const VIEW_WORDS: usize = 44;
+
+/// Writes everything but the harmonics, plane by plane, from plane `first` on.
+pub(super) fn write_geometry(gpu: &Gpu, to: &Array, first: usize, splats: &Splats) {
+    let mut at = first * splats.stride();
+    for column in [&splats.means, &splats.quats, &splats.log_scales, &splats.opacity_logits] {
+        to.write(gpu, at, column.as_slice());
+        at += column.as_slice().len();
+    }
+}
+
+/// The reverse of [`write_geometry`].
+pub(super) fn read_geometry(gpu: &Gpu, from: &Array, first: usize, splats: &mut Splats) {
+    let mut at = first * splats.stride();
+    for column in [
+        &mut splats.means,
+        &mut splats.quats,
+        &mut splats.log_scales,
+        &mut splats.opacity_logits,
+    ] {
+        from.read(gpu, at, column.as_mut_slice());
+        at += column.as_slice().len();
+    }
+}

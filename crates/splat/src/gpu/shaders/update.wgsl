@@ -1,0 +1,42 @@
+// How an update uses the gradients.
+struct Update {
+    // Of means, quaternions, ln scales, opacity logits; divided by the first moment's bias correction.
+    rates: vec4f,
+    // Of SH DC and of the others; unused.
+    sh_rates: vec4f,
+    // Decay of the moments, epsilon, inverse root of the second moment's bias correction.
+    adam: vec4f,
+    // Weights of opacity, its square, standard deviations, covariance, as the formulas apply them to a splat.
+    regularizers: vec4f,
+    // Screen pixels to normalised device coordinates; size below which position and shape rest; noise.
+    scales: vec4f,
+    // Splats, stride, SH coefficients trained, planes of SH.
+    splats: vec4u,
+    // Bits of UPDATE_*, seed of the noise, half the span of ln scales by the condition cap (bits of a float), unused.
+    flags: vec4u,
+}
+
+const UPDATE_DENSE: u32 = 1u;
+// Regularisers act on all splats.
+const UPDATE_ALL: u32 = 2u;
+const UPDATE_NOISE: u32 = 4u;
+const UPDATE_CAP: u32 = 8u;
+const UPDATE_FREEZE: u32 = 16u;
+// Statistics: norms of screen gradients, their absolute sums, errors and weights.
+const UPDATE_GRADIENT: u32 = 32u;
+const UPDATE_ABSOLUTE: u32 = 64u;
+const UPDATE_ERROR: u32 = 128u;
+
+// First moments below this are zero.
+const FAINTEST_MOMENT: f32 = 1e-30;
+
+// Parameter, first and second moment after the gradient g.
+fn adam(g: f32, rate: f32, parameter: f32, first: f32, second: f32) -> vec3f {
+    var m = fma(first, update.adam.x, (1.0 - update.adam.x) * g);
+    let v = fma(second, update.adam.y, (1.0 - update.adam.y) * g * g);
+    let p = parameter - rate * m / fma(sqrt(v), update.adam.w, update.adam.z);
+    if abs(m) < FAINTEST_MOMENT {
+        m = 0.0;
+    }
+    return vec3f(p, m, v);
+}

@@ -1,0 +1,421 @@
+//! Splats in training on the GPU: their state, the backward pass and the update.
+
+use super::frame::{FRAME_PLANES, GEOMETRY, GpuRenderer, flag, read_geometry, write_geometry};
+use crate::engine::Update;
+use crate::regularize::Regularized;
+use crate::render::{CHUNK, CameraGradient, Gather, OutputGradient, RenderOptions, basis_at};
+use crate::{SplatGradients, SplatState, Splats, Statistics, ViewParams};
+use irradia_compute::gpu::{Array, GROUP, Gpu, Work};
+use irradia_compute::{DeviceError, Planes};
+use irradia_scene::sh;
+use std::sync::Arc;
+
+/// Gradients of each splat, planes: geometry, colour, screen, gathered.
+const GRADIENTS: usize = GEOMETRY + 7;
+/// Sums of blending of each slot.
+const SUMS: usize = 12;
+/// Threads of a workgroup of `project_vjp.wgsl`, which needs many registers.
+const VJP_GROUP: usize = 64;
+/// Gradients of the camera of each visible splat.
+const CAMERA: usize = 15;
+
+/// Bits of `Update.flags` in `update.wgsl`.
+mod flags {
+    pub const DENSE: u32 = 1;
+    pub const ALL: u32 = 2;
+    pub const NOISE: u32 = 4;
+    pub const CAP: u32 = 8;
+    pub const FREEZE: u32 = 16;
+    pub const GRADIENT: u32 = 32;
+    pub const ABSOLUTE: u32 = 64;
+    pub const ERROR: u32 = 128;
+}
+
+/// Which gradients a frame on the device has.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct DeviceGradient {
+    /// Of alpha.
+    pub alpha: bool,
+    /// Of the accumulated depth.
+    pub depth: bool,
+    /// What else to accumulate per splat, for these statistics.
+    pub gather: Option<Statistics>,
+    /// Whether the camera's gradient is wanted.
+    pub camera: bool,
+}
+
+/// The twin of the CPU's state, renderer and gradients.
+pub(crate) struct GpuTraining {
+    pub renderer: GpuRenderer,
+    moments_geometry: Array,
+    moments_harmonics: Array,
+    statistics: Array,
+    filter: Array,
+    v_frame: Array,
+    sums: Array,
+    v_splats: Array,
+    v_camera: Array,
+    update: Array,
+    camera: Option<CameraGradient>,
+    /// Whether the host's state was edited since it was uploaded.
+    pub stale: bool,
+}
+
+impl GpuTraining {
+    pub fn new(gpu: Arc<Gpu>) -> Result<Self, DeviceError> {
+        let array = |label| Array::zeros(&gpu, label, 0);
+        Ok(Self {
+            moments_geometry: array("moments of geometry"),
+            moments_harmonics: array("moments of harmonics"),
+            statistics: array("statistics"),
+            filter: array("filter variances"),
+            v_frame: array("gradients of the frame"),
+            sums: array("sums of blending"),
+            v_splats: array("gradients of splats"),
+            v_camera: array("gradients of the camera"),
+            update: Array::zeros(&gpu, "update", UPDATE_WORDS),
+            camera: None,
+            stale: true,
+            renderer: GpuRenderer::new(gpu)?,
+        })
+    }
+
+    /// Takes the whole state.
+    pub fn upload(&mut self, state: &SplatState, filters: bool) {
+        let filter = if filters { state.filter.plane(0) } else { &[] };
+        self.renderer.upload(&state.splats, filter);
+        let gpu = &self.renderer.gpu;
+        let stride = state.splats.stride();
+        self.moments_geometry.reserve(gpu, 2 * GEOMETRY * stride);
+        let harmonics = state.splats.sh.as_slice().len();
+        self.moments_harmonics.reserve(gpu, 2 * harmonics);
+        for (i, moment) in state.moments.iter().enumerate() {
+            write_geometry(gpu, &self.moments_geometry, i * GEOMETRY, moment);
+            self.moments_harmonics.write(gpu, i * harmonics, moment.sh.as_slice());
+        }
+        self.statistics.reserve(gpu, state.statistics.as_slice().len());
+        self.statistics.write(gpu, 0, state.statistics.as_slice());
+        self.filter.reserve(gpu, stride);
+        self.filter.write(gpu, 0, state.filter.as_slice());
+        self.v_splats.reserve(gpu, GRADIENTS * stride);
+        self.stale = false;
+    }
+
+    /// The state as it is now.
+    pub fn download(&self) -> SplatState {
+        let gpu = &self.renderer.gpu;
+        let [count, _, degree] = self.renderer.shape;
+        let zeros = || Splats::zeros(count, degree as u32);
+        let mut state = SplatState {
+            splats: zeros(),
+            moments: [zeros(), zeros()],
+            statistics: Planes::zeros(SplatState::STATISTICS, count),
+            filter: Planes::zeros(1, count),
+        };
+        read_geometry(gpu, &self.renderer.geometry, 0, &mut state.splats);
+        self.renderer.harmonics.read(gpu, 0, state.splats.sh.as_mut_slice());
+        let harmonics = state.splats.sh.as_slice().len();
+        for (i, moment) in state.moments.iter_mut().enumerate() {
+            read_geometry(gpu, &self.moments_geometry, i * GEOMETRY, moment);
+            self.moments_harmonics
+                .read(gpu, i * harmonics, moment.sh.as_mut_slice());
+        }
+        self.statistics.read(gpu, 0, state.statistics.as_mut_slice());
+        self.filter.read(gpu, 0, state.filter.as_mut_slice());
+        state
+    }
+
+    pub fn len(&self) -> usize {
+        self.renderer.shape[0]
+    }
+
+    pub fn render(&mut self, view: &ViewParams, options: &RenderOptions) {
+        self.renderer.draw(view, options, true);
+    }
+
+    /// The planes of the last frame, and room for those of its gradients: red, green, blue, alpha, depth, and the error to gather.
+    pub fn frame_and_gradients(&mut self) -> [&Array; 2] {
+        let pixels = self.renderer.last.as_ref().expect("render comes first").pixels();
+        self.v_frame.reserve(&self.renderer.gpu, (FRAME_PLANES + 1) * pixels);
+        [&self.renderer.planes, &self.v_frame]
+    }
+
+    /// The gradients of the last frame, which stay on the device until the update.
+    pub fn backward(&mut self, v_out: &OutputGradient) {
+        let pixels = self.renderer.last.as_ref().expect("render comes first").pixels();
+        assert_eq!(v_out.color.len(), 3 * pixels, "a colour gradient per pixel");
+        let gpu = self.renderer.gpu.clone();
+        let [_, v_frame] = self.frame_and_gradients();
+        v_frame.write(&gpu, 0, v_out.color);
+        if let Some(alpha) = v_out.alpha {
+            v_frame.write(&gpu, 3 * pixels, alpha);
+        }
+        if let Some(depth) = v_out.depth {
+            v_frame.write(&gpu, 4 * pixels, depth);
+        }
+        if let Gather::Error(error) = v_out.gather {
+            v_frame.write(&gpu, 5 * pixels, error);
+        }
+        self.propagate(&DeviceGradient {
+            alpha: v_out.alpha.is_some(),
+            depth: v_out.depth.is_some(),
+            gather: match v_out.gather {
+                Gather::Nothing => None,
+                Gather::Absolute => Some(Statistics::AbsoluteGradient),
+                Gather::Error(_) => Some(Statistics::Error),
+            },
+            camera: v_out.camera,
+        });
+    }
+
+    /// As [`Self::backward`], of the gradients that [`Self::frame_and_gradients`] received.
+    pub fn propagate(&mut self, of: &DeviceGradient) {
+        let renderer = &mut self.renderer;
+        let last = renderer.last.clone().expect("render comes first");
+        assert!(last.trains, "a frame of a training");
+        let gpu = renderer.gpu.clone();
+        let bits = [
+            (of.alpha, flag::ALPHA),
+            (of.depth, flag::DEPTH),
+            (of.gather == Some(Statistics::AbsoluteGradient), flag::GATHER_ABSOLUTE),
+            (of.gather == Some(Statistics::Error), flag::GATHER_ERROR),
+            (of.camera, flag::CAMERA),
+        ];
+        let more = bits.iter().filter(|(on, _)| *on).map(|(_, bit)| bit).sum();
+        let [visible, entries] = last.found;
+        if of.camera {
+            self.v_camera.reserve(&gpu, CAMERA * visible);
+        }
+        renderer.view.write(&gpu, 0, &renderer.view_words(&last, more));
+        self.sums.reserve(&gpu, SUMS * entries);
+
+        let mut work = Work::new(&gpu);
+        work.run(
+            &renderer.kernels.blend_vjp,
+            &[
+                &renderer.view,
+                &renderer.ranges,
+                &renderer.slots,
+                &renderer.splat_of_slot,
+                &renderer.footprints,
+                &renderer.first_segments,
+                &renderer.tile_of_segment,
+                &renderer.reached,
+                &renderer.states,
+                &renderer.planes,
+                &self.v_frame,
+                &self.sums,
+            ],
+            last.segments(),
+        );
+        work.run(
+            &renderer.kernels.project_vjp,
+            &[
+                &renderer.view,
+                &renderer.order,
+                &renderer.firsts,
+                &renderer.touched,
+                &self.sums,
+                &renderer.footprints,
+                &renderer.geometry,
+                &renderer.harmonics,
+                &renderer.filter,
+                &self.v_splats,
+                &renderer.visible,
+                &renderer.found,
+                &self.v_camera,
+            ],
+            visible.div_ceil(VJP_GROUP),
+        );
+        work.submit();
+        self.camera = of.camera.then(|| self.sum_camera(&last.view, visible));
+    }
+
+    /// Sums the camera's gradients in order, in double precision.
+    fn sum_camera(&self, view: &ViewParams, visible: usize) -> CameraGradient {
+        let of_splats: Vec<f32> = self.v_camera.to_vec(&self.renderer.gpu, CAMERA * visible);
+        let sums: [f64; CAMERA] = std::array::from_fn(|plane| {
+            let values = &of_splats[plane * visible..][..visible];
+            values.iter().map(|v| f64::from(*v)).sum()
+        });
+        view.gradient(
+            std::array::from_fn(|i| std::array::from_fn(|j| sums[3 * i + j])),
+            std::array::from_fn(|i| sums[9 + i]),
+            std::array::from_fn(|i| sums[12 + i]),
+        )
+    }
+
+    /// Splats whose gradient was not finite in the backward pass before the last frame.
+    pub fn non_finite(&self) -> usize {
+        self.renderer.last.as_ref().map_or(0, |last| last.non_finite)
+    }
+
+    pub fn camera_gradient(&self) -> Option<CameraGradient> {
+        self.camera
+    }
+
+    /// Reads the gradients of the last backward pass back; those of colours are spread over the harmonics here.
+    pub fn read_gradients(&self, gradients: &mut SplatGradients) {
+        let gpu = &self.renderer.gpu;
+        let [count, stride, degree] = self.renderer.shape;
+        let last = self.renderer.last.as_ref().expect("render comes first");
+        gradients.splats = Splats::zeros(count, degree as u32);
+        read_geometry(gpu, &self.v_splats, 0, &mut gradients.splats);
+        let (mut v_color, mut means) = (vec![0.0f32; 3 * stride], vec![0.0f32; 3 * stride]);
+        self.v_splats.read(gpu, GEOMETRY * stride, &mut v_color);
+        self.renderer.geometry.read(gpu, 0, &mut means);
+        let used = (degree as u32).min(last.options.sh_degree);
+        for i in 0..count {
+            let mean = [0, 1, 2].map(|c| means[c * stride + i]);
+            let basis = basis_at(used, mean, last.view.center());
+            for plane in 0..gradients.splats.sh.count() {
+                let v = basis[plane / 3] * v_color[plane % 3 * stride + i];
+                gradients.splats.sh.set(plane, i, v);
+            }
+        }
+        gradients.screen = Planes::zeros(2, count);
+        gradients.gathered = Planes::zeros(2, count);
+        self.v_splats
+            .read(gpu, (GEOMETRY + 3) * stride, gradients.screen.as_mut_slice());
+        self.v_splats
+            .read(gpu, (GEOMETRY + 5) * stride, gradients.gathered.as_mut_slice());
+        let mut visible = vec![0u32; stride];
+        self.renderer.visible.read(gpu, 0, &mut visible[..count]);
+        gradients.active = visible.iter().map(|visible| *visible as f32).collect();
+        gradients.counts = visible.chunks(CHUNK).map(|chunk| chunk.iter().sum()).collect();
+        gradients.camera = self.camera;
+        let mut found = [0u32; 3];
+        self.renderer.found.read(gpu, 0, &mut found);
+        gradients.non_finite = found[2] as usize;
+    }
+
+    /// The twin of the CPU's update.
+    pub fn update(&mut self, update: &Update) {
+        let Some(last) = self.renderer.last.clone() else { return };
+        let words = self.update_words(update, last.found[0], [last.view.width, last.view.height]);
+        let renderer = &self.renderer;
+        let gpu = &renderer.gpu;
+        self.update.write(gpu, 0, &words);
+        let groups = renderer.shape[0].div_ceil(GROUP as usize);
+        let mut work = Work::new(gpu);
+        work.run(
+            &renderer.kernels.update_harmonics,
+            &[
+                &renderer.view,
+                &self.update,
+                &renderer.visible,
+                &renderer.geometry,
+                &self.v_splats,
+                &renderer.harmonics,
+                &self.moments_harmonics,
+            ],
+            groups,
+        );
+        work.run(
+            &renderer.kernels.update_geometry,
+            &[
+                &self.update,
+                &renderer.visible,
+                &renderer.footprints,
+                &self.v_splats,
+                &renderer.geometry,
+                &self.moments_geometry,
+                &self.statistics,
+            ],
+            groups,
+        );
+        work.submit();
+    }
+
+    fn update_words(&self, update: &Update, visible: usize, size: [u32; 2]) -> [u32; UPDATE_WORDS] {
+        let [count, stride, degree] = self.renderer.shape;
+        let step = &update.optimizer.step;
+        let t = step.step as f64;
+        let correction1 = 1.0 - f64::from(step.beta1).powf(t);
+        let correction2 = 1.0 - f64::from(step.beta2).powf(t);
+        let rate = |rate: f32| (f64::from(rate) / correction1) as f32;
+        let rates = &update.rates;
+        let regularizers = &update.regularizers;
+        let counted = match update.regularized {
+            Regularized::Visible => visible,
+            Regularized::All => count,
+        };
+        let (per_splat, unit) = (1.0 / counted.max(1) as f64, f64::from(update.regularizer_unit));
+        let regularizer = |weight: f32, scale: f64| (f64::from(weight) * per_splat * scale) as f32;
+        let is_regularized = !regularizers.is_zero();
+        let all = is_regularized && update.regularized == Regularized::All;
+        let limit = match update.trained_fraction < 1.0 {
+            true => self.frozen_below(update.trained_fraction),
+            false => None,
+        };
+        let noise = update.noise;
+        let bits = [
+            (update.optimizer.dense, flags::DENSE),
+            (all, flags::ALL),
+            (noise.is_some(), flags::NOISE),
+            (update.condition_cap.is_some(), flags::CAP),
+            (limit.is_some(), flags::FREEZE),
+            (update.statistics == Some(Statistics::Gradient), flags::GRADIENT),
+            (update.statistics == Some(Statistics::AbsoluteGradient), flags::ABSOLUTE),
+            (update.statistics == Some(Statistics::Error), flags::ERROR),
+        ];
+        let floats = [
+            [rates.means, rates.quats, rates.log_scales, rates.opacities].map(rate),
+            [rate(rates.sh_dc), rate(rates.sh_rest), 0.0, 0.0],
+            [step.beta1, step.beta2, step.epsilon, (1.0 / correction2.sqrt()) as f32],
+            [
+                regularizer(regularizers.opacity, 1.0),
+                regularizer(regularizers.opacity_square, 1.0),
+                regularizer(regularizers.scale, 1.0 / (3.0 * unit)),
+                regularizer(regularizers.covariance, unit.powi(-4)),
+            ],
+            [
+                0.5 * size[0] as f32,
+                0.5 * size[1] as f32,
+                limit.unwrap_or(0.0),
+                noise.map_or(0.0, |noise| noise.amount),
+            ],
+        ];
+        let seed = noise.map_or(0, |noise| {
+            (noise.seed as u32) ^ (noise.step as u32).wrapping_mul(0x9e37_79b9)
+        });
+        let span = update.condition_cap.map_or(0.0, |limit| 0.5 * limit.max(1.0).ln());
+        let coefficients = sh::coefficients(update.sh_degree.min(degree as u32));
+        let integers = [
+            count as u32,
+            stride as u32,
+            coefficients as u32,
+            3 * sh::coefficients(degree as u32) as u32,
+            bits.iter().filter(|(on, _)| *on).map(|(_, bit)| bit).sum(),
+            seed,
+            span.to_bits(),
+            0,
+        ];
+        let mut words = [0; UPDATE_WORDS];
+        let floats = floats.as_flattened().iter().map(|v| v.to_bits());
+        for (to, word) in words.iter_mut().zip(floats.chain(integers)) {
+            *to = word;
+        }
+        words
+    }
+
+    /// The size below which splats rest: all but the largest `fraction` of the visible ones, as `regularize::freeze_small` has it.
+    fn frozen_below(&self, fraction: f32) -> Option<f32> {
+        let gpu = &self.renderer.gpu;
+        let [count, stride, _] = self.renderer.shape;
+        let mut scales = vec![0.0f32; 3 * stride];
+        self.renderer.geometry.read(gpu, 7 * stride, &mut scales);
+        let visible: Vec<u32> = self.renderer.visible.to_vec(gpu, count);
+        let size = |i: usize| (0..3).map(|c| scales[c * stride + i]).fold(f32::MIN, f32::max);
+        let mut sizes: Vec<f32> = (0..count).filter(|i| visible[*i] != 0).map(size).collect();
+        let frozen = ((1.0 - fraction) * sizes.len() as f32).round() as usize;
+        if frozen == 0 || sizes.is_empty() {
+            return None;
+        }
+        let at = frozen.min(sizes.len() - 1);
+        Some(*sizes.select_nth_unstable_by(at, f32::total_cmp).1)
+    }
+}
+
+/// Words of `Update` in `update.wgsl`.
+const UPDATE_WORDS: usize = 28;

@@ -1,0 +1,132 @@
+//! What a run puts on its device, and the losses of a step where its frame is: on a GPU, if all of them have a form there.
+
+use crate::field_step::is_field;
+use crate::objective::{ObjectiveValues, Reference};
+use crate::recipe::{Param, Recipe};
+use crate::schedule::StepPlan;
+use crate::trainer::{TrainError, Trainer};
+use irradia_compute::{Device, DeviceError};
+use irradia_splat::Engine;
+
+/// Puts the engine on the device, as far as the recipe's splats can be trained there. Returns what is told of it.
+pub(crate) fn use_device(engine: &mut Engine, device: &Device, recipe: &Recipe) -> Result<Vec<String>, DeviceError> {
+    if device.is_cpu() {
+        return Ok(Vec::new());
+    }
+    let fields = (0..recipe.stage.len()).filter(|stage| is_field(recipe, *stage)).count();
+    let name = &recipe.name;
+    if recipe.residual.is_some() || fields == recipe.stage.len() {
+        return Ok(vec![format!(
+            "recipe {name} trains a field: on the CPU, not on {device}"
+        )]);
+    }
+    engine.use_device(device)?;
+    let of_fields = if fields > 0 {
+        "; its field is trained on the CPU"
+    } else {
+        ""
+    };
+    Ok(vec![format!("splats are trained on {device}{of_fields}")])
+}
+
+impl Trainer {
+    /// Brings the state from its device, before it is written.
+    ///
+    /// # Errors
+    /// When the device has failed: what it returned is not to be saved.
+    pub fn read_back(&self) -> Result<(), TrainError> {
+        self.engine.state();
+        Ok(self.engine.check_device()?)
+    }
+}
+
+/// Evaluates losses on the device of a run.
+pub(crate) struct DeviceLoss {
+    #[cfg(feature = "gpu")]
+    gpu: Option<irradia_measure::gpu::GpuLoss>,
+}
+
+/// Whether a step's losses need the frame on the host: for random backgrounds, or losses that a GPU lacks.
+#[cfg(feature = "gpu")]
+fn needs_host(reference: &Reference, plan: &StepPlan, has_lpips: bool) -> bool {
+    let weighs = |param| plan.value(param) > 0.0;
+    reference.background.is_some()
+        || weighs(Param::CoarseWeight)
+        || weighs(Param::PerceptualWeight) && has_lpips
+        || weighs(Param::AlphaWeight) && reference.photo.alpha.is_some()
+        || weighs(Param::SmoothWeight)
+        || plan.edge_share > 0.0
+}
+
+#[cfg(feature = "gpu")]
+impl DeviceLoss {
+    /// For `device`.
+    pub fn new(device: &Device) -> Result<Self, DeviceError> {
+        let gpu = match device {
+            Device::Cpu => None,
+            Device::Gpu(gpu) => Some(irradia_measure::gpu::GpuLoss::new(gpu.clone())?),
+        };
+        Ok(Self { gpu })
+    }
+
+    /// The losses of the last frame, and its backward pass; `None` if they need the host.
+    pub fn step(
+        &mut self,
+        engine: &mut Engine,
+        reference: &Reference,
+        plan: &StepPlan,
+        camera: bool,
+        has_lpips: bool,
+    ) -> Option<ObjectiveValues> {
+        use irradia_measure::gpu::{Beside, DeviceFrame};
+        use irradia_measure::{LossWeights, Target, Truth};
+        use irradia_splat::{DeviceGradient, Statistics};
+
+        let loss = self.gpu.as_mut().filter(|_| !needs_host(reference, plan, has_lpips))?;
+        let [planes, v_planes] = engine.device_frame()?;
+        let photo = reference.photo;
+        let target = Target {
+            width: photo.width as usize,
+            height: photo.height as usize,
+            truth: Truth::Rgb8(&photo.rgb),
+            mask: photo.mask.as_deref(),
+        };
+        let weights = LossWeights {
+            l1: plan.value(Param::PhotoWeight),
+            ssim: plan.value(Param::SsimWeight),
+            mse: plan.value(Param::MseWeight),
+        };
+        let depth_weight = plan.value(Param::DepthWeight);
+        let beside = Beside {
+            depths: reference.depths,
+            depth_weight,
+            error: plan.gathers == Some(Statistics::Error),
+        };
+        let values = loss.evaluate(&DeviceFrame { planes, v_planes }, &target, &weights, &beside);
+        let has_depth = !reference.depths.is_empty();
+        engine.backward_on_device(&DeviceGradient {
+            alpha: has_depth,
+            depth: has_depth,
+            gather: plan.gathers.filter(|what| *what != Statistics::Gradient),
+            camera,
+        });
+        Some(ObjectiveValues {
+            total: values.photometric.total + f64::from(depth_weight) * values.depth,
+            l1: values.photometric.l1,
+            mse: values.photometric.mse,
+        })
+    }
+}
+
+#[cfg(not(feature = "gpu"))]
+impl DeviceLoss {
+    /// For the CPU.
+    pub fn new(_: &Device) -> Result<Self, DeviceError> {
+        Ok(Self {})
+    }
+
+    /// Losses always need the host.
+    pub fn step(&mut self, _: &mut Engine, _: &Reference, _: &StepPlan, _: bool, _: bool) -> Option<ObjectiveValues> {
+        None
+    }
+}

@@ -15,13 +15,16 @@ const FOLDERS: [&str; 3] = ["", "images", "../images"];
 /// Numbers behind a photograph's name.
 const NUMBERS: usize = 10;
 
+/// A point: position, sRGB, and the indices of the photographs that see it.
+pub type NvmPoint = ([f64; 3], [u8; 3], Vec<usize>);
+
 /// A model: photographs, and points with the photographs that see them.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct NvmModel {
     /// Photographs.
     pub images: Vec<NvmImage>,
-    /// Position, sRGB, indices into [`Self::images`].
-    pub points: Vec<([f64; 3], [u8; 3], Vec<usize>)>,
+    /// Points that [`Self::images`] see.
+    pub points: Vec<NvmPoint>,
 }
 
 /// A photograph.
@@ -140,7 +143,7 @@ fn image(line: &str) -> Result<NvmImage, Malformed> {
     })
 }
 
-fn point(line: &str) -> Result<([f64; 3], [u8; 3], Vec<usize>), Malformed> {
+fn point(line: &str) -> Result<NvmPoint, Malformed> {
     let mut tokens = Tokens::new(line);
     let position = tokens.numbers("a point")?;
     let color = tokens.numbers::<3>("a colour")?.map(|v| v as u8);

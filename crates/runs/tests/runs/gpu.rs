@@ -130,7 +130,7 @@ fn a_gpu_that_is_not_there_is_a_mistake_of_the_request() {
         line.contains("device no such card") && line.contains("irradia devices"),
         "{line}"
     );
-    assert!(matches!(Device::open(&DeviceChoice::Auto), Ok(_)), "auto never fails");
+    assert!(Device::open(&DeviceChoice::Auto).is_ok(), "auto never fails");
 }
 
 #[test]

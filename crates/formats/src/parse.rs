@@ -1,10 +1,18 @@
 //! Every parser as a function of bytes: for fuzzing and the hostile tests, and for data already in memory. None of them
 //! panics on any input or allocates more than a small multiple of the input's size.
 
+pub use crate::dataset::bundler::parse_bundle as bundle;
 pub use crate::dataset::colmap::{
     ColmapCamera, ColmapImage, ColmapPoint, binary as colmap_binary, text as colmap_text,
 };
 pub use crate::dataset::llff::{LlffPose, parse_poses_bounds as poses_bounds};
+pub use crate::dataset::nerfies::{parse_nerfies_camera as nerfies_camera, parse_nerfies_dataset as nerfies_dataset};
+pub use crate::dataset::nvm::parse_nvm as nvm;
+pub use crate::dataset::opensfm::parse_opensfm as opensfm;
+pub use crate::dataset::phone::{parse_polycam as polycam, parse_record3d as record3d};
+pub use crate::dataset::realitycapture::{
+    parse_realitycapture_csv as realitycapture_csv, parse_realitycapture_xmp as realitycapture_xmp,
+};
 pub use crate::dataset::transforms::{CameraKeys, Frame, Transforms, parse_transforms as transforms};
 pub use crate::photos::parse_camera_tags as camera_tags;
 pub use crate::points_ply::parse_points_ply as points_ply;
@@ -30,4 +38,12 @@ pub fn gltf(text: &[u8]) -> Result<irradia_scene::GaussianCloud, crate::Malforme
 /// When the bytes are neither, or a tensor is truncated or not in 32-bit floats.
 pub fn tensors(bytes: &[u8]) -> Result<std::collections::BTreeMap<String, crate::Tensor>, crate::Malformed> {
     crate::tensors::parse(bytes, &|_| true)
+}
+
+/// The number of cameras in an XML by Metashape.
+///
+/// # Errors
+/// When it is not XML, has no cameras, or a lens that is not supported.
+pub fn metashape(bytes: &[u8]) -> Result<usize, crate::Malformed> {
+    crate::dataset::metashape::parse_metashape(bytes).map(|cameras| cameras.len())
 }

@@ -159,6 +159,54 @@ fn cases() -> Vec<Case> {
             |b| parse::camera_tags(b, [40, 30]).model.is_some(),
         ),
         case("splats", splat_ply(), |b| parse::splat_ply(b).is_ok()),
+        case(
+            "reconstruction.json",
+            br#"[{"cameras": {"c": {"projection_type": "brown", "width": 9, "height": 9, "focal": 1}}, "shots": {"a": {"rotation":
+            [1, 2, 3], "translation": [1, 2, 3], "camera": "c"}}, "points": {"1": {"color": [1, 2, 3], "coordinates": [1, 2, 3]}}}]"#
+                .into(),
+            |b| parse::opensfm(b).is_ok(),
+        ),
+        case(
+            "bundle.txt",
+            b"# Bundle file v0.3\n1 1\n500 0 0\n1 0 0\n0 1 0\n0 0 1\n1 2 3\n1 2 3\n255 0 1\n1 0 17 1.5 -2.5\n".into(),
+            |b| parse::bundle(b).is_ok(),
+        ),
+        case(
+            "nvm.txt",
+            b"NVM_V3 \n\n1\na b.png 500 1 0 0 0 1 2 3 0.1 0\n\n1\n1 2 3 255 0 1 1 0 17 1.5 -2.5\n0\n".into(),
+            |b| parse::nvm(b).is_ok(),
+        ),
+        case(
+            "cameras.xml",
+            br#"<?xml version="1.0"?><document><chunk><sensors><sensor id="0" type="frame"><resolution width="9" height="9"/>
+            <calibration><f>9</f><b1>0.1</b1></calibration></sensor></sensors><cameras><camera id="0" sensor_id="0" label="a">
+            <transform>1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1</transform></camera></cameras><transform><rotation>1 0 0 0 1 0 0 0 1</rotation>
+            <translation>1 2 3</translation></transform></chunk></document>"#
+                .into(),
+            |b| parse::metashape(b).is_ok_and(|cameras| cameras == 1),
+        ),
+        case(
+            "cameras.csv.txt",
+            b"#name,x,y,alt,heading,pitch,roll,f,px,py,k1\na.png,1,2,3,4,5,6,35,0,0,0.1\n".into(),
+            |b| parse::realitycapture_csv(b).is_ok(),
+        ),
+        case(
+            "a.xmp",
+            br#"<x><rdf:Description xcr:FocalLength35mm="35" xcr:Position="1 2 3" xcr:Rotation="1 0 0 0 1 0 0 0 1"/></x>"#.into(),
+            |b| parse::realitycapture_xmp(b).is_ok(),
+        ),
+        case(
+            "metadata.json",
+            br#"{"w": 9, "h": 9, "K": [9, 0, 0, 0, 9, 0, 4, 4, 1], "poses": [[0, 0, 0, 1, 1, 2, 3]]}"#.into(),
+            |b| parse::record3d(b).is_ok(),
+        ),
+        case(
+            "camera.json",
+            br#"{"orientation": [[1, 0, 0], [0, 1, 0], [0, 0, 1]], "position": [1, 2, 3], "focal_length": 9,
+            "principal_point": [4, 4], "image_size": [9, 9]}"#
+                .into(),
+            |b| parse::nerfies_camera(b).is_ok(),
+        ),
     ]
 }
 

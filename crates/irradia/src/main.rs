@@ -26,6 +26,8 @@ struct Cli {
 enum Command {
     /// Ray trace a scene, train on it, evaluate and report: no data needed
     Demo(command::demo::Args),
+    /// Say what is wrong with photographs before they are posed: blur, exposure, gaps, ..
+    Doctor(command::doctor::Args),
     /// Find the poses of photographs, or of the frames of a film
     Pose(command::pose::Args),
     /// Train a scene from photographs, or a film
@@ -73,6 +75,7 @@ impl std::error::Error for Usage {}
 fn main() -> ExitCode {
     let result = match Cli::parse().command {
         Command::Demo(args) => command::demo::run(&args),
+        Command::Doctor(args) => command::doctor::run(&args),
         Command::Pose(args) => command::pose::run(&args),
         Command::Train(args) => command::train::run(&args),
         Command::Compare(args) => command::compare::run(&args),

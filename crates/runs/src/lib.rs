@@ -81,12 +81,15 @@ pub use journal::logged_errors;
 pub use levels::{LEVELS, Level, level_file, read_levels, write_levels};
 pub use orbit::Outlook;
 pub use path::{CameraPath, Film, PathKey};
-pub use pose::{CameraReport, LeftOutPhoto, PoseInput, PoseProgress, PoseReport, StageReport, is_film, pose};
+pub use pose::{
+    CameraReport, DoctorInput, DoctorReport, Finding, LeftOutPhoto, PoseInput, PoseProgress, PoseReport, StageReport,
+    doctor, is_film, pose,
+};
 pub use protocol::Protocol;
 pub use provenance::{data_fingerprint, program_fingerprint};
 pub use request::{DEFAULT_RECIPE, HOW_TO_GET_LPIPS, Reading, TrainInput, TrainRequest, read_recipe};
 pub use results::write_image;
-pub use run::{Finished, Run};
+pub use run::{Finished, Run, open_device};
 pub use scene_file::{Scene, scene_of};
 pub use snapshot::{Snapshot, Snapshots};
 pub use synth_files::{SynthSummary, write_synth_dataset};

@@ -24,7 +24,7 @@ pub const DEFAULT_RECIPE: &str = "fast";
 /// How to read a dataset, not validated.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Reading {
-    /// `colmap`, `nerfstudio`, `blender` or `llff`; detected from the folder if `None`.
+    /// The name of a [`DatasetFormat`], such as `colmap`; detected from the folder if `None`.
     #[serde(default)]
     pub format: Option<String>,
     /// The images' sides are divided by this; 1 or more.
@@ -37,6 +37,9 @@ pub struct Reading {
     /// `None`: those that the dataset itself holds out, every 8th if it does not define any.
     #[serde(default)]
     pub holdout: Option<String>,
+    /// The folder of the photographs, if it is not where the layout has it.
+    #[serde(default)]
+    pub images: Option<PathBuf>,
 }
 
 impl Default for Reading {
@@ -47,6 +50,7 @@ impl Default for Reading {
             downscale: 1.0,
             max_side: Some(DEFAULT_MAX_SIDE),
             holdout: None,
+            images: None,
         }
     }
 }
@@ -82,6 +86,7 @@ impl Reading {
             downscale: self.downscale,
             max_side,
             holdout: self.holdout()?,
+            images: self.images.clone(),
         })
     }
 
@@ -99,8 +104,9 @@ impl Reading {
         }
     }
 
-    /// Makes the path in `holdout` absolute.
+    /// Makes the paths in `holdout` and `images` absolute.
     fn with_absolute_paths(mut self) -> Self {
+        self.images = self.images.map(|folder| std::path::absolute(&folder).unwrap_or(folder));
         if let Ok(Holdout::Listed(file)) = self.holdout() {
             self.holdout = Some(std::path::absolute(&file).unwrap_or(file).display().to_string());
         }

@@ -267,6 +267,7 @@ impl Run {
 
     fn save_unfinished(&mut self) -> Result<(), RunError> {
         if !self.trainer.finished() && self.trainer.clock.step > 0 {
+            self.trainer.read_back()?;
             self.journal.save_now(&self.trainer)?;
         }
         Ok(())
@@ -286,7 +287,10 @@ fn first_trainer(request: &TrainRequest, dataset: Arc<Dataset>, options: TrainOp
 }
 
 /// Opens the device of this name; see [`TrainInput::device`](crate::TrainInput::device).
-fn open_device(name: &str) -> Result<Device, RunError> {
+///
+/// # Errors
+/// When there is none of this name, or its driver refuses.
+pub fn open_device(name: &str) -> Result<Device, RunError> {
     let Ok(choice) = name.parse::<DeviceChoice>();
     Device::open(&choice).map_err(|error| RunError::setting("device", name, error.to_string()))
 }

@@ -6,6 +6,7 @@
 #![forbid(unsafe_code)]
 
 pub mod adjust;
+pub mod doctor;
 pub mod features;
 pub mod geometry;
 mod keypoints;

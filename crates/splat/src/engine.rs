@@ -206,36 +206,41 @@ impl Engine {
 
     /// Renders a frame.
     pub fn render(&mut self, placement: Placement, options: &RenderOptions) {
+        if placement.moved.is_some() {
+            self.use_cpu();
+        }
+        self.moved = placement.moved;
+        self.render_view(&ViewParams::new(&placement.camera), options);
+    }
+
+    /// Renders a frame of the splats that were placed last, for any pinhole camera.
+    pub fn render_view(&mut self, view: &ViewParams, options: &RenderOptions) {
         #[cfg(feature = "gpu")]
-        if placement.moved.is_none()
-            && let Some(gpu) = &mut self.gpu
-        {
+        if let Some(gpu) = &mut self.gpu {
             if gpu.stale {
                 let state = self.state.get().expect("what was edited is here");
                 gpu.upload(state, self.filters);
             }
-            gpu.render(&ViewParams::new(&placement.camera), options);
+            gpu.render(view, options);
             return;
         }
-        self.use_cpu();
-        self.place(placement.moved);
+        self.update_bounds();
         let (splats, bounds) = placed(known(&self.state), self.moved.as_ref(), &self.bounds);
-        self.renderer
-            .render_within(splats, bounds, &ViewParams::new(&placement.camera), options);
+        self.renderer.render_within(splats, bounds, view, options);
     }
 
     /// The first half of a frame with added colours; [`Self::composite`] is the second.
     pub fn project(&mut self, placement: Placement, options: &RenderOptions) {
         self.use_cpu();
-        self.place(placement.moved);
+        self.moved = placement.moved;
+        self.update_bounds();
         let (splats, bounds) = placed(known(&self.state), self.moved.as_ref(), &self.bounds);
         self.renderer
             .project_within(splats, bounds, &ViewParams::new(&placement.camera), options);
     }
 
-    /// Takes the splats of a frame, and brings the state's bounds up to date if those are not its own.
-    fn place(&mut self, moved: Option<Splats>) {
-        self.moved = moved;
+    /// Brings the bounds of the state's splats up to date, if those are drawn.
+    fn update_bounds(&mut self) {
         if self.moved.is_none() && std::mem::take(&mut self.edited) {
             let renderer = &self.renderer;
             self.bounds
@@ -333,6 +338,15 @@ impl Engine {
             return gpu.camera_gradient();
         }
         self.gradients.camera
+    }
+
+    /// The splats' gradients of the last backward pass, read back from a GPU: for tests and tools.
+    pub fn read_gradients(&mut self) -> &SplatGradients {
+        #[cfg(feature = "gpu")]
+        if let Some(gpu) = &self.gpu {
+            gpu.read_gradients(&mut self.gradients);
+        }
+        &self.gradients
     }
 
     /// The splats' gradients of the last backward pass: for a socket that moved the splats, to propagate further back.

@@ -4,6 +4,7 @@ use crate::field_step::is_field;
 use crate::objective::{ObjectiveValues, Reference};
 use crate::recipe::{Param, Recipe};
 use crate::schedule::StepPlan;
+use crate::trainer::{TrainError, Trainer};
 use irradia_compute::{Device, DeviceError};
 use irradia_splat::Engine;
 
@@ -28,13 +29,25 @@ pub(crate) fn use_device(engine: &mut Engine, device: &Device, recipe: &Recipe) 
     Ok(vec![format!("splats are trained on {device}{of_fields}")])
 }
 
+impl Trainer {
+    /// Brings the state from its device, before it is written.
+    ///
+    /// # Errors
+    /// When the device has failed: what it returned is not to be saved.
+    pub fn read_back(&self) -> Result<(), TrainError> {
+        self.engine.state();
+        Ok(self.engine.check_device()?)
+    }
+}
+
 /// Evaluates losses on the device of a run.
 pub(crate) struct DeviceLoss {
     #[cfg(feature = "gpu")]
     gpu: Option<irradia_measure::gpu::GpuLoss>,
 }
 
-/// A step's losses need the frame on the host: it has random backgrounds, developed frames, or losses that a GPU lacks.
+/// Whether a step's losses need the frame on the host: for random backgrounds, or losses that a GPU lacks.
+#[cfg(feature = "gpu")]
 fn needs_host(reference: &Reference, plan: &StepPlan, has_lpips: bool) -> bool {
     let weighs = |param| plan.value(param) > 0.0;
     reference.background.is_some()

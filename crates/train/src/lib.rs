@@ -21,6 +21,7 @@ mod misfits;
 pub mod model;
 mod objective;
 pub mod paces;
+pub mod painter;
 mod photos;
 pub mod recipe;
 pub mod report;

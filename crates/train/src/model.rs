@@ -3,7 +3,7 @@
 use crate::socket::added_colors;
 use irradia_field::{Field, render_view};
 use irradia_scene::{Camera, Image};
-use irradia_splat::{Renderer, Splats, ViewParams};
+use irradia_splat::{FramePlanes, Renderer, Splats, ViewParams};
 use std::borrow::Cow;
 
 /// A scene that can be rendered.
@@ -54,6 +54,25 @@ pub struct Frame {
     pub depth: Vec<f32>,
 }
 
+impl Frame {
+    /// From the planes of a renderer.
+    pub(crate) fn of_planes(planes: FramePlanes, camera: &Camera) -> Self {
+        Self {
+            color: interleaved(planes.color, camera),
+            alpha: planes.alpha.to_vec(),
+            depth: planes.depth.to_vec(),
+        }
+    }
+}
+
+/// `[H, W, 3]` from `[3, H, W]`.
+fn interleaved(planes: &[f32], camera: &Camera) -> Image {
+    let (width, height) = (camera.intrinsics.width, camera.intrinsics.height);
+    let pixels = width as usize * height as usize;
+    let data = (0..3 * pixels).map(|i| planes[(i % 3) * pixels + i / 3]).collect();
+    Image::new(width, height, 3, data)
+}
+
 impl<'a> Model<'a> {
     /// A scene of Gaussians alone.
     pub fn of_splats(splats: impl Into<Cow<'a, Splats>>) -> Self {
@@ -65,24 +84,10 @@ impl<'a> Model<'a> {
 
     /// Renders the view of `camera`; `renderer` reuses its buffers from frame to frame.
     pub fn render(&self, renderer: &mut Renderer, camera: &Camera, options: &RenderOptions) -> Frame {
-        let (width, height) = (camera.intrinsics.width, camera.intrinsics.height);
-        let pixels = width as usize * height as usize;
-        let image = |planes: &[f32]| {
-            let data = (0..3 * pixels).map(|i| planes[(i % 3) * pixels + i / 3]).collect();
-            Image::new(width, height, 3, data)
-        };
         match self {
             Model::Splats { splats, residual } => {
                 render_splats(splats, residual.as_deref(), renderer, camera, options);
-                Frame {
-                    color: image(renderer.color()),
-                    alpha: renderer.alpha().to_vec(),
-                    depth: if options.depth {
-                        renderer.depth().to_vec()
-                    } else {
-                        Vec::new()
-                    },
-                }
+                Frame::of_planes(renderer.frame(), camera)
             }
             Model::Field(field) => {
                 let options = irradia_field::RenderOptions {
@@ -93,7 +98,7 @@ impl<'a> Model<'a> {
                 let view = render_view(field, camera, &options);
                 let depth = view.depth.iter().zip(&view.alpha).map(|(depth, alpha)| depth * alpha);
                 Frame {
-                    color: image(&view.color),
+                    color: interleaved(&view.color, camera),
                     depth: depth.collect(),
                     alpha: view.alpha,
                 }

@@ -64,9 +64,9 @@ pub fn run(
         parameters: trainer.parameters(),
         views: trainer.dataset.train.len(),
     }];
+    let decisions = std::mem::take(&mut trainer.decisions);
+    events.extend(decisions.into_iter().map(|message| Event::Decided { message }));
     if trainer.clock.step == 0 {
-        let decisions = std::mem::take(&mut trainer.decisions);
-        events.extend(decisions.into_iter().map(|message| Event::Decided { message }));
         events.extend(trainer.warnings().into_iter().map(|message| Event::Warned { message }));
         events.push(Event::StageEntered {
             stage: trainer.stage_name().to_owned(),
@@ -126,6 +126,7 @@ pub fn run(
         trainer.times.wall = before + began.elapsed().as_secs_f64();
         if due.checkpoint || requests.save || requests.stop {
             let started = Instant::now();
+            trainer.read_back()?;
             save(trainer, &mut events, observers);
             trainer.times.saving += started.elapsed().as_secs_f64();
         }
@@ -136,6 +137,7 @@ pub fn run(
         }
         trainer.times.wall = before + began.elapsed().as_secs_f64();
     }
+    trainer.read_back()?;
     events.extend(fewer_than_at_first(trainer));
     let stopped = if requests.stop { "stopped" } else { "recipe complete" };
     let reason = reason.unwrap_or(stopped).to_owned();

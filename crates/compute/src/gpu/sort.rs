@@ -3,6 +3,8 @@ use crate::shaders::SORT;
 
 /// Keys of a block.
 const BLOCK: usize = 4096;
+/// Counts of digits that one workgroup sums up.
+const FEW: usize = 4096;
 /// Bits of a digit.
 const DIGIT: u32 = 4;
 
@@ -48,8 +50,9 @@ impl Sort {
     pub fn run(&mut self, work: &mut Work, keys: &Array, values: &Array, count: usize, bits: u32) {
         let (gpu, blocks) = (work.gpu(), count.div_ceil(BLOCK));
         let digits = 1 << DIGIT;
-        self.counts.reserve(gpu, digits * blocks);
-        self.starts.reserve(gpu, digits * blocks);
+        let counts = digits * blocks;
+        self.counts.reserve(gpu, counts + 1);
+        self.starts.reserve(gpu, counts);
         for other in &mut self.other {
             other.reserve(gpu, count);
         }
@@ -64,13 +67,17 @@ impl Sort {
                 _ => ([other_keys, other_values], [keys, values]),
             };
             work.run(count_digits, &[&pass.params, from[0], &self.counts], blocks);
-            self.scan
-                .run(work, &pass.scan, &self.counts, &self.starts, digits * blocks);
-            work.run(
-                scatter,
-                &[&pass.params, from[0], from[1], &self.starts, to[0], to[1]],
-                blocks,
-            );
+            let starts = match counts <= FEW {
+                true => {
+                    self.scan.run_in_place(work, &pass.scan, &self.counts, counts);
+                    &self.counts
+                }
+                false => {
+                    self.scan.run(work, &pass.scan, &self.counts, &self.starts, counts);
+                    &self.starts
+                }
+            };
+            work.run(scatter, &[&pass.params, from[0], from[1], starts, to[0], to[1]], blocks);
         }
     }
 }

@@ -1,8 +1,9 @@
 //! What a dataset's files declare, before any image is opened: the common form into which all layouts are read.
 
+use super::files::relative_name;
 use glam::{DMat3, DQuat, DVec3};
 use irradia_scene::{Intrinsics, Lens, PointCloud, Pose, Similarity};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 pub(super) struct Declared {
     /// Display name: `COLMAP (binary)`.
@@ -34,6 +35,31 @@ pub(super) struct DeclaredView {
     pub points_seen: Vec<u32>,
     /// `None` when the dataset does not declare it.
     pub split: Option<Split>,
+}
+
+impl DeclaredView {
+    /// A view below `root` of which only these are declared; `name` is used where there is no image.
+    pub fn posed(
+        root: &Path,
+        name: &str,
+        image: Option<PathBuf>,
+        pose: Option<DeclaredPose>,
+        camera: DeclaredCamera,
+    ) -> Self {
+        let name = relative_name(root, image.as_deref().unwrap_or(Path::new(name)));
+        Self {
+            // Photographs may be beside the folder of the file.
+            name: name.trim_start_matches("../").to_owned(),
+            image,
+            mask: None,
+            pose,
+            camera,
+            depth_bounds: None,
+            time: None,
+            points_seen: Vec::new(),
+            split: None,
+        }
+    }
 }
 
 /// A pose in the files' own coordinates, which may be too large for `f32`.

@@ -1,6 +1,7 @@
 //! Finding image files: by the names that datasets use, in their folders of full-size and smaller images.
 
 use crate::FormatError;
+use std::io::Read;
 use std::path::{Component, Path, PathBuf};
 
 const EXTENSIONS: [&str; 6] = ["png", "jpg", "jpeg", "PNG", "JPG", "JPEG"];
@@ -105,4 +106,38 @@ pub(super) fn choose_image_folder(root: &Path, downscale: f32) -> Option<ImageFo
         downscale,
         warning: Some(warning),
     })
+}
+
+/// The photograph `name` of a dataset in one of `folders` below `root`, with its folders or without.
+pub(super) fn locate_image(root: &Path, folders: &[&str], name: &str) -> Option<PathBuf> {
+    let file = Path::new(name).file_name()?;
+    let below = |name: &Path| {
+        folders
+            .iter()
+            .find_map(|folder| find_image(&root.join(folder).join(name)))
+    };
+    below(Path::new(name)).or_else(|| below(Path::new(file)))
+}
+
+/// `path` itself if it is a file of that name, or the file `name` in it.
+pub(super) fn named_or_in(path: &Path, name: &str) -> Option<PathBuf> {
+    let is_it = path.is_file() && path.file_name() == Path::new(name).file_name();
+    let file = if is_it { path.to_owned() } else { path.join(name) };
+    file.is_file().then_some(file)
+}
+
+/// `path` itself if it is a file that `keep` accepts, or the first such file in it.
+pub(super) fn first_file(path: &Path, keep: impl Fn(&Path) -> bool) -> Option<PathBuf> {
+    if path.is_file() {
+        return keep(path).then(|| path.to_owned());
+    }
+    list_files(path, keep).ok()?.into_iter().next()
+}
+
+/// Whether `accepts` the first bytes of a file.
+pub(super) fn begins_with(file: &Path, accepts: impl Fn(&[u8]) -> bool) -> bool {
+    const START: u64 = 4096;
+    let mut start = Vec::new();
+    let read = std::fs::File::open(file).and_then(|file| file.take(START).read_to_end(&mut start));
+    read.is_ok() && accepts(&start)
 }

@@ -5,16 +5,26 @@
 
 mod assemble;
 mod blender;
+pub(crate) mod bundler;
 pub(crate) mod colmap;
 mod declared;
 mod files;
+mod images;
 pub(crate) mod llff;
 mod masks;
+pub(crate) mod metashape;
+pub(crate) mod nerfies;
 mod nerfstudio;
 mod npy;
+pub(crate) mod nvm;
+pub(crate) mod opensfm;
+pub(crate) mod phone;
+pub(crate) mod realitycapture;
 mod split;
+mod tokens;
 pub(crate) mod transforms;
 mod world;
+pub(crate) mod xml;
 
 use crate::FormatError;
 pub(crate) use assemble::{oriented_size, turned_as_stored};
@@ -24,13 +34,13 @@ pub(crate) use files::{is_image_name, list_files};
 use irradia_scene::Dataset;
 pub use split::Holdout;
 use std::fmt;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
 /// The layouts of datasets.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum DatasetFormat {
-    /// `cameras`, `images` and `points3D` as `.bin` or `.txt` in `sparse/0`, `sparse` or the folder itself.
+    /// `cameras`, `images` and `points3D` as `.bin` or `.txt` in `sparse/N`, `sparse` or the folder itself.
     Colmap,
     /// nerfstudio's and instant-ngp's `transforms.json`.
     Nerfstudio,
@@ -38,6 +48,22 @@ pub enum DatasetFormat {
     Blender,
     /// `poses_bounds.npy`.
     Llff,
+    /// `dataset.json` and a folder `camera`: Nerfies, HyperNeRF.
+    Nerfies,
+    /// `reconstruction.json` of OpenSfM and OpenDroneMap.
+    Opensfm,
+    /// Cameras exported by Metashape as XML.
+    Metashape,
+    /// A CSV of cameras, or an XMP beside each photograph, by RealityCapture.
+    RealityCapture,
+    /// `keyframes` of Polycam.
+    Polycam,
+    /// `metadata.json` and a folder `rgb`.
+    Record3d,
+    /// VisualSfM's `.nvm`.
+    Nvm,
+    /// `bundle.out` with a list of photographs.
+    Bundler,
 }
 
 impl DatasetFormat {
@@ -45,7 +71,20 @@ impl DatasetFormat {
     ///
     /// Later preparation takes precedence: `transforms.json` is made from a COLMAP model that may be beside it, and
     /// `poses_bounds.npy` contains less than the COLMAP model it is made from.
-    pub const ALL: [Self; 4] = [Self::Blender, Self::Nerfstudio, Self::Colmap, Self::Llff];
+    pub const ALL: [Self; 12] = [
+        Self::Blender,
+        Self::Nerfstudio,
+        Self::Nerfies,
+        Self::Colmap,
+        Self::Opensfm,
+        Self::Metashape,
+        Self::RealityCapture,
+        Self::Polycam,
+        Self::Record3d,
+        Self::Nvm,
+        Self::Bundler,
+        Self::Llff,
+    ];
 
     /// The name used on the command line.
     pub fn name(self) -> &'static str {
@@ -54,6 +93,14 @@ impl DatasetFormat {
             Self::Nerfstudio => "nerfstudio",
             Self::Blender => "blender",
             Self::Llff => "llff",
+            Self::Nerfies => "nerfies",
+            Self::Opensfm => "opensfm",
+            Self::Metashape => "metashape",
+            Self::RealityCapture => "realitycapture",
+            Self::Polycam => "polycam",
+            Self::Record3d => "record3d",
+            Self::Nvm => "nvm",
+            Self::Bundler => "bundler",
         }
     }
 
@@ -63,6 +110,14 @@ impl DatasetFormat {
             Self::Nerfstudio => "transforms.json (nerfstudio, instant-ngp)",
             Self::Blender => "transforms_train.json (Blender)",
             Self::Llff => "poses_bounds.npy (LLFF)",
+            Self::Nerfies => "dataset.json and a folder camera (Nerfies)",
+            Self::Opensfm => "reconstruction.json (OpenSfM)",
+            Self::Metashape => "an .xml of cameras (Metashape)",
+            Self::RealityCapture => "a .csv of cameras or .xmp files (RealityCapture)",
+            Self::Polycam => "keyframes (Polycam)",
+            Self::Record3d => "metadata.json and a folder rgb (Record3D)",
+            Self::Nvm => "an .nvm file (VisualSfM)",
+            Self::Bundler => "bundle.out and list.txt (Bundler)",
         }
     }
 
@@ -72,6 +127,14 @@ impl DatasetFormat {
             Self::Nerfstudio => nerfstudio::find(path).is_some(),
             Self::Blender => path.join("transforms_train.json").is_file(),
             Self::Llff => path.join("poses_bounds.npy").is_file(),
+            Self::Nerfies => nerfies::is_in(path),
+            Self::Opensfm => opensfm::find(path).is_some(),
+            Self::Metashape => metashape::find(path).is_some(),
+            Self::RealityCapture => realitycapture::find(path).is_some(),
+            Self::Polycam => phone::find_polycam(path).is_some(),
+            Self::Record3d => phone::find_record3d(path).is_some(),
+            Self::Nvm => nvm::find(path).is_some(),
+            Self::Bundler => bundler::find(path).is_some(),
         }
     }
 
@@ -113,6 +176,8 @@ pub struct DatasetOptions {
     pub max_side: Option<u32>,
     /// Which views are held out.
     pub holdout: Holdout,
+    /// The folder of the photographs, if it is not where the layout has it.
+    pub images: Option<PathBuf>,
 }
 
 /// The default limit on the longer side, in pixels, to which larger photographs are downscaled, as by the authors' code of 3DGS
@@ -126,6 +191,7 @@ impl Default for DatasetOptions {
             downscale: 1.0,
             max_side: None,
             holdout: Holdout::AsDeclared,
+            images: None,
         }
     }
 }
@@ -185,11 +251,22 @@ pub fn read_dataset(path: &Path, options: &DatasetOptions) -> Result<Dataset, Fo
                 .join("; "),
         });
     };
-    let declared: Declared = match format {
+    let mut declared: Declared = match format {
         DatasetFormat::Colmap => colmap::read(path, options.downscale)?,
         DatasetFormat::Nerfstudio => nerfstudio::read(path, options.downscale)?,
         DatasetFormat::Blender => blender::read(path, options.downscale)?,
         DatasetFormat::Llff => llff::read(path, options.downscale)?,
+        DatasetFormat::Nerfies => nerfies::read(path, options.downscale)?,
+        DatasetFormat::Opensfm => opensfm::read(path, options.downscale)?,
+        DatasetFormat::Metashape => metashape::read(path, options.downscale)?,
+        DatasetFormat::RealityCapture => realitycapture::read(path, options.downscale)?,
+        DatasetFormat::Polycam => phone::read_polycam(path, options.downscale)?,
+        DatasetFormat::Record3d => phone::read_record3d(path, options.downscale)?,
+        DatasetFormat::Nvm => nvm::read(path, options.downscale)?,
+        DatasetFormat::Bundler => bundler::read(path, options.downscale)?,
     };
+    if let Some(folder) = &options.images {
+        images::relocate(&mut declared, folder, options.downscale)?;
+    }
     assemble::assemble(declared, options)
 }

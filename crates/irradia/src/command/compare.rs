@@ -263,6 +263,7 @@ fn sources(args: &Args) -> Result<Vec<Source>> {
         let reading = match args.protocol {
             Some(protocol) => Reading {
                 format: args.reading.format.clone(),
+                images: args.reading.images.clone(),
                 ..protocol.reading(&scene)
             },
             None => args.reading.reading(),

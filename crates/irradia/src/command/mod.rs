@@ -5,6 +5,7 @@ pub mod compare;
 pub mod convert;
 pub mod demo;
 pub mod devices;
+pub mod doctor;
 pub mod edit;
 pub mod eval;
 pub mod files;
@@ -26,7 +27,7 @@ use clap::builder::RangedU64ValueParser;
 use irradia_runs::formats::SplatFormat;
 use irradia_runs::scene::Dataset;
 use irradia_runs::{Reading, RunError};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// A part of a dataset.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
@@ -65,7 +66,11 @@ pub struct DataArgs {
     /// Hold out every N-th view by name, none (0), or those listed in FILE; when absent the dataset's own split, or every 8th
     #[arg(long, value_name = "N|0|FILE")]
     pub holdout: Option<String>,
-    /// colmap, nerfstudio, blender or llff; detected from the folder when absent
+    /// Folder of the photographs, if it is not where the layout of the dataset has it
+    #[arg(long, value_name = "DIR")]
+    pub images: Option<PathBuf>,
+    /// colmap, nerfstudio, blender, llff, nerfies, opensfm, metashape, realitycapture, polycam, record3d, nvm or bundler; detected
+    /// from the folder when absent
     #[arg(long)]
     pub format: Option<String>,
 }
@@ -80,6 +85,7 @@ impl DataArgs {
             downscale: self.downscale.unwrap_or(usual.downscale),
             max_side: self.max_side.or(usual.max_side.filter(|_| !sized)),
             holdout: self.holdout.clone(),
+            images: self.images.clone(),
         }
     }
 

@@ -7,7 +7,7 @@ use anyhow::Result;
 use clap::builder::RangedU64ValueParser;
 use indicatif::{ProgressBar, ProgressStyle};
 use irradia_runs::formats::{DatasetFormat, has_photos};
-use irradia_runs::{PoseInput, PoseProgress, PoseReport, TrainInput, is_film, pose};
+use irradia_runs::{Finding, PoseInput, PoseProgress, PoseReport, TrainInput, is_film, pose};
 use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
@@ -15,6 +15,8 @@ use std::time::{Duration, Instant};
 
 /// Photographs with a pose, of all, below which a training does not begin.
 const ENOUGH: f64 = 0.8;
+/// Findings of one kind that are told in full.
+const TOLD: usize = 5;
 /// Interval of plain lines.
 const LINE_EVERY: Duration = Duration::from_secs(5);
 
@@ -62,11 +64,18 @@ pub fn pose_first(input: &mut TrainInput, anyway: bool) -> Result<()> {
     let report = pose_with_progress(&PoseInput::new(data, &posed))?;
     note(summary(&report));
     if report.fraction() < ENOUGH && !anyway {
+        let reasons: Vec<&str> = report
+            .findings
+            .iter()
+            .filter(|f| f.kind != "left-out")
+            .map(|f| f.sentence.as_str())
+            .collect();
+        let first = reasons.first().map_or(String::new(), |first| format!(" {first};"));
         return Err(Usage(format!(
-            "only {} of {} photographs have poses, see {}; add photographs between them and the others, or train --anyway",
+            "only {} of {} photographs have poses:{first} see {}; add photographs between them and the others, or train --anyway",
             report.registered,
             report.photos,
-            posed.join("pose.json").display()
+            posed.join("doctor.html").display()
         ))
         .into());
     }
@@ -74,8 +83,27 @@ pub fn pose_first(input: &mut TrainInput, anyway: bool) -> Result<()> {
 }
 
 fn pose_with_progress(input: &PoseInput) -> Result<PoseReport> {
+    let report = with_progress(|progress| pose(input, progress)).map_err(by_option)?;
+    let unread = |name: &str| {
+        !report
+            .findings
+            .iter()
+            .any(|f| f.kind == "left-out" && f.photos == [name])
+    };
+    for left in report.left_out.iter().filter(|left| unread(&left.name)) {
+        note(format_args!("left out: {}: {}", left.name, left.reason));
+    }
+    tell_findings(&report.findings, |line| {
+        note(line);
+        Ok(())
+    })?;
+    Ok(report)
+}
+
+/// Runs `work` with its progress on display.
+pub fn with_progress<T>(work: impl FnOnce(&(dyn Fn(PoseProgress) + Sync)) -> T) -> T {
     let display = Mutex::new(Display::new());
-    let report = pose(input, &|event| {
+    let result = work(&|event| {
         // A thread that panicked while it held the display ends everything anyway.
         if let Ok(mut display) = display.lock() {
             display.show(event);
@@ -84,11 +112,23 @@ fn pose_with_progress(input: &PoseInput) -> Result<PoseReport> {
     if let Ok(display) = display.into_inner() {
         display.clear();
     }
-    let report = report.map_err(by_option)?;
-    for left in &report.left_out {
-        note(format_args!("left out: {}: {}", left.name, left.reason));
+    result
+}
+
+/// One line a finding, at most [`TOLD`] of each kind.
+pub fn tell_findings(findings: &[Finding], mut tell: impl FnMut(&str) -> Result<()>) -> Result<()> {
+    for (i, finding) in findings.iter().enumerate() {
+        let same = |other: &&Finding| other.kind == finding.kind;
+        match findings[..i].iter().filter(same).count() {
+            before if before < TOLD => tell(&format!("{}: {}", finding.kind, finding.sentence))?,
+            TOLD => {
+                let more = findings[i..].iter().filter(same).count();
+                tell(&format!("{}: {more} more such findings", finding.kind))?;
+            }
+            _ => {}
+        }
     }
-    Ok(report)
+    Ok(())
 }
 
 /// `48 of 50 photographs posed, ..; features 3.1 s, ..`

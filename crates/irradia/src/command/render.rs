@@ -1,13 +1,13 @@
 //! `irradia render`
 
 use super::film::{self, FilmWriter};
-use super::{DataArgs, Split, thread_count, use_threads};
+use super::{DataArgs, Split, by_option, thread_count, use_threads};
 use crate::Usage;
-use crate::terminal::say;
+use crate::terminal::{note, say};
 use anyhow::{Context, Result};
 use irradia_runs::scene::{Camera, Image};
-use irradia_runs::{Film, Scene, file_stems, write_image};
-use irradia_splat::Renderer;
+use irradia_runs::train::painter::Painter;
+use irradia_runs::{Film, Scene, file_stems, open_device, write_image};
 use std::path::{Path, PathBuf};
 
 #[derive(clap::Args)]
@@ -48,6 +48,9 @@ pub struct Args {
     /// Threads; all cores when absent
     #[arg(long, value_parser = thread_count())]
     pub threads: Option<usize>,
+    /// Where splats are rendered: cpu, gpu, auto (a real GPU if there is one), or a part of a GPU's name; see irradia devices
+    #[arg(long, value_name = "DEVICE", default_value = "cpu")]
+    pub device: String,
     #[command(flatten)]
     pub reading: DataArgs,
 }
@@ -112,6 +115,15 @@ pub(super) fn film_of(path: &Path, scene: &Scene, frames: u32, size: Option<(u32
     })
 }
 
+/// Renders the scene on the device of the arguments.
+fn painter<'m>(args: &Args, scene: &'m Scene) -> Result<Painter<'m>> {
+    let device = open_device(&args.device).map_err(by_option)?;
+    if !device.is_cpu() {
+        note(format_args!("rendering on {device}"));
+    }
+    Ok(Painter::new(&scene.model, &device)?)
+}
+
 fn write_film(args: &Args, scene: &Scene, film: &Film) -> Result<()> {
     if args.depth || args.alpha {
         return Err(Usage("depth and alpha are written as frames: name a folder with --out".into()).into());
@@ -122,9 +134,9 @@ fn write_film(args: &Args, scene: &Scene, film: &Film) -> Result<()> {
     let k = first.intrinsics;
     let fps = args.fps.map_or(film.fps, |fps| fps as f32);
     let mut writer = FilmWriter::begin(&args.out, (k.width, k.height), fps)?;
-    let mut renderer = Renderer::new();
+    let mut painter = painter(args, scene)?;
     for camera in &film.cameras {
-        writer.add(&scene.model.render(&mut renderer, camera, &scene.options).color)?;
+        writer.add(&painter.render(camera, &scene.options)?.color)?;
     }
     writer.finish()?;
     say(format_args!("{} frames in {}", film.cameras.len(), args.out.display()))
@@ -135,13 +147,13 @@ fn write_frames(args: &Args, scene: &Scene, cameras: Vec<(String, Camera)>) -> R
         return Err(Usage("nothing to render: no such views".into()).into());
     }
     std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
-    let mut renderer = Renderer::new();
+    let mut painter = painter(args, scene)?;
     let mut depths = Vec::new();
     let write = |name: &str, what: &str, image: &Image| -> Result<()> {
         Ok(write_image(args.out.join(format!("{name}{what}.png")), image)?)
     };
     for (name, camera) in &cameras {
-        let frame = scene.model.render(&mut renderer, camera, &scene.options);
+        let frame = painter.render(camera, &scene.options)?;
         let image = frame.color;
         write(name, "", &image)?;
         let alpha = Image::new(image.width, image.height, 1, frame.alpha);

@@ -17,8 +17,8 @@ use std::sync::atomic::Ordering;
 
 #[derive(clap::Args)]
 pub struct Args {
-    /// Folder of posed photographs (COLMAP, nerfstudio, Blender, LLFF), or photographs or a film without poses, which are posed
-    /// first; not needed with --resume and --replay
+    /// Folder of posed photographs (COLMAP, nerfstudio, Blender, LLFF, OpenSfM, Metashape, ..), or photographs or a film without
+    /// poses, which are posed first; not needed with --resume and --replay
     #[arg(required_unless_present_any = ["resume", "replay"])]
     pub data: Option<PathBuf>,
     /// Folder for the run

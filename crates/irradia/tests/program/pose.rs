@@ -1,21 +1,32 @@
 //! Photographs without poses.
 
 use crate::process::*;
+use irradia_testkit::shared;
 use std::fs;
+use std::path::Path;
 
 #[test]
-fn bare_photographs_are_posed_and_trained_on() {
+fn bare_photographs_are_examined_posed_and_trained_on() {
+    let Some(door) = shared("data/lund_door/images") else {
+        return;
+    };
     let folder = tempfile::tempdir().expect("a folder");
-    irradia(folder.path(), "synth data --views 40 --size 320x240").success();
-    let posed = irradia(folder.path(), "pose data/train --out posed").success();
+    let photos = folder.path().join("photos");
+    copy(&door, &photos, 12);
+    let examined = irradia(folder.path(), "doctor photos --out posed").success();
+    assert!(
+        examined.stdout.contains("12 photographs, nothing wrong found"),
+        "{examined:#?}"
+    );
+    assert!(folder.path().join("posed/doctor.html").is_file());
+    let posed = irradia(folder.path(), "pose photos --out posed").success();
     assert!(
         posed.stdout.contains("photographs posed") && posed.stdout.contains("features"),
         "{posed:#?}"
     );
     let report = json(&folder.path().join("posed/pose.json"));
-    assert!(report["registered"].as_u64().is_some_and(|n| n >= 36), "{report}");
+    assert_eq!(report["registered"].as_u64(), Some(12), "{report}");
     // The posed photographs lie beside their poses: no other folder is needed.
-    fs::rename(folder.path().join("data/train"), folder.path().join("photos")).expect("renamed");
     irradia(folder.path(), "train posed --out first --steps 3").success();
     let trained = irradia(folder.path(), "train photos --out second --steps 3").success();
     assert!(trained.stderr.contains("no poses"), "{trained:#?}");
@@ -23,6 +34,31 @@ fn bare_photographs_are_posed_and_trained_on() {
     assert!(folder.path().join("second/scene.ply").is_file());
     irradia(folder.path(), "train --resume second").success();
     assert_no_leftovers(folder.path());
+}
+
+#[test]
+fn a_training_stops_with_the_reasons_when_too_few_photographs_have_poses() {
+    let (Some(door), Some(fern)) = (shared("data/lund_door/images"), shared("data/fern/images_8")) else {
+        return;
+    };
+    let folder = tempfile::tempdir().expect("a folder");
+    let photos = folder.path().join("photos");
+    copy(&door, &photos, 6);
+    copy(&fern, &photos, 5);
+    irradia(folder.path(), "train photos --out run --steps 2")
+        .refused(2, &["only 6 of 11", "2 parts", "doctor.html", "--anyway"]);
+    irradia(folder.path(), "train photos --out run --steps 2 --anyway").success();
+}
+
+/// Copies the first photographs of a folder.
+fn copy(from: &Path, to: &Path, count: usize) {
+    fs::create_dir_all(to).expect("a folder");
+    let entries = fs::read_dir(from).expect("the shared folder");
+    let mut files: Vec<_> = entries.map(|entry| entry.expect("an entry").path()).collect();
+    files.sort();
+    for file in files.iter().take(count) {
+        fs::copy(file, to.join(file.file_name().expect("a file"))).expect("copied");
+    }
 }
 
 #[test]

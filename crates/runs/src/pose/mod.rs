@@ -4,9 +4,11 @@
 //! images/          the posed photographs: links to the originals where the file system allows, else copies; frames of a film
 //! sparse/0/*.bin   cameras, poses and points with tracks, in COLMAP's format; further models in sparse/1, ..
 //! pose.json        what happened: numbers, times, and each photograph left out with its reason
+//! doctor.html      what is wrong with the capture, and where to take further photographs; doctor.json and doctor/*.png belong to it
 //! features.bin     features and matches, which are reused as long as photographs do not change
 //! ```
 
+mod doctor;
 mod film;
 mod output;
 mod stages;
@@ -15,8 +17,9 @@ mod store;
 use crate::RunError;
 use crate::folder::to_json;
 use irradia_formats::{PhotoFolder, read_photo_folder, write_atomic};
+use irradia_sfm::doctor::Kind;
 use irradia_sfm::features::Sift;
-use irradia_sfm::map::{MapOptions, PhotoInfo, Progress, reconstruct};
+use irradia_sfm::map::{MapOptions, PhotoInfo, Progress, Reconstruction, reconstruct};
 use irradia_sfm::matching::PairOptions;
 use serde::Serialize;
 use stages::Work;
@@ -24,6 +27,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
+pub use doctor::{DoctorInput, DoctorReport, Finding, doctor};
 pub use film::is_film;
 
 /// Fewer photographs make no dataset.
@@ -101,6 +105,8 @@ pub struct PoseReport {
     pub seconds: f64,
     /// What the user should know.
     pub warnings: Vec<String>,
+    /// What is wrong with the capture, the gravest first.
+    pub findings: Vec<Finding>,
 }
 
 impl PoseReport {
@@ -137,7 +143,7 @@ pub struct CameraReport {
 /// Time of a stage.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct StageReport {
-    /// `photographs`, `frames`, `features`, `matches`, `poses` or `writing`.
+    /// `photographs`, `frames`, `features`, `matches`, `poses`, `doctor` or `writing`.
     pub name: &'static str,
     /// Wall time.
     pub seconds: f64,
@@ -168,7 +174,7 @@ pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Resu
     check_enough(&input.photos, &folder)?;
     clock.end("photographs");
 
-    let mut work = Work::new(input, &folder, progress);
+    let mut work = Work::new(input.max_features, Some(out), &folder, progress);
     work.find_features()?;
     clock.end("features");
     let pair_options = PairOptions {
@@ -189,13 +195,22 @@ pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Resu
         }
     });
     clock.end("poses");
+    let examined = doctor::examine(&work, &infos, &pairs, &reconstruction);
+    doctor::write(out, &folder, &work, &examined)?;
+    clock.end("doctor");
     if reconstruction.models.is_empty() {
-        return Err(RunError::Refused(no_model(&input.photos, &infos, &reconstruction)));
+        return Err(RunError::Refused(no_model(
+            &input.photos,
+            &infos,
+            &reconstruction,
+            &examined,
+        )));
     }
     output::write(out, &folder, &work, &infos, &reconstruction)?;
     clock.end("writing");
 
     let mut report = output::report(&folder, &work, &infos, &reconstruction);
+    report.findings = examined.findings;
     report.pairs = pairs.len();
     report.warnings = work.warnings().to_vec();
     report.stages = clock.stages;
@@ -261,11 +276,17 @@ fn photo_infos(folder: &PhotoFolder, used: &[usize]) -> Vec<PhotoInfo> {
         .collect()
 }
 
-/// Why nothing could be posed: the most frequent kind of reason comes with its first photograph.
-fn no_model(path: &Path, photos: &[PhotoInfo], found: &irradia_sfm::map::Reconstruction) -> String {
-    let first = found.left_out.first().map_or(String::new(), |left| {
-        format!("; {}: {}", photos[left.photo].name, left.reason)
-    });
+/// Why nothing could be posed: what the doctor says of the whole, else the first photograph's reason.
+fn no_model(path: &Path, photos: &[PhotoInfo], found: &Reconstruction, examined: &DoctorReport) -> String {
+    let of_all = examined
+        .findings
+        .iter()
+        .find(|finding| finding.kind != Kind::LeftOut.name());
+    let first = match (of_all, found.left_out.first()) {
+        (Some(finding), _) => format!("; {}", finding.sentence),
+        (None, Some(left)) => format!("; {}: {}", photos[left.photo].name, left.reason),
+        (None, None) => String::new(),
+    };
     format!(
         "{}: no three of {} photographs could be posed together{first}; take more photographs that overlap by two thirds, from \
          different places",

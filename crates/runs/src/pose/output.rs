@@ -185,5 +185,6 @@ pub(super) fn report(folder: &PhotoFolder, work: &Work, infos: &[PhotoInfo], fou
         stages: Vec::new(),
         seconds: 0.0,
         warnings: Vec::new(),
+        findings: Vec::new(),
     }
 }

@@ -1,15 +1,16 @@
 //! Features and matches, with those of an earlier call.
 
+use super::PoseProgress;
 use super::store::{self, Known, Looks};
-use super::{PoseInput, PoseProgress};
 use crate::RunError;
 use irradia_formats::{PhotoEntry, PhotoFolder, Pixels};
+use irradia_sfm::doctor::Appearance;
 use irradia_sfm::features::{Extractor, GreyPhoto, Sift};
 use irradia_sfm::matching::{MatchOptions, PairOptions, candidate_pairs, match_pairs};
 use irradia_sfm::{Features, PairMatches};
 use rayon::prelude::*;
 use std::collections::HashSet;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 /// The file of features and matches.
@@ -19,7 +20,8 @@ const STORE: &str = "features.bin";
 pub(super) struct Work<'a> {
     folder: &'a PhotoFolder,
     progress: &'a (dyn Fn(PoseProgress) + Sync),
-    path: PathBuf,
+    /// Where features and matches are kept, if they are.
+    path: Option<PathBuf>,
     settings: [u32; 4],
     sift: Sift,
     known: Known,
@@ -29,25 +31,35 @@ pub(super) struct Work<'a> {
     hashes: Vec<u64>,
     features: Vec<Features>,
     colors: Vec<Vec<[u8; 3]>>,
+    appearances: Vec<Appearance>,
     /// Names of the others, and why.
     undecodable: Vec<(String, String)>,
     warnings: Vec<String>,
 }
 
 impl<'a> Work<'a> {
-    pub fn new(input: &PoseInput, folder: &'a PhotoFolder, progress: &'a (dyn Fn(PoseProgress) + Sync)) -> Self {
+    /// Features and matches are kept in the folder `out`.
+    pub fn new(
+        max_features: usize,
+        out: Option<&Path>,
+        folder: &'a PhotoFolder,
+        progress: &'a (dyn Fn(PoseProgress) + Sync),
+    ) -> Self {
         let sift = Sift {
-            max_features: input.max_features,
+            max_features,
             ..Sift::default()
         };
-        let path = input.out.join(STORE);
+        let path = out.map(|out| out.join(STORE));
         let settings = [
             sift.max_side,
             sift.max_features as u32,
             sift.peak_threshold.to_bits(),
             sift.edge_threshold.to_bits(),
         ];
-        let (known, warning) = store::read(&path, settings);
+        let (known, warning) = path
+            .as_ref()
+            .map(|path| store::read(path, settings))
+            .unwrap_or_default();
         let mut work = Self {
             folder,
             progress,
@@ -59,6 +71,7 @@ impl<'a> Work<'a> {
             hashes: Vec::new(),
             features: Vec::new(),
             colors: Vec::new(),
+            appearances: Vec::new(),
             undecodable: Vec::new(),
             warnings: Vec::new(),
         };
@@ -85,6 +98,11 @@ impl<'a> Work<'a> {
     /// The colour at each keypoint, by photograph.
     pub fn colors(&self) -> &[Vec<[u8; 3]>] {
         &self.colors
+    }
+
+    /// The figures of each photograph's pixels.
+    pub fn appearances(&self) -> &[Appearance] {
+        &self.appearances
     }
 
     pub fn undecodable(&self) -> &[(String, String)] {
@@ -120,11 +138,16 @@ impl<'a> Work<'a> {
             is_new |= matches!(looks, Ok(Some(_)));
             match looks.map(|new| new.or_else(|| self.known.looks.remove(&photo.hash))) {
                 Ok(looks) => {
-                    let Looks { features, colors } = looks.unwrap_or_default();
+                    let Looks {
+                        features,
+                        colors,
+                        appearance,
+                    } = looks.unwrap_or_default();
                     self.used.push(i);
                     self.hashes.push(photo.hash);
                     self.features.push(features);
                     self.colors.push(colors);
+                    self.appearances.push(appearance);
                 }
                 Err(reason) => self.undecodable.push((photo.name.clone(), reason)),
             }
@@ -142,8 +165,14 @@ impl<'a> Work<'a> {
     }
 
     fn save(&self) -> Result<(), RunError> {
-        let photos = (&self.hashes[..], &self.features[..], &self.colors[..]);
-        Ok(store::write(&self.path, self.settings, photos, &self.known.matches)?)
+        let Some(path) = &self.path else { return Ok(()) };
+        let photos = (
+            &self.hashes[..],
+            &self.features[..],
+            &self.colors[..],
+            &self.appearances[..],
+        );
+        Ok(store::write(path, self.settings, photos, &self.known.matches)?)
     }
 
     /// Matches of the pairs worth it, those that are not known yet in parallel.
@@ -199,9 +228,11 @@ fn extract(sift: &Sift, photo: &PhotoEntry) -> Result<Looks, String> {
         photo.width as f32 / pixels.width as f32,
         photo.height as f32 / pixels.height as f32,
     ];
+    let (width, height) = (pixels.width as usize, pixels.height as usize);
     Ok(Looks {
         features: features.scaled(enlarge),
         colors,
+        appearance: Appearance::measure(width, height, &grey, mask.as_deref()),
     })
 }
 

@@ -1,26 +1,28 @@
 //! Features and matches on disk, by the hash of the photographs' bytes: renamed photographs keep theirs, changed ones lose them.
 //!
-//! Little-endian: the signature; the settings; u64 photographs, each u64 hash, u64 features, each `f32 x, y, scale, angle`, the
-//! descriptor and `r, g, b`; u64 pairs, each the hashes of both photographs, u64 matches, each `u32, u32`.
+//! Little-endian: the signature; the settings; u64 photographs, each u64 hash, four `f32` of its appearance, u64 features, each
+//! `f32 x, y, scale, angle`, the descriptor and `r, g, b`; u64 pairs, each the hashes of both photographs, u64 matches, each `u32, u32`.
 
 use irradia_formats::{FormatError, write_atomic};
+use irradia_sfm::doctor::Appearance;
 use irradia_sfm::{DESCRIPTOR_BYTES, Features, Keypoint};
 use std::collections::HashMap;
 use std::io::{self, Write};
 use std::path::Path;
 
 /// Ends in the version of everything that features and matches depend on beside the settings.
-const SIGNATURE: &[u8; 16] = b"irradia.sfm 0001";
+const SIGNATURE: &[u8; 16] = b"irradia.sfm 0002";
 /// Bytes of a feature.
 const FEATURE: usize = 16 + DESCRIPTOR_BYTES + 3;
 
-/// The features of a photograph, and the colours there.
+/// The features of a photograph, the colours there, and figures of its pixels.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(super) struct Looks {
     /// In pixels at full size.
     pub features: Features,
     /// `[N]`
     pub colors: Vec<[u8; 3]>,
+    pub appearance: Appearance,
 }
 
 /// What is known from an earlier call.
@@ -57,21 +59,24 @@ fn header(settings: [u32; 4]) -> Vec<u8> {
         .collect()
 }
 
-/// Photographs by their hashes, with their features and the colours of these.
-pub(super) type Photos<'a> = (&'a [u64], &'a [Features], &'a [Vec<[u8; 3]>]);
+/// Photographs by their hashes, with their features, the colours of these, and the figures of their pixels.
+pub(super) type Photos<'a> = (&'a [u64], &'a [Features], &'a [Vec<[u8; 3]>], &'a [Appearance]);
 
 /// Writes photographs and the matches between them.
 pub(super) fn write(
     path: &Path,
     settings: [u32; 4],
-    (hashes, features, colors): Photos,
+    (hashes, features, colors, appearances): Photos,
     matches: &HashMap<[u64; 2], Vec<[u32; 2]>>,
 ) -> Result<(), FormatError> {
     write_atomic(path, |out| {
         out.write_all(&header(settings))?;
         write_u64(out, hashes.len() as u64)?;
-        for ((hash, features), colors) in hashes.iter().zip(features).zip(colors) {
+        for (((hash, features), colors), appearance) in hashes.iter().zip(features).zip(colors).zip(appearances) {
             write_u64(out, *hash)?;
+            for value in appearance.to_array() {
+                out.write_all(&value.to_le_bytes())?;
+            }
             write_u64(out, colors.len() as u64)?;
             for ((k, descriptor), color) in features.keypoints.iter().zip(&features.descriptors).zip(colors) {
                 for value in [k.x, k.y, k.scale, k.angle] {
@@ -105,8 +110,13 @@ fn parse(mut bytes: &[u8]) -> Option<Known> {
     let mut known = Known::default();
     for _ in 0..take_u64(&mut bytes)? {
         let hash = take_u64(&mut bytes)?;
+        let figures = take(&mut bytes, 16)?.as_chunks::<4>().0;
+        let figures: [f32; 4] = std::array::from_fn(|i| f32::from_le_bytes(figures[i]));
         let count = usize::try_from(take_u64(&mut bytes)?).ok()?;
-        let mut looks = Looks::default();
+        let mut looks = Looks {
+            appearance: Appearance::from_array(figures),
+            ..Looks::default()
+        };
         for feature in take(&mut bytes, count.checked_mul(FEATURE)?)?.chunks_exact(FEATURE) {
             let (place, rest) = feature.split_at(16);
             let value = |i: usize| f32::from_le_bytes(place[4 * i..][..4].try_into().expect("4 bytes"));
@@ -167,6 +177,7 @@ mod tests {
                 descriptors: (0..n).map(|i| [i; DESCRIPTOR_BYTES]).collect(),
             },
             colors: (0..n).map(|i| [i, 1, 2]).collect(),
+            appearance: Appearance::from_array([0.1, 0.5, 0.0, f32::from(n)]),
         }
     }
 
@@ -181,7 +192,14 @@ mod tests {
         let hashes: Vec<u64> = known.looks.keys().copied().collect();
         let features: Vec<Features> = known.looks.values().map(|looks| looks.features.clone()).collect();
         let colors: Vec<Vec<[u8; 3]>> = known.looks.values().map(|looks| looks.colors.clone()).collect();
-        write(path, SETTINGS, (&hashes, &features, &colors), &known.matches).unwrap();
+        let appearances: Vec<Appearance> = known.looks.values().map(|looks| looks.appearance).collect();
+        write(
+            path,
+            SETTINGS,
+            (&hashes, &features, &colors, &appearances),
+            &known.matches,
+        )
+        .unwrap();
     }
 
     #[test]

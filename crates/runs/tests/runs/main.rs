@@ -3,6 +3,8 @@
 mod compact;
 mod edits;
 mod every_recipe;
+#[cfg(feature = "gpu")]
+mod gpu;
 mod pose;
 mod requests;
 mod scenes;

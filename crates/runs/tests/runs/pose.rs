@@ -1,9 +1,10 @@
 //! Photographs in, a dataset out: ray-traced photographs whose poses are known, and folders with which nothing can be done.
 
-use irradia_runs::formats::{DatasetFormat, DatasetOptions, read_dataset, write_png};
+use irradia_runs::formats::{DatasetFormat, DatasetOptions, read_dataset, read_image, write_png};
 use irradia_runs::scene::Camera;
 use irradia_runs::synth::{Capture, Part, SynthOptions};
-use irradia_runs::{PoseInput, PoseProgress, PoseReport, RunError, pose};
+use irradia_runs::{DoctorInput, Finding, PoseInput, PoseProgress, PoseReport, RunError, doctor, pose};
+use irradia_testkit::shared;
 use std::fs;
 use std::path::Path;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -20,12 +21,14 @@ const OPTIONS: SynthOptions = SynthOptions {
 /// The training photographs of a ray-traced scene, and their true cameras by name.
 fn photographs(folder: &Path) -> Vec<(String, Camera)> {
     let capture = Capture::new(&OPTIONS).unwrap();
+    let scene = OPTIONS.scene.build(OPTIONS.seed).0;
     let shots = capture.shots().iter().filter(|shot| shot.part == Part::Train);
     shots
         .enumerate()
         .map(|(i, shot)| {
             let name = format!("{i:02}.png");
-            let frame = capture.trace(shot);
+            // A quarter of the usual samples: features do not mind the noise.
+            let frame = scene.trace(&shot.camera, 4, i as u64);
             write_png(&folder.join(&name), OPTIONS.width, OPTIONS.height, 4, &frame.rgba()).unwrap();
             (name, shot.camera)
         })
@@ -136,6 +139,12 @@ fn folders_without_enough_photographs_have_one_clear_outcome() {
         write_png(&apart.join(name), 64, 48, 1, &picture(seed)).unwrap();
     }
     refused(&apart, &["no three of 3 photographs", "overlap"]);
+    let two = make("two");
+    fs::copy(apart.join("a.png"), two.join("a.png")).unwrap();
+    fs::copy(apart.join("b.png"), two.join("b.png")).unwrap();
+    refused(&two, &["2 readable photographs", "at least 3"]);
+    let none = doctor(&DoctorInput::new(&two), &|_| {}).unwrap_err().to_string();
+    assert!(none.contains("2 readable photographs"), "{none}");
     // A dataset of another origin is not replaced.
     let foreign = make("foreign");
     fs::create_dir(foreign.join("sparse")).unwrap();
@@ -144,4 +153,79 @@ fn folders_without_enough_photographs_have_one_clear_outcome() {
     let film = folder.path().join("film.mp4");
     fs::write(&film, "no film").unwrap();
     refused(&film, &["film.mp4", "ffmpeg"]);
+}
+
+#[test]
+fn photographs_of_two_scenes_a_copy_and_a_text_file_have_one_clear_outcome() {
+    let (Some(door), Some(fern)) = (shared("data/lund_door/images"), shared("data/fern/images_8")) else {
+        return;
+    };
+    let folder = tempfile::tempdir().unwrap();
+    let (photos, out) = (folder.path().join("photos"), folder.path().join("data"));
+    fs::create_dir(&photos).unwrap();
+    let files = |from: &Path, count: usize| {
+        let mut files: Vec<_> = fs::read_dir(from).unwrap().map(|entry| entry.unwrap().path()).collect();
+        files.sort();
+        files.truncate(count);
+        files
+    };
+    let doors = files(&door, 6);
+    for (name, file) in doors
+        .iter()
+        .map(|f| ("door", f))
+        .chain(files(&fern, 5).iter().map(|f| ("fern", f)))
+    {
+        let own = file.file_name().unwrap().to_str().unwrap();
+        fs::copy(file, photos.join(format!("{name}_{own}"))).unwrap();
+    }
+    // The same pixels in another file.
+    let copied = read_image(&doors[2]).unwrap();
+    write_png(
+        &photos.join("same.png"),
+        copied.width,
+        copied.height,
+        copied.channels,
+        &copied.data,
+    )
+    .unwrap();
+    fs::write(photos.join("text.jpg"), "no picture").unwrap();
+
+    let of = |findings: &[Finding], kind: &str| -> Vec<Finding> {
+        findings
+            .iter()
+            .filter(|finding| finding.kind == kind)
+            .cloned()
+            .collect()
+    };
+    let report = pose(&PoseInput::new(&photos, &out), &|_| {}).unwrap();
+    assert_eq!(
+        (report.photos, report.registered, &report.models[..]),
+        (13, 7, &[7, 5][..]),
+        "{report:#?}"
+    );
+    assert_eq!(report.left_out.len(), 6);
+    let parts = of(&report.findings, "separate-parts");
+    assert!(
+        parts.len() == 1 && parts[0].sentence.contains("2 parts") && parts[0].photos.len() == 5,
+        "{parts:#?}"
+    );
+    let twice = of(&report.findings, "twice");
+    assert!(
+        twice.len() == 1 && twice[0].photos.contains(&"same.png".to_owned()),
+        "{twice:#?}"
+    );
+    let page = fs::read_to_string(out.join("doctor.html")).unwrap();
+    assert!(page.contains("separate-parts") && out.join("doctor/same.png.png").is_file());
+    // The doctor alone comes to the same, from the features that are there, and names the text file too.
+    let alone = DoctorInput {
+        out: Some(out.clone()),
+        ..DoctorInput::new(&photos)
+    };
+    let alone = doctor(&alone, &|_| {}).unwrap();
+    assert_eq!(of(&alone.findings, "separate-parts"), parts);
+    let unread = of(&alone.findings, "left-out");
+    assert!(
+        unread.len() == 1 && unread[0].sentence.starts_with("text.jpg is left out: "),
+        "{unread:#?}"
+    );
 }

@@ -161,6 +161,7 @@ fn a_request_round_trips() {
             downscale: 1.5,
             max_side: None,
             holdout: Some("5".into()),
+            images: Some("photographs".into()),
         },
         ..input(folder.path(), "run", 4)
     };

@@ -52,7 +52,8 @@ pub(super) fn finish(working: Working, photos: &[PhotoInfo]) -> Model {
 
 /// Up is +Z, the points' median is the origin, and the cameras' median distance from it is 1.
 fn upright(model: &Model, photos: &[PhotoInfo]) -> Alignment {
-    let up = up(model, photos);
+    let cameras = photos.iter().zip(&model.poses);
+    let up = up(cameras.filter_map(|(photo, pose)| Some((pose.as_ref()?.rotation, photo.up))));
     let rotation = DQuat::from_rotation_arc(up, DVec3::Z);
     let middle = |mut values: Vec<f64>| {
         if values.is_empty() {
@@ -79,18 +80,18 @@ fn upright(model: &Model, photos: &[PhotoInfo]) -> Alignment {
     }
 }
 
-/// The direction up: photographs are held level more often than not, so that all their x axes lie in one horizontal plane.
+/// The direction up, from the rotation of each camera to the world and the direction up in its own axes, if known: photographs are
+/// held level more often than not, so that all their x axes lie in one horizontal plane.
 ///
 /// Its normal is the answer if the x axes leave no doubt about it and it agrees with the mean of the photographs' own up
 /// directions; otherwise that mean.
-fn up(model: &Model, photos: &[PhotoInfo]) -> DVec3 {
+pub(crate) fn up(cameras: impl Iterator<Item = (DQuat, Option<DVec3>)>) -> DVec3 {
     let mut mean = DVec3::ZERO;
     let mut scatter = [[0.0; 3]; 3];
-    for (photo, pose) in photos.iter().zip(&model.poses) {
-        let Some(pose) = pose else { continue };
-        let own = photo.up.unwrap_or(DVec3::NEG_Y);
-        mean += pose.rotation * own;
-        let right = pose.rotation * own.cross(DVec3::NEG_Z).normalize_or_zero();
+    for (rotation, own) in cameras {
+        let own = own.unwrap_or(DVec3::NEG_Y);
+        mean += rotation * own;
+        let right = rotation * own.cross(DVec3::NEG_Z).normalize_or_zero();
         for i in 0..3 {
             for j in 0..3 {
                 scatter[i][j] += right[i] * right[j];

@@ -1,8 +1,7 @@
 //! Focal lengths before any adjustment: from metadata, from the pairs, or a common value.
 
-use super::Cameras;
 use super::types::{MapOptions, PhotoInfo};
-use super::verify::{Uncalibrated, centered_points, essential_from, select};
+use super::verify::{Cameras, Uncalibrated, centered_points, essential_from, select};
 use crate::geometry::camera::DCamera;
 use crate::geometry::correspondences::Correspondences;
 use crate::geometry::essential::{motions, refine_motion};

@@ -1,11 +1,11 @@
 //! The growth of a model from a seed, photograph by photograph.
 
-use super::Cameras;
 use super::model::Working;
 use super::refine::Extent;
 use super::seed::seeds;
 use super::tracks::Tracks;
 use super::types::{MapOptions, PhotoInfo, Progress, VerifiedPair};
+use super::verify::Cameras;
 use crate::geometry::pose::DPose;
 use crate::geometry::ransac::Limits;
 use crate::geometry::resection::Resection;

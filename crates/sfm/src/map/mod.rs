@@ -4,6 +4,7 @@
 //! models from seed pairs (`grow`), adjusting as they grow (`refine`). It depends on nothing but its input: no clock, no
 //! threads, no order of hashing.
 
+mod agree;
 mod finish;
 mod focal;
 mod grow;
@@ -13,14 +14,17 @@ mod seed;
 mod tracks;
 mod triangulation;
 mod types;
+mod unfold;
 mod verify;
 
+pub use agree::{agreement, contradictions, strengths};
+pub(crate) use finish::up;
+pub use focal::Source;
 pub use types::{
     LeftOut, MapOptions, Model, ModelPoint, PairKind, PhotoInfo, Progress, Reason, Reconstruction, VerifiedPair,
 };
-pub use verify::verify;
+pub use verify::{Cameras, verify};
 
-use crate::geometry::camera::DCamera;
 use crate::{Features, PairMatches};
 use tracks::Tracks;
 
@@ -40,14 +44,59 @@ pub fn reconstruct(
 ) -> Reconstruction {
     assert_eq!(photos.len(), features.len(), "one set of features a photograph");
     let (cameras, verified) = verify(photos, features, pairs, options, progress);
-    let tracks = Tracks::new(features, &verified);
+    let input = Input {
+        photos,
+        features,
+        cameras: &cameras,
+        pairs: &verified,
+        options,
+    };
+    let found = unfold::unfolded(&input, grown(&input, &verified, progress), progress);
+    let Grown { models, taken, tried } = found;
+    let left_out = finish::left_out(photos, features, pairs, &verified, &taken, &tried, options);
+    Reconstruction {
+        models,
+        left_out,
+        pairs: verified,
+        cameras,
+    }
+}
+
+/// Models, and what was tried.
+struct Grown {
+    /// Largest first.
+    models: Vec<Model>,
+    /// `[photos]` whether a photograph is in a model.
+    taken: Vec<bool>,
+    /// `[photos]` failed registrations.
+    tried: Vec<usize>,
+}
+
+/// What models are grown from.
+struct Input<'a> {
+    photos: &'a [PhotoInfo],
+    features: &'a [Features],
+    cameras: &'a Cameras,
+    /// All verified pairs.
+    pairs: &'a [VerifiedPair],
+    options: &'a MapOptions,
+}
+
+/// All models from the matches of `pairs`, which may be some of those of `input`.
+fn grown(input: &Input, pairs: &[VerifiedPair], progress: &mut dyn FnMut(Progress)) -> Grown {
+    let Input {
+        photos,
+        features,
+        cameras,
+        options,
+        ..
+    } = *input;
+    let tracks = Tracks::new(features, pairs);
     let mut models = Vec::new();
     let mut taken = vec![false; photos.len()];
     let mut tried = vec![0; photos.len()];
     while models.len() < options.max_models {
-        let Some(model) = grow::model(
-            photos, &cameras, &verified, &tracks, &taken, &mut tried, options, progress,
-        ) else {
+        let Some(model) = grow::model(photos, cameras, pairs, &tracks, &taken, &mut tried, options, progress) else {
             break;
         };
         for (photo, pose) in model.poses.iter().enumerate() {
@@ -55,16 +104,8 @@ pub fn reconstruct(
         }
         models.push(model);
     }
-    let left_out = finish::left_out(photos, features, pairs, &verified, &taken, &tried, options);
     let mut models: Vec<Model> = models.into_iter().map(|model| finish::finish(model, photos)).collect();
     // Stable: models of equal size stay in the order of their seeds.
     models.sort_by_key(|model| std::cmp::Reverse(model.registered()));
-    Reconstruction {
-        models,
-        left_out,
-        pairs: verified,
-    }
+    Grown { models, taken, tried }
 }
-
-/// The cameras before any adjustment: a focal length a group, the principal point in the centre.
-type Cameras = Vec<(DCamera, focal::Source)>;

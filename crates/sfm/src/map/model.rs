@@ -1,9 +1,9 @@
 //! A model that grows: which photographs have poses, which tracks have points, which observations agree.
 
-use super::Cameras;
 use super::focal::Source;
 use super::tracks::Tracks;
 use super::types::{MapOptions, PhotoInfo};
+use super::verify::Cameras;
 use crate::geometry::camera::DCamera;
 use crate::geometry::pose::DPose;
 use crate::geometry::triangulate::Sight;

@@ -1,3 +1,4 @@
+use super::focal::Source;
 use crate::geometry::camera::DCamera;
 use crate::geometry::essential::Motion;
 use crate::geometry::pose::DPose;
@@ -133,6 +134,8 @@ pub struct Reconstruction {
     pub left_out: Vec<LeftOut>,
     /// The pairs that were used.
     pub pairs: Vec<VerifiedPair>,
+    /// `[groups]` the camera of each group before any adjustment, and where its focal length comes from.
+    pub cameras: Vec<(DCamera, Source)>,
 }
 
 /// Cameras, poses and points in one world: up is +Z, the origin is near the scene's middle, the cameras' distance is about 1.

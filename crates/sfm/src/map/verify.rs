@@ -1,6 +1,5 @@
 //! Which matches of a pair agree with one geometry, and what kind of geometry that is.
 
-use super::Cameras;
 use super::focal::{self, Source};
 use super::types::{MapOptions, PairKind, PhotoInfo, Progress, VerifiedPair};
 use crate::geometry::camera::DCamera;
@@ -21,6 +20,9 @@ const EXPLAINS: f64 = 0.8;
 
 /// The median angle below which a pair is a rotation, radians: about three pixels at a long side of a thousand.
 const LEAST_ANGLE: f64 = 0.003;
+
+/// The camera of each group before any adjustment, and where its focal length comes from; the principal point is in the centre.
+pub type Cameras = Vec<(DCamera, Source)>;
 
 /// A pair's fundamental matrix between pixels that are centred and divided by each photograph's long side.
 #[derive(Clone, Debug)]

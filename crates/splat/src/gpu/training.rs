@@ -3,10 +3,10 @@
 use super::frame::{FRAME_PLANES, GEOMETRY, GpuRenderer, flag, read_geometry, write_geometry};
 use crate::engine::Update;
 use crate::regularize::Regularized;
-use crate::render::{CameraGradient, Gather, OutputGradient, RenderOptions};
-use crate::{SplatState, Splats, Statistics, ViewParams};
-use irradia_compute::DeviceError;
+use crate::render::{CHUNK, CameraGradient, Gather, OutputGradient, RenderOptions, basis_at};
+use crate::{SplatGradients, SplatState, Splats, Statistics, ViewParams};
 use irradia_compute::gpu::{Array, GROUP, Gpu, Work};
+use irradia_compute::{DeviceError, Planes};
 use irradia_scene::sh;
 use std::sync::Arc;
 
@@ -109,8 +109,8 @@ impl GpuTraining {
         let mut state = SplatState {
             splats: zeros(),
             moments: [zeros(), zeros()],
-            statistics: irradia_compute::Planes::zeros(SplatState::STATISTICS, count),
-            filter: irradia_compute::Planes::zeros(1, count),
+            statistics: Planes::zeros(SplatState::STATISTICS, count),
+            filter: Planes::zeros(1, count),
         };
         read_geometry(gpu, &self.renderer.geometry, 0, &mut state.splats);
         self.renderer.harmonics.read(gpu, 0, state.splats.sh.as_mut_slice());
@@ -254,24 +254,39 @@ impl GpuTraining {
         self.camera
     }
 
-    /// The gradients of the last backward pass, column by column; `splats` have the shape. Unspecified where a splat is not visible.
-    #[cfg(test)]
-    pub fn gradients(&self, splats: &Splats) -> Splats {
+    /// Reads the gradients of the last backward pass back; those of colours are spread over the harmonics here.
+    pub fn read_gradients(&self, gradients: &mut SplatGradients) {
         let gpu = &self.renderer.gpu;
-        let (mut gradients, stride) = (splats.clone(), splats.stride());
-        read_geometry(gpu, &self.v_splats, 0, &mut gradients);
-        let mut v_color = vec![0.0f32; 3 * stride];
+        let [count, stride, degree] = self.renderer.shape;
+        let last = self.renderer.last.as_ref().expect("render comes first");
+        gradients.splats = Splats::zeros(count, degree as u32);
+        read_geometry(gpu, &self.v_splats, 0, &mut gradients.splats);
+        let (mut v_color, mut means) = (vec![0.0f32; 3 * stride], vec![0.0f32; 3 * stride]);
         self.v_splats.read(gpu, GEOMETRY * stride, &mut v_color);
-        let center = self.renderer.last.as_ref().expect("render comes first").view.center();
-        for i in 0..splats.len() {
-            let basis = crate::render::basis_at(splats.sh_degree(), splats.mean(i), center);
-            for plane in 0..splats.sh.count() {
-                gradients
-                    .sh
-                    .set(plane, i, basis[plane / 3] * v_color[plane % 3 * stride + i]);
+        self.renderer.geometry.read(gpu, 0, &mut means);
+        let used = (degree as u32).min(last.options.sh_degree);
+        for i in 0..count {
+            let mean = [0, 1, 2].map(|c| means[c * stride + i]);
+            let basis = basis_at(used, mean, last.view.center());
+            for plane in 0..gradients.splats.sh.count() {
+                let v = basis[plane / 3] * v_color[plane % 3 * stride + i];
+                gradients.splats.sh.set(plane, i, v);
             }
         }
-        gradients
+        gradients.screen = Planes::zeros(2, count);
+        gradients.gathered = Planes::zeros(2, count);
+        self.v_splats
+            .read(gpu, (GEOMETRY + 3) * stride, gradients.screen.as_mut_slice());
+        self.v_splats
+            .read(gpu, (GEOMETRY + 5) * stride, gradients.gathered.as_mut_slice());
+        let mut visible = vec![0u32; stride];
+        self.renderer.visible.read(gpu, 0, &mut visible[..count]);
+        gradients.active = visible.iter().map(|visible| *visible as f32).collect();
+        gradients.counts = visible.chunks(CHUNK).map(|chunk| chunk.iter().sum()).collect();
+        gradients.camera = self.camera;
+        let mut found = [0u32; 3];
+        self.renderer.found.read(gpu, 0, &mut found);
+        gradients.non_finite = found[2] as usize;
     }
 
     /// The twin of the CPU's update.

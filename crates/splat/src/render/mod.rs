@@ -609,7 +609,7 @@ fn corner(bins: &Bins, tile: usize) -> [f32; 2] {
 }
 
 /// The SH basis of the direction from `center` to `mean`.
-#[cfg(all(test, feature = "gpu"))]
+#[cfg(feature = "gpu")]
 pub(crate) fn basis_at(degree: u32, mean: [f32; 3], center: [f64; 3]) -> [f32; 16] {
     let (d, _) = sh::direction(mean.map(f64::from), center);
     sh::basis(degree, d).map(|v| v as f32)

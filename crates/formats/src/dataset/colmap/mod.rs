@@ -72,24 +72,57 @@ const MODELS: [(&str, usize); 11] = [
     ("THIN_PRISM_FISHEYE", 12),
 ];
 
+/// Models of one folder that are looked at.
+const MOST_MODELS: usize = 1000;
+
 /// The folder of a model and its format.
 pub(super) struct ModelFiles {
     folder: PathBuf,
     binary: bool,
 }
 
-/// The first complete model of `sparse/0`, `sparse` and the folder itself; binary before text.
-pub(super) fn find_model(root: &Path) -> Option<ModelFiles> {
-    ["sparse/0", "sparse", ""].into_iter().find_map(|below| {
-        let folder = root.join(below);
-        [true, false].into_iter().find_map(|binary| {
-            let files = ModelFiles {
-                folder: folder.clone(),
-                binary,
-            };
-            (files.path("cameras").is_file() && files.path("images").is_file()).then_some(files)
-        })
+/// The model in `folder`, if it is complete; binary before text.
+fn model_in(folder: &Path) -> Option<ModelFiles> {
+    [true, false].into_iter().find_map(|binary| {
+        let files = ModelFiles {
+            folder: folder.to_owned(),
+            binary,
+        };
+        (files.path("cameras").is_file() && files.path("images").is_file()).then_some(files)
     })
+}
+
+/// The complete models of `sparse/0`, `sparse/1`, ..: COLMAP writes one for each part of a scene that it cannot connect.
+fn numbered_models(root: &Path) -> Vec<ModelFiles> {
+    (0..MOST_MODELS)
+        .map_while(|i| model_in(&root.join(format!("sparse/{i}"))))
+        .collect()
+}
+
+/// The first complete model of `sparse/0`, `sparse` and the folder itself.
+pub(super) fn find_model(root: &Path) -> Option<ModelFiles> {
+    ["sparse/0", "sparse", ""]
+        .into_iter()
+        .find_map(|below| model_in(&root.join(below)))
+}
+
+/// The model to read, and a warning if it is one of several: that with the most photographs.
+fn largest_model(root: &Path) -> Result<Option<(ModelFiles, Option<String>)>, FormatError> {
+    let mut models = numbered_models(root);
+    if models.len() < 2 {
+        return Ok(find_model(root).map(|model| (model, None)));
+    }
+    let counts: Vec<usize> = models
+        .iter()
+        .map(|model| Ok(model.images()?.len()))
+        .collect::<Result<_, FormatError>>()?;
+    let (most, total) = (counts.iter().copied().max().unwrap_or(0), counts.iter().sum::<usize>());
+    let largest = counts.iter().position(|count| *count == most).unwrap_or(0);
+    let warning = format!(
+        "COLMAP made {} models that it could not connect; sparse/{largest} is used, with {most} of their {total} photographs",
+        models.len()
+    );
+    Ok(Some((models.swap_remove(largest), Some(warning))))
 }
 
 impl ModelFiles {
@@ -106,10 +139,14 @@ impl ModelFiles {
     ) -> Result<T, FormatError> {
         read_and_parse(&self.path(table), if self.binary { binary } else { text })
     }
+
+    fn images(&self) -> Result<Vec<ColmapImage>, FormatError> {
+        self.read("images", binary::parse_images, text::parse_images)
+    }
 }
 
 pub(super) fn read(root: &Path, downscale: f32) -> Result<Declared, FormatError> {
-    let Some(files) = find_model(root) else {
+    let Some((files, several)) = largest_model(root)? else {
         return Err(FormatError::malformed(root, "contains no COLMAP model"));
     };
     let mut cameras = HashMap::new();
@@ -120,7 +157,7 @@ pub(super) fn read(root: &Path, downscale: f32) -> Result<Declared, FormatError>
         })?;
         cameras.insert(camera.id, declared);
     }
-    let images = files.read("images", binary::parse_images, text::parse_images)?;
+    let images = files.images()?;
     let (points, index_of) = match files.path("points3D").is_file() {
         true => gather(files.read("points3D", binary::parse_points, text::parse_points)?),
         false => Default::default(),
@@ -161,7 +198,7 @@ pub(super) fn read(root: &Path, downscale: f32) -> Result<Declared, FormatError>
             split: None,
         });
     }
-    let mut warnings: Vec<String> = folder.warning.into_iter().collect();
+    let mut warnings: Vec<String> = folder.warning.into_iter().chain(several).collect();
     let masked = views.iter().filter(|view| view.mask.is_some()).count();
     warnings.extend(masks.and_then(|masks| masks.warning(views.len(), masked)));
     Ok(Declared {

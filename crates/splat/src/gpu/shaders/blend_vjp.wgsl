@@ -21,11 +21,14 @@
 // Turns of a thread with one splat: the pixels of a tile, four at a time.
 const TURNS: u32 = 64u;
 
-var<workgroup> transmittances: array<f32, 256>;
-var<workgroup> rests: array<f32, 256>;
-// Gradients of red, green, blue and depth.
-var<workgroup> v_pixels: array<vec4f, 256>;
-var<workgroup> errors: array<f32, 256>;
+// Four neighbours in a row each.
+var<workgroup> transmittances: array<vec4f, 64>;
+var<workgroup> rests: array<vec4f, 64>;
+var<workgroup> v_red: array<vec4f, 64>;
+var<workgroup> v_green: array<vec4f, 64>;
+var<workgroup> v_blue: array<vec4f, 64>;
+var<workgroup> v_depth: array<vec4f, 64>;
+var<workgroup> errors: array<vec4f, 64>;
 
 @compute @workgroup_size(32)
 fn main(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups: vec3u, @builtin(local_invocation_index) lane: u32) {
@@ -79,10 +82,13 @@ fn main(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups: ve
                 error = v_frame[5u * pixels + p];
             }
         }
-        transmittances[at] = t;
-        rests[at] = rest;
-        v_pixels[at] = v;
-        errors[at] = error;
+        transmittances[at / 4u][at % 4u] = t;
+        rests[at / 4u][at % 4u] = rest;
+        v_red[at / 4u][at % 4u] = v.x;
+        v_green[at / 4u][at % 4u] = v.y;
+        v_blue[at / 4u][at % 4u] = v.z;
+        v_depth[at / 4u][at % 4u] = v.w;
+        errors[at / 4u][at % 4u] = error;
     }
 
     let origin = vec2f(corner) + 0.5;
@@ -122,37 +128,42 @@ fn main(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups: ve
             v_color = vec4f(0.0);
             gathered = vec2f(0.0);
         }
-        for (var q = 0u; q < 4u; q++) {
-            let at = 4u * group_of_four + q;
-            let t = transmittances[at];
-            let d = vec2f(f32(at % TILE), f32(at / TILE)) - xy;
-            let p = exponent(quadratic, log2_opacity, d);
-            if t > 0.0 && LOG2_ALPHA_MIN <= p {
-                let f = fragment(p, t);
-                if f.drawn {
-                    let v = v_pixels[at];
-                    let g = dot(color, v);
-                    let rest = rests[at] - f.weight * g;
-                    v_color += f.weight * v;
-                    var v_p = 0.0;
-                    if !f.capped {
-                        v_p = (t * g - rest / (1.0 - f.alpha)) * f.alpha;
-                    }
-                    moment0 += v_p;
-                    moments1 += v_p * d;
-                    moments2 += v_p * vec3f(d.x * d.x, d.x * d.y, d.y * d.y);
-                    if has(flags, FLAG_GATHER_ABSOLUTE) {
-                        let slope = vec2f(2.0 * quadratic.x * d.x + quadratic.y * d.y, quadratic.y * d.x + 2.0 * quadratic.z * d.y);
-                        gathered += abs(v_p) * abs(slope);
-                    } else if has(flags, FLAG_GATHER_ERROR) {
-                        gathered += f.weight * vec2f(errors[at], 1.0);
-                    }
-                    rests[at] = rest;
-                    transmittances[at] = f.transmittance;
-                } else if f.ends {
-                    transmittances[at] = -t;
-                }
+        let t = transmittances[group_of_four];
+        let dx = vec4f(0.0, 1.0, 2.0, 3.0) + (f32(4u * (group_of_four % 4u)) - xy.x);
+        let dy = f32(group_of_four / 4u) - xy.y;
+        let p = fma(fma(vec4f(quadratic.z), vec4f(dy), quadratic.y * dx), vec4f(dy), fma(quadratic.x * dx, dx, vec4f(log2_opacity)));
+        let touched = (p >= vec4f(LOG2_ALPHA_MIN)) & (t > vec4f(0.0));
+        if any(touched) {
+            let raw = exp2(p);
+            let alpha = min(raw, vec4f(ALPHA_MAX));
+            let weight = alpha * t;
+            let behind = t - weight;
+            let is_visible = behind > vec4f(TRANSMITTANCE_MIN);
+            let drawn = touched & is_visible;
+            let w = select(vec4f(0.0), weight, drawn);
+            let vr = v_red[group_of_four];
+            let vg = v_green[group_of_four];
+            let vb = v_blue[group_of_four];
+            let vd = v_depth[group_of_four];
+            let g = color.x * vr + color.y * vg + color.z * vb + color.w * vd;
+            let rest = rests[group_of_four] - w * g;
+            v_color += vec4f(dot(w, vr), dot(w, vg), dot(w, vb), dot(w, vd));
+            let v_p = select(vec4f(0.0), (t * g - rest / (1.0 - alpha)) * alpha, drawn & (raw <= vec4f(ALPHA_MAX)));
+            let v_dx = v_p * dx;
+            let along = vec2f(dot(v_dx, vec4f(1.0)), dot(v_dx, dx));
+            let sum = dot(v_p, vec4f(1.0));
+            moment0 += sum;
+            moments1 += vec2f(along.x, sum * dy);
+            moments2 += vec3f(along.y, along.x * dy, sum * dy * dy);
+            if has(flags, FLAG_GATHER_ABSOLUTE) {
+                let slope_x = abs(2.0 * quadratic.x * dx + quadratic.y * dy);
+                let slope_y = abs(quadratic.y * dx + 2.0 * quadratic.z * dy);
+                gathered += vec2f(dot(abs(v_p), slope_x), dot(abs(v_p), slope_y));
+            } else if has(flags, FLAG_GATHER_ERROR) {
+                gathered += vec2f(dot(w, errors[group_of_four]), dot(w, vec4f(1.0)));
             }
+            rests[group_of_four] = rest;
+            transmittances[group_of_four] = select(t, select(-t, behind, is_visible), touched);
         }
         if group_of_four == TURNS - 1u {
             let to = slot * 12u;

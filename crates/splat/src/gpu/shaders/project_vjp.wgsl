@@ -46,6 +46,10 @@ fn main(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups: ve
     let v_conic = vec3f(-0.5 * s[3], -s[4], -0.5 * s[5]);
     let v_opacity = s[0] * exp2(-fb.y);
     let v_depth = s[9];
+    var gathered = vec2f(s[10], s[11]);
+    if has(view.flags.x, FLAG_GATHER_ABSOLUTE) {
+        gathered *= LN_2;
+    }
 
     let g = load_geometry(i);
     let at = intermediate(g, load_variance(i));
@@ -181,7 +185,7 @@ fn main(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups: ve
     var planes = array<f32, 18>(
         v_mean.x, v_mean.y, v_mean.z, v_quat.x, v_quat.y, v_quat.z, v_quat.w,
         v_log_scale.x, v_log_scale.y, v_log_scale.z, v_logit, v_color.x, v_color.y, v_color.z,
-        v_xy.x, v_xy.y, s[10], s[11],
+        v_xy.x, v_xy.y, gathered.x, gathered.y,
     );
     for (var plane = 0u; plane < 18u; plane++) {
         v_splats[plane * stride + i] = planes[plane];

@@ -1,0 +1,164 @@
+//! Bundler's `bundle.out`, version 0.3 (<https://www.cs.cornell.edu/~snavely/bundler/bundler-v0.4-manual.html>, S6). Poses are
+//! camera-from-world with x right, y up and z backward; pixels are counted from the image's centre.
+
+use super::declared::{Declared, DeclaredCamera, DeclaredPoints, DeclaredPose, DeclaredView, Focal, lens_or_pinhole};
+use super::files::{first_file, locate_image};
+use super::tokens::{Tokens, text};
+use crate::error::read_and_parse;
+use crate::{FormatError, Malformed};
+use glam::{DMat3, DVec3};
+use irradia_scene::Lens;
+use std::path::{Path, PathBuf};
+
+/// Names of the list of photographs, beside the bundle or in the folder above.
+const LISTS: [&str; 4] = ["list.txt", "bundle.out.list.txt", "bundle.list.txt", "image_list.txt"];
+/// Where the photographs are, relative to the list.
+const FOLDERS: [&str; 3] = ["", "images", "../images"];
+
+/// A file of cameras and points.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Bundle {
+    /// In the order of the list of photographs.
+    pub cameras: Vec<BundleCamera>,
+    /// Coloured points, each with the numbers of the cameras that see it.
+    pub points: Vec<([f64; 3], [u8; 3], Vec<usize>)>,
+}
+
+/// A camera.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct BundleCamera {
+    /// Focal length, pixels; 0 for a photograph without a pose.
+    pub focal: f64,
+    /// Radial distortion.
+    pub k: [f64; 2],
+    /// Row by row, camera-from-world.
+    pub rotation: [f64; 9],
+    /// Camera-from-world.
+    pub translation: [f64; 3],
+}
+
+pub(super) fn find(path: &Path) -> Option<PathBuf> {
+    let is_bundle = |file: &Path| file.extension().is_some_and(|e| e == "out") && begins_as_a_bundle(file);
+    first_file(path, is_bundle).or_else(|| first_file(&path.join("bundle"), is_bundle))
+}
+
+fn begins_as_a_bundle(file: &Path) -> bool {
+    super::files::begins_with(file, |start| start.starts_with(b"# Bundle file"))
+}
+
+pub(super) fn read(path: &Path, downscale: f32) -> Result<Declared, FormatError> {
+    let file = find(path).ok_or_else(|| FormatError::malformed(path, "contains no bundle.out"))?;
+    let bundle = read_and_parse(&file, parse_bundle)?;
+    let beside = file.parent().unwrap_or(Path::new("."));
+    let folders = [Some(beside), beside.parent()];
+    let list = folders
+        .into_iter()
+        .flatten()
+        .flat_map(|folder| LISTS.map(|name| folder.join(name)))
+        .find(|list| list.is_file());
+    let Some(list) = list else {
+        let message = format!(
+            "it names no photographs, and there is no {} beside it",
+            LISTS.join(" or ")
+        );
+        return Err(FormatError::malformed(&file, message));
+    };
+    let names = read_and_parse(&list, |bytes| {
+        // A line may have a focal length behind the name.
+        let first = |line: &str| line.split_whitespace().next().map(str::to_owned);
+        Ok(text(bytes)?.lines().filter_map(first).collect::<Vec<String>>())
+    })?;
+    if names.len() != bundle.cameras.len() {
+        let (cameras, names) = (bundle.cameras.len(), names.len());
+        let message = format!("it names {names} photographs, but the bundle has {cameras} cameras");
+        return Err(FormatError::malformed(&list, message));
+    }
+    let root = list.parent().unwrap_or(Path::new(".")).to_owned();
+    let mut points = DeclaredPoints::default();
+    let mut seen = vec![Vec::new(); names.len()];
+    for (position, color, cameras) in &bundle.points {
+        let index = points.positions.len() as u32;
+        if points.push((*position).into(), *color) {
+            for i in cameras {
+                if let Some(seen) = seen.get_mut(*i) {
+                    seen.push(index);
+                }
+            }
+        }
+    }
+    let mut views = Vec::with_capacity(names.len());
+    // A focal length of 0 says that the photograph has no pose.
+    let all = names.iter().zip(&bundle.cameras).zip(seen);
+    for ((name, camera), points_seen) in all.filter(|((_, camera), _)| camera.focal != 0.0) {
+        let name = name.replace('\\', "/");
+        let image = locate_image(&root, &FOLDERS, &name);
+        views.push(DeclaredView {
+            points_seen,
+            ..DeclaredView::posed(&root, &name, image, pose(camera), declared_camera(camera))
+        });
+    }
+    Ok(Declared {
+        kind: "Bundler",
+        root,
+        views,
+        points: Some(points),
+        ignores_exif: true,
+        downscale,
+        warnings: Vec::new(),
+    })
+}
+
+/// Parses a `bundle.out`.
+///
+/// # Errors
+/// When it is another version, truncated, or has a word where a number is expected.
+pub fn parse_bundle(bytes: &[u8]) -> Result<Bundle, Malformed> {
+    let text = text(bytes)?;
+    let body = text
+        .strip_prefix("# Bundle file v0.3")
+        .ok_or_else(|| Malformed("not a bundle of version 0.3".into()))?;
+    let mut tokens = Tokens::new(body);
+    let (cameras, points): (usize, usize) = (tokens.next("a count of cameras")?, tokens.next("a count of points")?);
+    let mut bundle = Bundle::default();
+    for _ in 0..cameras {
+        let [focal, k1, k2] = tokens.numbers("a focal length or distortion")?;
+        bundle.cameras.push(BundleCamera {
+            focal,
+            k: [k1, k2],
+            rotation: tokens.numbers("a rotation")?,
+            translation: tokens.numbers("a translation")?,
+        });
+    }
+    for _ in 0..points {
+        let position = tokens.numbers("a point")?;
+        let color = tokens.numbers::<3>("a colour")?.map(|v| v as u8);
+        let views: usize = tokens.next("a count of views")?;
+        let mut seen = Vec::new();
+        for _ in 0..views {
+            seen.push(tokens.next("a view")?);
+            tokens.skip(3, "a list of views")?;
+        }
+        bundle.points.push((position, color, seen));
+    }
+    Ok(bundle)
+}
+
+fn pose(camera: &BundleCamera) -> Option<DeclaredPose> {
+    // Rows: the camera's axes (right, up, backward) in the world.
+    let [right, up, backward] = [0, 1, 2].map(|row| DVec3::from_slice(&camera.rotation[3 * row..]));
+    let camera_from_world = DMat3::from_cols(right, up, backward).transpose();
+    let position = -(camera_from_world.transpose() * DVec3::from(camera.translation));
+    super::declared::pose_from_axes(right, -up, -backward, position)
+}
+
+fn declared_camera(camera: &BundleCamera) -> DeclaredCamera {
+    DeclaredCamera {
+        size: None,
+        focal: Focal::Pixels([camera.focal; 2]),
+        center: None,
+        lens: lens_or_pinhole(Lens::Opencv {
+            k: [camera.k[0], camera.k[1], 0.0, 0.0, 0.0, 0.0],
+            p: [0.0; 2],
+        }),
+    }
+}

@@ -1,0 +1,30 @@
+//! Photographs in a folder that the user names, instead of where the layout has them.
+
+use super::declared::Declared;
+use super::files::find_image;
+use crate::FormatError;
+use std::path::Path;
+
+/// Takes the photographs of `declared` from `folder`: by their paths, without the first folder of these (`images/a/b.jpg` is `a/b.jpg`
+/// there), or by their names alone. `downscale` is relative to these photographs.
+///
+/// # Errors
+/// When none is there.
+pub(super) fn relocate(declared: &mut Declared, folder: &Path, downscale: f32) -> Result<(), FormatError> {
+    for view in &mut declared.views {
+        let name = Path::new(&view.name);
+        let below = view.name.split_once('/').map(|(_, below)| Path::new(below));
+        let candidates = [Some(name), below, name.file_name().map(Path::new)];
+        view.image = candidates
+            .into_iter()
+            .flatten()
+            .find_map(|name| find_image(&folder.join(name)));
+    }
+    if declared.views.iter().all(|view| view.image.is_none()) {
+        let first = declared.views.first().map_or("", |view| view.name.as_str());
+        let message = format!("has none of the dataset's photographs, such as {first}");
+        return Err(FormatError::malformed(folder, message));
+    }
+    declared.downscale = downscale;
+    Ok(())
+}

@@ -1,0 +1,202 @@
+//! Cameras exported by Agisoft Metashape as XML. Poses are world-from-camera with OpenCV axes, row by row, in the coordinates of a
+//! chunk; its transform leads to the world. Lens: the manual's appendix "Camera models", whose P1 and P2 are OpenCV's p2 and p1.
+
+use super::declared::{Declared, DeclaredCamera, DeclaredPose, DeclaredView, Focal, lens_or_pinhole, pose_from_axes};
+use super::files::{begins_with, first_file, locate_image};
+use super::xml::{Element, parse_xml};
+use crate::error::read_and_parse;
+use crate::{FormatError, Malformed};
+use glam::{DMat3, DVec3};
+use irradia_scene::Lens;
+use std::collections::HashMap;
+use std::path::{Path, PathBuf};
+
+/// Where the photographs are, relative to the file.
+const FOLDERS: [&str; 3] = ["images", "", "../images"];
+
+pub(super) fn find(path: &Path) -> Option<PathBuf> {
+    let has_document = |start: &[u8]| start.windows(9).any(|word| word == b"<document");
+    first_file(path, |file| {
+        file.extension().is_some_and(|e| e.eq_ignore_ascii_case("xml")) && begins_with(file, has_document)
+    })
+}
+
+pub(super) fn read(path: &Path, downscale: f32) -> Result<Declared, FormatError> {
+    let file = find(path).ok_or_else(|| FormatError::malformed(path, "contains no cameras by Metashape"))?;
+    let cameras = read_and_parse(&file, parse_metashape)?;
+    let root = file.parent().unwrap_or(Path::new(".")).to_owned();
+    let (posed, unposed): (Vec<_>, Vec<_>) = cameras.into_iter().partition(|camera| camera.pose.is_some());
+    let mut warnings = Vec::new();
+    if !unposed.is_empty() {
+        warnings.push(format!("{} photographs are not aligned and are skipped", unposed.len()));
+    }
+    let view = |camera: MetashapeCamera| {
+        let name = camera.label.replace('\\', "/");
+        let image = locate_image(&root, &FOLDERS, &name);
+        DeclaredView::posed(&root, &name, image, camera.pose, camera.intrinsics)
+    };
+    Ok(Declared {
+        kind: "Metashape",
+        views: posed.into_iter().map(view).collect(),
+        points: None,
+        ignores_exif: true,
+        downscale,
+        warnings,
+        root,
+    })
+}
+
+/// A photograph of a chunk.
+pub(crate) struct MetashapeCamera {
+    label: String,
+    /// `None` if it is not aligned.
+    pose: Option<DeclaredPose>,
+    intrinsics: DeclaredCamera,
+}
+
+/// Rotation, translation and scale from a chunk to the world.
+struct Transform {
+    rotation: DMat3,
+    translation: DVec3,
+    scale: f64,
+}
+
+/// Parses the XML; every camera of its first chunk.
+pub(crate) fn parse_metashape(bytes: &[u8]) -> Result<Vec<MetashapeCamera>, Malformed> {
+    let document = parse_xml(bytes)?;
+    let missing = |what: &str| Malformed(format!("has no <{what}>; export cameras in the format Agisoft XML"));
+    let chunk = document.child("chunk").ok_or_else(|| missing("chunk"))?;
+    let mut sensors = HashMap::new();
+    for sensor in chunk.descendants("sensor") {
+        // A sensor that took no aligned photograph has no calibration.
+        if let (Some(id), Some(calibration)) = (sensor.attribute("id"), calibration(sensor)) {
+            sensors.insert(id, intrinsics(sensor, calibration)?);
+        }
+    }
+    let world_from_chunk = chunk.child("transform").and_then(transform);
+    let components: HashMap<&str, Transform> = chunk
+        .descendants("component")
+        .into_iter()
+        .filter_map(|component| Some((component.attribute("id")?, transform(component.child("transform")?)?)))
+        .collect();
+    let cameras = chunk.child("cameras").ok_or_else(|| missing("cameras"))?;
+    let mut found = Vec::new();
+    for camera in cameras.descendants("camera") {
+        let label = camera
+            .attribute("label")
+            .ok_or_else(|| Malformed("a <camera> has no label".into()))?;
+        let matrix = camera.child("transform").map(Element::numbers);
+        let sensor = camera.attribute("sensor_id").and_then(|id| sensors.get(id));
+        let (Some(matrix), Some(intrinsics)) = (matrix, sensor) else {
+            if let Some(intrinsics) = sensors.values().next() {
+                found.push(MetashapeCamera {
+                    label: label.to_owned(),
+                    pose: None,
+                    intrinsics: *intrinsics,
+                });
+            }
+            continue;
+        };
+        if matrix.len() != 16 {
+            return Err(Malformed(format!(
+                "the transform of camera {label} has {} numbers, not 16",
+                matrix.len()
+            )));
+        }
+        let component = camera.attribute("component_id").and_then(|id| components.get(id));
+        found.push(MetashapeCamera {
+            label: label.to_owned(),
+            pose: pose(&matrix, component.or(world_from_chunk.as_ref())),
+            intrinsics: *intrinsics,
+        });
+    }
+    Ok(found)
+}
+
+/// The adjusted calibration, else the first.
+fn calibration(sensor: &Element) -> Option<&Element> {
+    let all = || sensor.children.iter().filter(|child| child.name == "calibration");
+    all()
+        .find(|child| child.attribute("class") == Some("adjusted"))
+        .or_else(|| all().next())
+}
+
+fn pose(matrix: &[f64], world: Option<&Transform>) -> Option<DeclaredPose> {
+    let column = |c: usize| DVec3::new(matrix[c], matrix[4 + c], matrix[8 + c]);
+    let [right, down, forward, mut position] = [0, 1, 2, 3].map(column);
+    let turn = world.map_or(DMat3::IDENTITY, |world| world.rotation);
+    if let Some(world) = world {
+        position = world.scale * (world.rotation * position) + world.translation;
+    }
+    pose_from_axes(turn * right, turn * down, turn * forward, position)
+}
+
+/// `None` if it is incomplete: the chunk has no place in the world yet.
+fn transform(element: &Element) -> Option<Transform> {
+    let numbers = |name: &str| element.child(name).map(Element::numbers);
+    let rotation: [f64; 9] = numbers("rotation")?.try_into().ok()?;
+    let translation: [f64; 3] = numbers("translation")?.try_into().ok()?;
+    Some(Transform {
+        rotation: DMat3::from_cols_array(&rotation).transpose(),
+        translation: translation.into(),
+        scale: numbers("scale").and_then(|scale| scale.first().copied()).unwrap_or(1.0),
+    })
+}
+
+fn intrinsics(sensor: &Element, calibration: &Element) -> Result<DeclaredCamera, Malformed> {
+    let resolution = calibration.child("resolution").or_else(|| sensor.child("resolution"));
+    let side = |name: &str| -> Option<f64> { resolution?.attribute(name)?.parse().ok() };
+    let size = side("width")
+        .zip(side("height"))
+        .filter(|(w, h)| *w >= 1.0 && *h >= 1.0);
+    let Some((width, height)) = size else {
+        return Err(Malformed("a sensor has no resolution".into()));
+    };
+    let number = |name: &str| {
+        calibration
+            .child(name)
+            .and_then(|child| child.numbers().first().copied())
+    };
+    let of = |name: &str| number(name).unwrap_or(0.0);
+    let kind = calibration
+        .attribute("type")
+        .or_else(|| sensor.attribute("type"))
+        .unwrap_or("frame");
+    let lens = match kind {
+        "frame" if of("k4") == 0.0 => Lens::Opencv {
+            k: [of("k1"), of("k2"), of("k3"), 0.0, 0.0, 0.0],
+            p: [of("p2"), of("p1")],
+        },
+        "frame" => {
+            return Err(Malformed(
+                "a sensor has a k4, which is not supported; optimise the cameras without it, or undistort the photographs".into(),
+            ));
+        }
+        "fisheye" | "equidistant_fisheye" => Lens::Fisheye {
+            k: [of("k1"), of("k2"), of("k3"), of("k4")],
+        },
+        other => {
+            return Err(Malformed(format!(
+                "the sensor type `{other}` is not supported; undistort the photographs as frame cameras"
+            )));
+        }
+    };
+    // Old versions write fx and fy, and the principal point from the corner.
+    let (focal, center) = match (number("f"), number("fx")) {
+        (Some(f), _) => ([f + of("b1"), f], [0.5 * width + of("cx"), 0.5 * height + of("cy")]),
+        (None, Some(fx)) => (
+            [fx, number("fy").unwrap_or(fx)],
+            [
+                number("cx").unwrap_or(0.5 * width),
+                number("cy").unwrap_or(0.5 * height),
+            ],
+        ),
+        (None, None) => return Err(Malformed("a sensor's calibration has no <f>".into())),
+    };
+    Ok(DeclaredCamera {
+        size: Some([width, height]),
+        focal: Focal::Pixels(focal),
+        center: Some(center),
+        lens: lens_or_pinhole(lens),
+    })
+}

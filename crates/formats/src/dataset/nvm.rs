@@ -1,0 +1,185 @@
+//! VisualSfM's `.nvm`, version 3 (<http://ccwu.me/vsfm/doc.html#nvm>). Rotations are camera-from-world with x right, y down and z
+//! forward, positions are camera centres.
+
+use super::declared::{Declared, DeclaredCamera, DeclaredPoints, DeclaredPose, DeclaredView, Focal, lens_or_pinhole};
+use super::files::{first_file, locate_image};
+use super::tokens::{Tokens, text};
+use crate::error::read_and_parse;
+use crate::{FormatError, Malformed};
+use glam::DQuat;
+use irradia_scene::Lens;
+use std::path::{Path, PathBuf};
+
+/// Where the photographs are, relative to the file.
+const FOLDERS: [&str; 3] = ["", "images", "../images"];
+/// Numbers behind a photograph's name.
+const NUMBERS: usize = 10;
+
+/// A point: position, sRGB, and the indices of the photographs that see it.
+pub type NvmPoint = ([f64; 3], [u8; 3], Vec<usize>);
+
+/// A model: photographs, and points with the photographs that see them.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct NvmModel {
+    /// Photographs.
+    pub images: Vec<NvmImage>,
+    /// Points that [`Self::images`] see.
+    pub points: Vec<NvmPoint>,
+}
+
+/// A photograph.
+#[derive(Clone, Debug, PartialEq)]
+pub struct NvmImage {
+    /// File, relative to the model's.
+    pub name: String,
+    /// Pixels.
+    pub focal: f64,
+    /// Camera-from-world, `w, x, y, z`.
+    pub rotation: [f64; 4],
+    /// The camera's centre.
+    pub center: [f64; 3],
+    /// r of undistorted = distorted (1 + r |distorted|^2), in units of the focal length.
+    pub radial: f64,
+}
+
+pub(super) fn find(path: &Path) -> Option<PathBuf> {
+    first_file(path, |file| {
+        file.extension().is_some_and(|e| e.eq_ignore_ascii_case("nvm"))
+    })
+}
+
+pub(super) fn read(path: &Path, downscale: f32) -> Result<Declared, FormatError> {
+    let file = find(path).ok_or_else(|| FormatError::malformed(path, "contains no .nvm file"))?;
+    let models = read_and_parse(&file, parse_nvm)?;
+    let root = file.parent().unwrap_or(Path::new(".")).to_owned();
+    let count = models.len();
+    let largest = models.into_iter().rev().max_by_key(|model| model.images.len());
+    let Some(model) = largest else {
+        return Err(FormatError::malformed(&file, "it has no model with photographs"));
+    };
+    let mut warnings = Vec::new();
+    if count > 1 {
+        let n = model.images.len();
+        warnings.push(format!("the largest of {count} models is used, with {n} photographs"));
+    }
+    let mut points = DeclaredPoints::default();
+    let mut seen = vec![Vec::new(); model.images.len()];
+    for (position, color, images) in &model.points {
+        let index = points.positions.len() as u32;
+        if points.push((*position).into(), *color) {
+            for i in images {
+                if let Some(seen) = seen.get_mut(*i) {
+                    seen.push(index);
+                }
+            }
+        }
+    }
+    let views = model.images.iter().zip(seen).map(|(image, points_seen)| {
+        let name = image.name.replace('\\', "/");
+        let found = locate_image(&root, &FOLDERS, &name);
+        DeclaredView {
+            points_seen,
+            ..DeclaredView::posed(&root, &name, found, pose(image), declared_camera(image))
+        }
+    });
+    Ok(Declared {
+        kind: "VisualSfM",
+        views: views.collect(),
+        root,
+        points: Some(points),
+        ignores_exif: true,
+        downscale,
+        warnings,
+    })
+}
+
+/// Parses an `.nvm` file: its models with photographs.
+///
+/// # Errors
+/// When it is another version, truncated, or has a word where a number is expected.
+pub fn parse_nvm(bytes: &[u8]) -> Result<Vec<NvmModel>, Malformed> {
+    let text = text(bytes)?;
+    let mut lines = text
+        .lines()
+        .filter(|line| !line.trim().is_empty() && !line.starts_with('#'));
+    if !lines.next().is_some_and(|line| line.starts_with("NVM_V3")) {
+        return Err(Malformed("not an NVM file of version 3".into()));
+    }
+    let count = |line: Option<&str>| -> Result<usize, Malformed> { Tokens::new(line.unwrap_or("0")).next("a count") };
+    let mut models = Vec::new();
+    loop {
+        let images = count(lines.next())?;
+        if images == 0 {
+            break;
+        }
+        let mut model = NvmModel::default();
+        for _ in 0..images {
+            model.images.push(image(lines.next().unwrap_or_default())?);
+        }
+        for _ in 0..count(lines.next())? {
+            model.points.push(point(lines.next().unwrap_or_default())?);
+        }
+        models.push(model);
+    }
+    Ok(models)
+}
+
+fn image(line: &str) -> Result<NvmImage, Malformed> {
+    // A name may have spaces, so the numbers are counted from the end.
+    let words: Vec<&str> = line.split_whitespace().collect();
+    let Some(length) = words.len().checked_sub(NUMBERS).filter(|length| *length > 0) else {
+        return Err(Malformed(format!(
+            "a photograph has a name and {NUMBERS} numbers, not `{line}`"
+        )));
+    };
+    let numbers = words[length..].join(" ");
+    let [focal, w, x, y, z, cx, cy, cz, radial, _] = Tokens::new(&numbers).numbers("a number of a photograph")?;
+    Ok(NvmImage {
+        name: words[..length].join(" "),
+        focal,
+        rotation: [w, x, y, z],
+        center: [cx, cy, cz],
+        radial,
+    })
+}
+
+fn point(line: &str) -> Result<NvmPoint, Malformed> {
+    let mut tokens = Tokens::new(line);
+    let position = tokens.numbers("a point")?;
+    let color = tokens.numbers::<3>("a colour")?.map(|v| v as u8);
+    let views: usize = tokens.next("a count of views")?;
+    let mut seen = Vec::new();
+    for _ in 0..views {
+        seen.push(tokens.next("a view")?);
+        tokens.skip(3, "a list of views")?;
+    }
+    Ok((position, color, seen))
+}
+
+fn pose(image: &NvmImage) -> Option<DeclaredPose> {
+    let [w, x, y, z] = image.rotation;
+    let camera_from_world = DQuat::from_xyzw(x, y, z, w);
+    let length = camera_from_world.length();
+    if !(length.is_finite() && length > 1e-6) {
+        return None;
+    }
+    DeclaredPose {
+        rotation: (camera_from_world / length).inverse(),
+        position: image.center.into(),
+    }
+    .checked()
+}
+
+fn declared_camera(image: &NvmImage) -> DeclaredCamera {
+    // VisualSfM's model goes from distorted to undistorted; this is the reversed series of u = d + r d^3.
+    let r = image.radial;
+    DeclaredCamera {
+        size: None,
+        focal: Focal::Pixels([image.focal; 2]),
+        center: None,
+        lens: lens_or_pinhole(Lens::Opencv {
+            k: [-r, 3.0 * r * r, -12.0 * r * r * r, 0.0, 0.0, 0.0],
+            p: [0.0; 2],
+        }),
+    }
+}

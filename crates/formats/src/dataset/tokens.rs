@@ -1,0 +1,52 @@
+//! Words of a text file of numbers, separated by white space.
+
+use crate::Malformed;
+use std::str::{FromStr, SplitWhitespace};
+
+/// The words of a text that are not read yet.
+pub(super) struct Tokens<'a> {
+    words: SplitWhitespace<'a>,
+}
+
+impl<'a> Tokens<'a> {
+    pub fn new(text: &'a str) -> Self {
+        Self {
+            words: text.split_whitespace(),
+        }
+    }
+
+    /// The next number; `what` names it in the error.
+    pub fn next<T: FromStr>(&mut self, what: &str) -> Result<T, Malformed> {
+        let word = self
+            .words
+            .next()
+            .ok_or_else(|| Malformed(format!("ends where {what} is expected; the file is truncated")))?;
+        word.parse()
+            .map_err(|_| Malformed(format!("`{word}` is where {what} is expected")))
+    }
+
+    /// The next `N` numbers.
+    pub fn numbers<const N: usize>(&mut self, what: &str) -> Result<[f64; N], Malformed> {
+        let mut numbers = [0.0; N];
+        for number in &mut numbers {
+            *number = self.next(what)?;
+        }
+        Ok(numbers)
+    }
+
+    /// Skips `count` words.
+    pub fn skip(&mut self, count: usize, what: &str) -> Result<(), Malformed> {
+        for _ in 0..count {
+            if self.words.next().is_none() {
+                return Err(Malformed(format!("ends within {what}; the file is truncated")));
+            }
+        }
+        Ok(())
+    }
+}
+
+/// The text of a file in UTF-8, without a byte order mark.
+pub(super) fn text(bytes: &[u8]) -> Result<&str, Malformed> {
+    let bytes = bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes);
+    std::str::from_utf8(bytes).map_err(|_| Malformed("is not text in UTF-8".into()))
+}

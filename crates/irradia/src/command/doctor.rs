@@ -1,0 +1,49 @@
+//! `irradia doctor`
+
+use super::pose::{tell_findings, with_progress};
+use super::{by_option, thread_count, use_threads};
+use crate::terminal::say;
+use anyhow::Result;
+use clap::builder::RangedU64ValueParser;
+use irradia_runs::{DoctorInput, doctor};
+use std::path::PathBuf;
+
+#[derive(clap::Args)]
+pub struct Args {
+    /// Folder of photographs (JPEG, PNG)
+    pub photos: PathBuf,
+    /// Folder for doctor.html, with small pictures, and doctor.json; nothing is written when absent. Features and matches are kept
+    /// there too: irradia pose with the same folder reuses them
+    #[arg(long, value_name = "FOLDER")]
+    pub out: Option<PathBuf>,
+    /// Maximum number of features of a photograph; 4096 when absent
+    #[arg(long, value_name = "N", value_parser = RangedU64ValueParser::<usize>::new().range(1..=65_536))]
+    pub max_features: Option<usize>,
+    /// Threads; all cores when absent. The result does not depend on it
+    #[arg(long, value_name = "N", value_parser = thread_count())]
+    pub threads: Option<usize>,
+}
+
+pub fn run(args: &Args) -> Result<()> {
+    use_threads(args.threads)?;
+    let mut input = DoctorInput::new(&args.photos);
+    input.out.clone_from(&args.out);
+    input.max_features = args.max_features.unwrap_or(input.max_features);
+    let report = with_progress(|progress| doctor(&input, progress)).map_err(by_option)?;
+    tell_findings(&report.findings, |line| say(line))?;
+    let page = args
+        .out
+        .as_ref()
+        .map(|out| format!("; see {}", out.join("doctor.html").display()));
+    say(format_args!(
+        "{} photographs, {} in {:.1} s{}",
+        report.photos,
+        match report.findings.len() {
+            0 => "nothing wrong found".to_owned(),
+            1 => "1 finding".to_owned(),
+            n => format!("{n} findings"),
+        },
+        report.seconds,
+        page.unwrap_or_default()
+    ))
+}

@@ -1,0 +1,290 @@
+//! The capture doctor on files: `doctor.json`, and `doctor.html` with small pictures and a plan.
+
+use super::stages::Work;
+use super::{PoseProgress, check_enough, photo_infos};
+use crate::RunError;
+use crate::folder::to_json;
+use irradia_formats::{PhotoFolder, read_photo_folder, write_atomic, write_png};
+use irradia_sfm::PairMatches;
+use irradia_sfm::doctor::{Diagnosis, Evidence, diagnose, shots};
+use irradia_sfm::features::Sift;
+use irradia_sfm::map::{MapOptions, Model, PhotoInfo, Reconstruction, verify};
+use irradia_sfm::matching::PairOptions;
+use serde::Serialize;
+use std::collections::BTreeMap;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+/// The report, its page, and the folder of its pictures.
+const REPORT: &str = "doctor.json";
+const PAGE: &str = "doctor.html";
+const PICTURES: &str = "doctor";
+/// The page, with a place for the report.
+const TEMPLATE: &str = include_str!("doctor.html");
+/// Long side of the small pictures, px.
+const SMALL: u32 = 240;
+/// Findings with pictures, at most.
+const PICTURED: usize = 60;
+/// Points in the plan, at most.
+const PLAN_POINTS: usize = 2000;
+
+/// A request for a diagnosis.
+#[derive(Clone, Debug, PartialEq)]
+pub struct DoctorInput {
+    /// A folder of photographs.
+    pub photos: PathBuf,
+    /// Where the report, features and matches are written, if anywhere.
+    pub out: Option<PathBuf>,
+    /// The most features of a photograph, at least 1.
+    pub max_features: usize,
+}
+
+impl DoctorInput {
+    /// With the usual options; nothing is written.
+    pub fn new(photos: impl Into<PathBuf>) -> Self {
+        Self {
+            photos: photos.into(),
+            out: None,
+            max_features: Sift::default().max_features,
+        }
+    }
+}
+
+/// What is wrong with a capture; `doctor.json`.
+#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+pub struct DoctorReport {
+    /// Pictures found.
+    pub photos: usize,
+    /// The gravest first.
+    pub findings: Vec<Finding>,
+    /// Cameras and points seen from above, if there is a model.
+    pub plan: Option<Plan>,
+    /// Seconds in all, of [`doctor`] alone.
+    pub seconds: f64,
+}
+
+/// One fault.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Finding {
+    /// Its kind, such as `blurred`.
+    pub kind: &'static str,
+    /// What is wrong and what to do, in one sentence.
+    pub sentence: String,
+    /// Names of the photographs at fault.
+    pub photos: Vec<String>,
+    /// Photographs of both sides, of which the page shows small pictures.
+    pub sides: Vec<String>,
+    /// Where photographs would mend it.
+    pub shoot: Vec<Place>,
+    #[serde(skip)]
+    pictured: Vec<usize>,
+}
+
+/// A camera or a place for one, in the coordinates of the model.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Place {
+    /// The photograph's name; empty for one that is to be taken.
+    pub name: String,
+    /// Position; up is +Z, the cameras' median distance from the origin is 1.
+    pub position: [f64; 3],
+    /// Unit viewing direction.
+    pub forward: [f64; 3],
+}
+
+/// A model seen from above.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Plan {
+    /// All cameras.
+    pub cameras: Vec<Place>,
+    /// Some of the points, x and y.
+    pub points: Vec<[f32; 2]>,
+}
+
+/// Examines photographs by their pixels, features and pairs, without mapping them.
+///
+/// # Errors
+/// When there are fewer than three photographs, or a file cannot be read or written.
+pub fn doctor(input: &DoctorInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Result<DoctorReport, RunError> {
+    let started = Instant::now();
+    if input.max_features == 0 {
+        return Err(RunError::setting("max_features", 0, "must be 1 or more"));
+    }
+    let folder = read_photo_folder(&input.photos)?;
+    check_enough(&input.photos, &folder)?;
+    if let Some(out) = &input.out {
+        fs::create_dir_all(out).map_err(RunError::io("create", out))?;
+    }
+    let mut work = Work::new(input.max_features, input.out.as_deref(), &folder, progress);
+    work.find_features()?;
+    let pairs = work.match_pairs(&PairOptions::default())?;
+    let infos = photo_infos(&folder, work.photos());
+    let (cameras, verified) = verify(&infos, work.features(), &pairs, &MapOptions::default(), &mut |_| ());
+    let found = Reconstruction {
+        pairs: verified,
+        cameras,
+        ..Reconstruction::default()
+    };
+    let mut report = examine(&work, &infos, &pairs, &found);
+    add_unreadable(&mut report, &folder, &work);
+    report.seconds = started.elapsed().as_secs_f64();
+    if let Some(out) = &input.out {
+        write(out, &folder, &work, &report)?;
+    }
+    Ok(report)
+}
+
+/// Diagnoses what is known after verification, or after mapping if there is a model.
+pub(super) fn examine(
+    work: &Work,
+    infos: &[PhotoInfo],
+    matches: &[PairMatches],
+    found: &Reconstruction,
+) -> DoctorReport {
+    let model = found.models.first();
+    let evidence = Evidence {
+        photos: infos,
+        appearances: work.appearances(),
+        features: work.features(),
+        colors: work.colors(),
+        matches,
+        pairs: &found.pairs,
+        cameras: &found.cameras,
+        model,
+        left_out: &found.left_out,
+    };
+    let names: Vec<String> = infos.iter().map(|info| info.name.clone()).collect();
+    let findings = diagnose(&evidence)
+        .iter()
+        .map(|diagnosis| finding(diagnosis, &names, model))
+        .collect();
+    DoctorReport {
+        photos: infos.len(),
+        findings,
+        plan: model.map(|model| plan(model, infos)),
+        seconds: 0.0,
+    }
+}
+
+fn finding(diagnosis: &Diagnosis, names: &[String], model: Option<&Model>) -> Finding {
+    let (first, second) = diagnosis.sides();
+    let pictured: Vec<usize> = std::iter::once(first).chain(second).collect();
+    let shoot = model.map_or(Vec::new(), |model| shots(diagnosis, model));
+    Finding {
+        kind: diagnosis.kind().name(),
+        sentence: diagnosis.sentence(names).to_string(),
+        photos: diagnosis.photos().into_iter().map(|p| names[p].clone()).collect(),
+        sides: pictured.iter().map(|p| names[*p].clone()).collect(),
+        shoot: shoot
+            .into_iter()
+            .map(|shot| Place {
+                name: String::new(),
+                position: shot.position.to_array(),
+                forward: shot.forward.to_array(),
+            })
+            .collect(),
+        pictured,
+    }
+}
+
+/// Pictures that cannot be read have no other faults.
+fn add_unreadable(report: &mut DoctorReport, folder: &PhotoFolder, work: &Work) {
+    let unreadable: Vec<&(String, String)> = folder.left_out.iter().chain(work.undecodable()).collect();
+    report.photos += folder.left_out.len();
+    report
+        .findings
+        .extend(unreadable.into_iter().map(|(name, reason)| Finding {
+            kind: irradia_sfm::doctor::Kind::LeftOut.name(),
+            sentence: format!("{name} is left out: {reason}"),
+            photos: vec![name.clone()],
+            sides: Vec::new(),
+            shoot: Vec::new(),
+            pictured: Vec::new(),
+        }));
+}
+
+fn plan(model: &Model, infos: &[PhotoInfo]) -> Plan {
+    let cameras = infos
+        .iter()
+        .zip(&model.poses)
+        .filter_map(|(info, pose)| {
+            let pose = pose.as_ref()?;
+            Some(Place {
+                name: info.name.clone(),
+                position: pose.position.to_array(),
+                forward: (pose.rotation * glam::DVec3::Z).to_array(),
+            })
+        })
+        .collect();
+    let thin = model.points.len().div_ceil(PLAN_POINTS).max(1);
+    let points = model
+        .points
+        .iter()
+        .step_by(thin)
+        .map(|p| [p.position.x as f32, p.position.y as f32]);
+    Plan {
+        cameras,
+        points: points.collect(),
+    }
+}
+
+/// Writes the report, its page and its pictures.
+pub(super) fn write(out: &Path, folder: &PhotoFolder, work: &Work, report: &DoctorReport) -> Result<(), RunError> {
+    let pictures = out.join(PICTURES);
+    if pictures.exists() {
+        // Those of an earlier call.
+        fs::remove_dir_all(&pictures).map_err(RunError::io("clear", &pictures))?;
+    }
+    let shown: BTreeMap<&str, usize> = report
+        .findings
+        .iter()
+        .take(PICTURED)
+        .flat_map(|finding| {
+            finding
+                .sides
+                .iter()
+                .map(String::as_str)
+                .zip(finding.pictured.iter().copied())
+        })
+        .collect();
+    if !shown.is_empty() {
+        fs::create_dir_all(&pictures).map_err(RunError::io("create", &pictures))?;
+    }
+    for (name, photo) in shown {
+        let (size, rgb) = small(&folder.photos[work.photos()[photo]])?;
+        write_png(&pictures.join(format!("{name}.png")), size[0], size[1], 3, &rgb)?;
+    }
+    let json = to_json(report);
+    // Within a script element only `<` can end the data; strings of JSON may escape any character.
+    let data = String::from_utf8_lossy(&json).replace('<', "\\u003c");
+    let page = TEMPLATE.replace("/*DATA*/", &data);
+    write_atomic(&out.join(REPORT), |file| file.write_all(&json))?;
+    write_atomic(&out.join(PAGE), |file| file.write_all(page.as_bytes()))?;
+    Ok(())
+}
+
+/// A photograph, reduced by a whole number to about [`SMALL`]: its size and RGB.
+fn small(photo: &irradia_formats::PhotoEntry) -> Result<([u32; 2], Vec<u8>), RunError> {
+    let pixels = photo.read(SMALL)?;
+    let (from, channels) = (
+        [pixels.width as usize, pixels.height as usize],
+        pixels.channels as usize,
+    );
+    let factor = from[0].max(from[1]).div_ceil(SMALL as usize).max(1);
+    let [width, height] = from.map(|side| (side / factor).max(1));
+    let mut data = Vec::with_capacity(3 * width * height);
+    for y in 0..height {
+        for x in 0..width {
+            for c in 0..3 {
+                let mut sum = 0;
+                for row in y * factor..((y + 1) * factor).min(from[1]) {
+                    for column in x * factor..((x + 1) * factor).min(from[0]) {
+                        sum += usize::from(pixels.data[(row * from[0] + column) * channels + c.min(channels - 1)]);
+                    }
+                }
+                data.push((sum / (factor * factor)) as u8);
+            }
+        }
+    }
+    Ok(([width as u32, height as u32], data))
+}

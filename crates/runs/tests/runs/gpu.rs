@@ -1,0 +1,153 @@
+//! Runs on a GPU, beside the same on the CPU.
+
+use super::*;
+use irradia_compute::gpu::{Gpu, Wanted};
+use irradia_compute::{Device, DeviceChoice};
+
+fn is_there() -> bool {
+    irradia_testkit::gpu_or_skip(|| Gpu::open(&Wanted::Any)).is_some()
+}
+
+fn on(device: &str, folder: &Path, recipe: &str, steps: u64) -> Run {
+    let request = TrainInput {
+        device: device.to_owned(),
+        recipe: recipe.to_owned(),
+        ..input(folder, &format!("{recipe}-{device}"), steps)
+    };
+    Run::begin_on(request.check().expect("a request"), dataset()).expect("a run")
+}
+
+#[test]
+fn a_run_on_the_gpu_ends_as_on_the_cpu() {
+    if !is_there() {
+        return;
+    }
+    let folder = folder();
+    for recipe in ["fast", "classic", "mcmc", "curriculum"] {
+        let psnr = ["cpu", "gpu"].map(|device| {
+            let mut run = on(device, folder.path(), recipe, 30);
+            run.train(&mut []).expect("trains");
+            run.finish().expect("finishes").report.psnr
+        });
+        // mcmc draws other random numbers on the GPU; 30 steps amplify little.
+        let most = if recipe == "mcmc" { 0.3 } else { 0.1 };
+        assert!((psnr[0] - psnr[1]).abs() < most, "{recipe}: {psnr:?}");
+    }
+}
+
+#[test]
+fn a_run_moves_between_devices_and_names_its_own() {
+    if !is_there() {
+        return;
+    }
+    struct StopAt(u64, Vec<String>);
+    impl Observer for StopAt {
+        fn on_event(&mut self, event: &Event, trainer: &Trainer) -> Signal {
+            if let Event::Decided { message } = event {
+                self.1.push(message.clone());
+            }
+            if trainer.clock.step >= self.0 {
+                Signal::Stop
+            } else {
+                Signal::Continue
+            }
+        }
+    }
+    let folder = folder();
+    let mut run = on("gpu", folder.path(), "classic", 20);
+    let mut observer = StopAt(10, Vec::new());
+    run.train(&mut [&mut observer]).expect("trains");
+    assert!(
+        observer.1.iter().any(|line| line.contains("trained on the GPU")),
+        "{:?}",
+        observer.1
+    );
+    assert!(!run.finish().expect("finishes").complete);
+    let mut input = TrainInput::of_run(folder.path().join("classic-gpu")).expect("a run");
+    assert_eq!(input.device, "gpu");
+    input.device = "cpu".to_owned();
+    let mut run = Run::resume_on(input.check().expect("a request"), dataset()).expect("resumes");
+    assert_eq!(run.trainer().clock.step, 10);
+    run.train(&mut []).expect("trains");
+    let moved = run.finish().expect("finishes").report.psnr;
+    let mut whole = on("cpu", folder.path(), "classic", 20);
+    whole.train(&mut []).expect("trains");
+    let expected = whole.finish().expect("finishes").report.psnr;
+    assert!((moved - expected).abs() < 0.1, "{moved} {expected}");
+}
+
+#[test]
+fn a_lost_gpu_ends_the_run_with_a_line_and_leaves_its_checkpoint() {
+    if !is_there() {
+        return;
+    }
+    struct LoseAt(u64);
+    impl Observer for LoseAt {
+        fn on_event(&mut self, _: &Event, trainer: &Trainer) -> Signal {
+            if trainer.clock.step == self.0 {
+                let Device::Gpu(gpu) = &trainer.options.device else {
+                    panic!("a run on the GPU")
+                };
+                gpu.fail("it was unplugged");
+            }
+            if trainer.clock.step == 5 {
+                Signal::Save
+            } else {
+                Signal::Continue
+            }
+        }
+    }
+    let folder = folder();
+    let mut run = on("gpu", folder.path(), "classic", 20);
+    let error = run
+        .train(&mut [&mut LoseAt(8)])
+        .expect_err("the GPU is lost")
+        .to_string();
+    assert!(error.contains("it was unplugged") && !error.contains('\n'), "{error}");
+    drop(run);
+    let input = TrainInput::of_run(folder.path().join("classic-gpu")).expect("a run");
+    let input = TrainInput {
+        device: "cpu".to_owned(),
+        ..input
+    };
+    let mut run = Run::resume_on(input.check().expect("a request"), dataset()).expect("resumes");
+    assert_eq!(run.trainer().clock.step, 5);
+    run.train(&mut []).expect("trains");
+    assert!(run.finish().expect("finishes").report.psnr > 5.0);
+}
+
+#[test]
+fn a_gpu_that_is_not_there_is_a_mistake_of_the_request() {
+    let request = TrainInput {
+        device: "no such card".to_owned(),
+        ..input(folder().path(), "run", 5)
+    };
+    let error = Run::begin_on(request.check().expect("a request"), dataset())
+        .err()
+        .expect("no such GPU");
+    let line = error.to_string();
+    assert!(
+        line.contains("device no such card") && line.contains("irradia devices"),
+        "{line}"
+    );
+    assert!(Device::open(&DeviceChoice::Auto).is_ok(), "auto never fails");
+}
+
+#[test]
+fn pictures_of_the_gpu_are_those_of_the_cpu() {
+    if !is_there() {
+        return;
+    }
+    let folder = folder();
+    let mut run = begin(folder.path(), "run", 20);
+    run.train(&mut []).expect("trains");
+    run.finish().expect("finishes");
+    let scene = Scene::read(folder.path().join("run")).expect("a scene");
+    let device = Device::open(&DeviceChoice::Gpu).expect("a GPU");
+    let mut painter = irradia_runs::train::painter::Painter::new(&scene.model, &device).expect("kernels");
+    for camera in scene.orbit(3, Some((80, 60))) {
+        let got = painter.render(&camera, &scene.options).expect("a frame").color;
+        let expected = scene.render(&camera).color;
+        assert!(irradia_measure::psnr(&got, &expected) > 60.0);
+    }
+}

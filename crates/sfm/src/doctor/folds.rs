@@ -1,0 +1,174 @@
+//! Pairs that cannot be right together: parts of a scene that look alike fold it.
+//!
+//! A two-view rotation may be wrong without harm: two fit a plane, and with little parallax many do. So a pair contradicts the
+//! rest only if no motion near the rotation that the rest predicts explains its matches.
+
+use super::{Diagnosis, Evidence, Turns, turns};
+use crate::Features;
+use crate::geometry::camera::DCamera;
+use crate::geometry::correspondences::sampson_squared;
+use crate::geometry::essential::{Motion, refine_motion};
+use crate::map::{PhotoInfo, Source, VerifiedPair, agreement, contradictions, strengths};
+use glam::{DQuat, DVec2};
+use irradia_scene::Rng;
+use rayon::prelude::*;
+
+/// Disagreement with the prediction from which on another motion is sought, radians.
+const DOUBTFUL: f64 = 0.17;
+/// Farthest from the prediction that such a motion may be, radians.
+const NEAR: f64 = 0.26;
+/// Matches of a pair that are looked at.
+const MATCHES: usize = 100;
+/// Directions of the translation that are tried.
+const TRIES: usize = 50;
+/// Errors at which matches agree, on the plane z = 1: roughly with a predicted rotation a few degrees off, then in steps.
+const STEPS: [f64; 3] = [0.06, 0.03, 0.012];
+/// The last is about eight pixels at the usual focal length: the lens is unknown yet.
+const AGREES: f64 = 0.01;
+/// Fraction of its matches that must agree with the rest.
+const EXPLAINED: f64 = 0.6;
+/// Fraction of the pairs without any motion near the prediction from which on the prediction is not believed.
+const UNSETTLED: f64 = 0.15;
+/// Contradicting pairs from which on parts may be taken for one another.
+const PAIRS: usize = 2;
+
+/// Rotations that agree with most pairs, and how well each pair agrees with them.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Consistency {
+    /// Rotations of all photographs.
+    pub turns: Turns,
+    /// `[pairs]` the fraction of the matches that some motion near the predicted rotation explains.
+    pub agree: Vec<f64>,
+}
+
+/// Looks for loops of pairs that cannot close: rotations from all pairs, and for those that disagree another motion near the
+/// prediction, until no more agree.
+pub fn consistency(
+    photos: &[PhotoInfo],
+    features: &[Features],
+    cameras: &[(DCamera, Source)],
+    pairs: &[VerifiedPair],
+) -> Consistency {
+    const ROUNDS: usize = 3;
+    let mut rotations: Vec<DQuat> = pairs.iter().map(|pair| pair.motion.rotation).collect();
+    let mut settled = turns(photos.len(), pairs, &rotations);
+    let mut agree = vec![1.0; pairs.len()];
+    for _ in 0..ROUNDS {
+        let found: Vec<(f64, Option<DQuat>)> = pairs
+            .par_iter()
+            .enumerate()
+            .map(|(i, pair)| {
+                let [a, b] = pair.photos.map(|p| settled.world_from_camera[p as usize]);
+                let (Some(a), Some(b)) = (a, b) else { return (1.0, None) };
+                if settled.disagreement[i] < DOUBTFUL {
+                    return (1.0, None);
+                }
+                let camera = |photo: usize| &cameras[photos[photo].group].0;
+                let points = on_plane(pair, features, &camera);
+                near_prediction(&points, b.inverse() * a, i as u64)
+            })
+            .collect();
+        let mut changed = false;
+        for (i, (fraction, rotation)) in found.into_iter().enumerate() {
+            agree[i] = fraction;
+            if let Some(rotation) = rotation {
+                rotations[i] = rotation;
+                changed = true;
+            }
+        }
+        if !changed {
+            break;
+        }
+        settled = turns(photos.len(), pairs, &rotations);
+    }
+    Consistency { turns: settled, agree }
+}
+
+impl Consistency {
+    /// Whether the rotations are those of most pairs: with long lenses, two-view rotations are ambiguous and often wrong.
+    pub fn is_settled(&self) -> bool {
+        let off = self.agree.iter().filter(|agree| **agree < 0.5).count();
+        (off as f64) < UNSETTLED * self.agree.len() as f64
+    }
+}
+
+/// Some of the matches of a pair on the planes z = 1.
+fn on_plane<'a>(pair: &VerifiedPair, features: &[Features], camera: &dyn Fn(usize) -> &'a DCamera) -> Vec<[DVec2; 2]> {
+    let thin = pair.matches.len().div_ceil(MATCHES).max(1);
+    let place = |side: usize, keypoint: u32| {
+        let photo = pair.photos[side] as usize;
+        let k = features[photo].keypoints[keypoint as usize];
+        camera(photo).unproject(DVec2::new(k.x.into(), k.y.into()))
+    };
+    let matches = pair.matches.iter().step_by(thin);
+    matches
+        .filter_map(|[i, j]| Some([place(0, *i)?, place(1, *j)?]))
+        .collect()
+}
+
+/// The fraction of the matches that agree with a motion, in front of both cameras.
+fn explained(motion: &Motion, points: &[[DVec2; 2]], threshold: f64) -> f64 {
+    let essential = motion.essential();
+    let agrees = |p: &&[DVec2; 2]| {
+        sampson_squared(&essential, **p) < threshold * threshold
+            // Far points are as likely just behind as in front: both rays must point the same way.
+            && (motion.rotation * p[0].extend(1.0)).dot(p[1].extend(1.0)) > 0.0
+    };
+    points.iter().filter(agrees).count() as f64 / points.len().max(1) as f64
+}
+
+/// The best motion whose rotation is near `predicted`: the fraction of matches that agree with it, and its rotation if it explains
+/// the pair.
+fn near_prediction(points: &[[DVec2; 2]], predicted: DQuat, seed: u64) -> (f64, Option<DQuat>) {
+    if points.len() < 8 {
+        return (1.0, None);
+    }
+    // The translation lies in the plane of both rays of each match.
+    let normal = |[a, b]: [DVec2; 2]| (predicted * a.extend(1.0)).cross(b.extend(1.0));
+    let mut rng = Rng::new(seed, 7);
+    let mut best: Option<(f64, Motion)> = None;
+    for _ in 0..TRIES {
+        let [i, j] = [0; 2].map(|_| rng.below(points.len() as u32) as usize);
+        let Some(translation) = normal(points[i]).cross(normal(points[j])).try_normalize() else {
+            continue;
+        };
+        let motion = Motion {
+            rotation: predicted,
+            translation,
+        };
+        let fraction = explained(&motion, points, STEPS[1]);
+        if best.is_none_or(|(most, _)| fraction > most) {
+            best = Some((fraction, motion));
+        }
+    }
+    let Some((_, mut motion)) = best else {
+        return (1.0, None);
+    };
+    for threshold in STEPS {
+        motion = refine_motion(motion, points, threshold, 3).unwrap_or(motion);
+    }
+    let angle = 2.0 * motion.rotation.dot(predicted).abs().min(1.0).acos();
+    if angle > NEAR {
+        return (0.0, None);
+    }
+    let fraction = explained(&motion, points, AGREES);
+    (fraction, (fraction > EXPLAINED).then_some(motion.rotation))
+}
+
+/// Repeated structures: neighbours that disagree with the model.
+pub(super) fn contradiction(evidence: &Evidence) -> Vec<Diagnosis> {
+    let Some(model) = evidence.model else { return Vec::new() };
+    let pairs = evidence.pairs;
+    let agreement = agreement(evidence.photos, evidence.features, pairs, model);
+    let strengths = strengths(evidence.photos, evidence.features, pairs);
+    let found = contradictions(pairs, &strengths, &agreement);
+    let Some(first) = found.first().copied().filter(|_| found.len() >= PAIRS) else {
+        return Vec::new();
+    };
+    vec![Diagnosis::Contradiction {
+        pairs: found.iter().map(|i| pairs[*i].photos.map(|p| p as usize)).collect(),
+        matches: pairs[first].matches.len(),
+        agree: agreement[first].unwrap_or(0.0),
+        of: agreement.iter().flatten().count(),
+    }]
+}

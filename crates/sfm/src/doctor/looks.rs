@@ -1,0 +1,155 @@
+//! Blur, exposure and texture of single photographs, relative to those that show the same.
+
+use super::{Diagnosis, Evidence, Graph, median};
+
+/// How many times less sharp than its neighbours a photograph is at which it is blurred: up to 2.6 in sharp close-ups of plain
+/// surfaces, 2.9 and more where a hand shook.
+const BLURRED: f64 = 2.7;
+/// Neighbours with which a photograph is compared.
+const NEIGHBOURS: usize = 6;
+/// Photographs before and after in the order of names that stand for neighbours where there are fewer than three partners.
+const IN_ORDER: usize = 3;
+
+/// Stops from the neighbours at which an exposure jumps: phones vary by half a stop from photograph to photograph.
+const JUMP: f64 = 1.0;
+/// Levels between which a colour tells the exposure, of 255.
+const TELLS: std::ops::RangeInclusive<u8> = 10..=245;
+/// Matches from which on a pair tells the difference in exposure.
+const ENOUGH_COLORS: usize = 12;
+/// Fractions of white or black pixels, beyond the median over all photographs, at which a photograph is clipped.
+const WHITE: f64 = 0.3;
+const BLACK: f64 = 0.4;
+
+/// Features below which a photograph has too few, and the fraction of the median below which it has.
+const FEATURES: usize = 150;
+const FEATURES_BY_MEDIAN: f64 = 0.1;
+
+/// The photographs that show most of what `photo` shows.
+fn neighbours(evidence: &Evidence, graph: &Graph, photo: usize) -> Vec<usize> {
+    let mut found: Vec<usize> = graph.partners[photo].iter().take(NEIGHBOURS).map(|p| p.0).collect();
+    if found.len() < IN_ORDER {
+        let n = evidence.photos.len();
+        let around = photo.saturating_sub(IN_ORDER)..(photo + IN_ORDER + 1).min(n);
+        for other in around.filter(|other| *other != photo) {
+            if !found.contains(&other) {
+                found.push(other);
+            }
+        }
+    }
+    found
+}
+
+/// Photographs that are less sharp than their neighbours.
+pub(super) fn blurred(evidence: &Evidence, graph: &Graph) -> Vec<Diagnosis> {
+    let sharpness = |photo: usize| f64::from(evidence.appearances[photo].sharpness);
+    (0..evidence.photos.len())
+        .filter_map(|photo| {
+            let neighbours = neighbours(evidence, graph, photo);
+            let usual = median(neighbours.iter().map(|p| sharpness(*p)).collect())?;
+            let own = sharpness(photo);
+            // Nothing to see is no blur.
+            (own > 0.0 && usual > BLURRED * own).then(|| Diagnosis::Blurred {
+                photo,
+                times: usual / own,
+                neighbours,
+            })
+        })
+        .collect()
+}
+
+/// Linear light of an sRGB level, apart from a factor.
+fn linear(color: [u8; 3]) -> f64 {
+    let [r, g, b] = color.map(f64::from);
+    (0.2126 * r + 0.7152 * g + 0.0722 * b).powf(2.2)
+}
+
+/// By how many stops the second photograph of each pair is brighter at its matches; `None` if too few tell.
+fn differences(evidence: &Evidence) -> Vec<Option<f64>> {
+    let tells = |color: &[u8; 3]| color.iter().all(|c| TELLS.contains(c));
+    let difference = |pair: &crate::map::VerifiedPair| {
+        let [a, b] = pair.photos.map(|p| &evidence.colors[p as usize]);
+        let stops: Vec<f64> = pair
+            .matches
+            .iter()
+            .map(|[i, j]| (a[*i as usize], b[*j as usize]))
+            .filter(|(a, b)| tells(a) && tells(b))
+            .map(|(a, b)| (linear(b) / linear(a)).log2())
+            .collect();
+        if stops.len() < ENOUGH_COLORS {
+            None
+        } else {
+            median(stops)
+        }
+    };
+    evidence.pairs.iter().map(difference).collect()
+}
+
+/// Photographs that are brighter or darker than their neighbours, or clipped.
+pub(super) fn exposure(evidence: &Evidence, graph: &Graph) -> Vec<Diagnosis> {
+    let differences = differences(evidence);
+    let usual = |of: fn(&super::Appearance) -> f32| {
+        median(evidence.appearances.iter().map(|a| f64::from(of(a))).collect()).unwrap_or(0.0)
+    };
+    let (white, black) = (usual(|a| a.white), usual(|a| a.black));
+    let mut found = Vec::new();
+    for photo in 0..evidence.photos.len() {
+        let telling: Vec<(usize, f64)> = graph.partners[photo]
+            .iter()
+            .filter_map(|(other, pair)| {
+                let difference = differences[*pair]?;
+                Some((*other, if *other < photo { difference } else { -difference }))
+            })
+            .take(NEIGHBOURS)
+            .collect();
+        let stops = median(telling.iter().map(|t| t.1).collect());
+        let own = evidence.appearances[photo];
+        if let Some(stops) = stops.filter(|stops| stops.abs() > JUMP) {
+            found.push(Diagnosis::ExposureJump {
+                photo,
+                stops,
+                neighbours: telling.into_iter().map(|t| t.0).collect(),
+            });
+        } else if f64::from(own.white) > white + WHITE {
+            found.push(Diagnosis::Clipped {
+                photo,
+                fraction: own.white.into(),
+                bright: true,
+            });
+        } else if f64::from(own.black) > black + BLACK {
+            found.push(Diagnosis::Clipped {
+                photo,
+                fraction: own.black.into(),
+                bright: false,
+            });
+        } else if stops.is_none() {
+            // Without matches, the brightness of the whole picture is all there is.
+            let neighbours = neighbours(evidence, graph, photo);
+            let brightness = |p: usize| f64::from(evidence.appearances[p].brightness.max(0.002));
+            let around = median(neighbours.iter().map(|p| brightness(*p)).collect());
+            let stops = around.map_or(0.0, |around| 2.2 * (brightness(photo) / around).log2());
+            if stops.abs() > 2.0 * JUMP {
+                found.push(Diagnosis::ExposureJump {
+                    photo,
+                    stops,
+                    neighbours,
+                });
+            }
+        }
+    }
+    found
+}
+
+/// Photographs with little texture.
+pub(super) fn few_features(evidence: &Evidence) -> Vec<Diagnosis> {
+    let counts: Vec<usize> = evidence.features.iter().map(|f| f.keypoints.len()).collect();
+    let median = median(counts.iter().map(|c| *c as f64).collect()).unwrap_or(0.0);
+    let least = (FEATURES_BY_MEDIAN * median).max(FEATURES as f64);
+    (0..counts.len())
+        .filter(|photo| (counts[*photo] as f64) < least)
+        .map(|photo| Diagnosis::FewFeatures {
+            photo,
+            features: counts[photo],
+            median: median as usize,
+        })
+        .collect()
+}

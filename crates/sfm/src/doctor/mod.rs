@@ -1,0 +1,226 @@
+//! The capture doctor: what is wrong with a set of photographs, in plain sentences with evidence.
+//!
+//! [`diagnose`] looks at pixels, features, pairs and, if there is one, the model. Every diagnosis is a pure function in the file
+//! of its family; thresholds are constants beside it, measured by the example `doctor` on injured and on clean captures.
+
+mod appearance;
+mod folds;
+mod lens;
+mod looks;
+mod motion;
+mod overlap;
+mod ring;
+mod shots;
+mod turns;
+mod types;
+
+pub use appearance::Appearance;
+pub use folds::{Consistency, consistency};
+pub use shots::{Shot, shots};
+pub use turns::{Turns, turns};
+pub use types::{Diagnosis, Kind};
+
+use crate::geometry::camera::DCamera;
+use crate::map::{LeftOut, Model, PairKind, PhotoInfo, Reason, Source, VerifiedPair};
+use crate::{Features, PairMatches};
+use std::collections::BTreeMap;
+
+/// Everything that is known of a capture. All that is by photograph has the same order.
+#[derive(Clone, Copy, Debug)]
+pub struct Evidence<'a> {
+    /// `[photos]`
+    pub photos: &'a [PhotoInfo],
+    /// `[photos]` figures of the pixels.
+    pub appearances: &'a [Appearance],
+    /// `[photos]`
+    pub features: &'a [Features],
+    /// `[photos]` the colour at each keypoint.
+    pub colors: &'a [Vec<[u8; 3]>],
+    /// Pairs before verification.
+    pub matches: &'a [PairMatches],
+    /// Pairs after it.
+    pub pairs: &'a [VerifiedPair],
+    /// `[groups]` the camera of each group before any adjustment, and where its focal length comes from.
+    pub cameras: &'a [(DCamera, Source)],
+    /// The largest model, if the photographs were mapped.
+    pub model: Option<&'a Model>,
+    /// What became of photographs without a pose, if the photographs were mapped.
+    pub left_out: &'a [LeftOut],
+}
+
+/// The partners of each photograph.
+struct Graph {
+    /// `[photos]` partner and index of the pair, those with most matches first.
+    partners: Vec<Vec<(usize, usize)>>,
+}
+
+/// Matches of a pair that holds photographs together. COLMAP accepts 15, of which chance alone reaches up to 20 among thousands of pairs.
+const HOLDS: usize = 25;
+
+impl Graph {
+    /// Of the pairs with at least `matches` matches.
+    fn new(photos: usize, pairs: &[VerifiedPair], matches: usize) -> Self {
+        let mut partners = vec![Vec::new(); photos];
+        for (i, pair) in pairs
+            .iter()
+            .enumerate()
+            .filter(|(_, pair)| pair.matches.len() >= matches)
+        {
+            let [a, b] = pair.photos.map(|p| p as usize);
+            partners[a].push((b, i));
+            partners[b].push((a, i));
+        }
+        for partners in &mut partners {
+            partners.sort_by_key(|(photo, i)| (std::cmp::Reverse(pairs[*i].matches.len()), *photo));
+        }
+        Self { partners }
+    }
+
+    /// Photographs in connected parts, largest first.
+    fn parts(&self) -> Vec<Vec<usize>> {
+        let mut part_of = vec![usize::MAX; self.partners.len()];
+        let mut parts: Vec<Vec<usize>> = Vec::new();
+        for start in 0..self.partners.len() {
+            if part_of[start] != usize::MAX {
+                continue;
+            }
+            let mut part = vec![start];
+            part_of[start] = parts.len();
+            let mut next = 0;
+            while next < part.len() {
+                for (other, _) in &self.partners[part[next]] {
+                    if part_of[*other] == usize::MAX {
+                        part_of[*other] = parts.len();
+                        part.push(*other);
+                    }
+                }
+                next += 1;
+            }
+            part.sort_unstable();
+            parts.push(part);
+        }
+        parts.sort_by_key(|part| (std::cmp::Reverse(part.len()), part[0]));
+        parts
+    }
+}
+
+/// All that is wrong with a capture, the gravest first.
+///
+/// # Panics
+/// When lengths or indices of `evidence` do not fit together.
+pub fn diagnose(evidence: &Evidence) -> Vec<Diagnosis> {
+    let n = evidence.photos.len();
+    assert!(
+        [
+            evidence.appearances.len(),
+            evidence.features.len(),
+            evidence.colors.len()
+        ] == [n; 3]
+    );
+    if n == 0 {
+        return Vec::new();
+    }
+    let graph = Graph::new(n, evidence.pairs, HOLDS);
+    let rotation_only = motion::rotation_only(evidence, &graph);
+    let still = motion::stands_still(evidence);
+    // Pairs on a turntable seem taken from one place.
+    let twice = if still.is_empty() {
+        motion::twice(evidence)
+    } else {
+        Vec::new()
+    };
+    let moving = if still.is_empty() {
+        motion::moving(evidence)
+    } else {
+        Vec::new()
+    };
+    let looks = [
+        looks::blurred(evidence, &graph),
+        looks::exposure(evidence, &graph),
+        looks::few_features(evidence),
+    ]
+    .concat();
+    let lens = [
+        lens::settings(evidence),
+        lens::zoom(evidence),
+        lens::focal_unknown(evidence),
+    ]
+    .concat();
+    let overlap = overlap::overlap(evidence, &graph);
+    let ring = match evidence.model {
+        Some(_) => ring::ring(evidence, &graph, &[]),
+        None => {
+            let found = consistency(evidence.photos, evidence.features, evidence.cameras, evidence.pairs);
+            match found.is_settled() {
+                true => ring::ring(evidence, &graph, &found.turns.world_from_camera),
+                false => Vec::new(),
+            }
+        }
+    };
+    let contradiction = folds::contradiction(evidence);
+    let known = [
+        contradiction,
+        rotation_only,
+        still,
+        overlap,
+        ring,
+        lens,
+        looks,
+        moving,
+        twice,
+    ]
+    .concat();
+    let left_out = left_out(evidence, &known);
+    [left_out, known].concat()
+}
+
+/// One reason for each photograph without a pose: what the doctor found there, else what the mapper says.
+fn left_out(evidence: &Evidence, known: &[Diagnosis]) -> Vec<Diagnosis> {
+    let mut causes: BTreeMap<usize, String> = BTreeMap::new();
+    for diagnosis in known {
+        let cause = match diagnosis {
+            Diagnosis::Blurred { times, .. } => {
+                format!("it is blurred, {times:.1} times less sharp than its neighbours")
+            }
+            Diagnosis::ExposureJump { stops, .. } => format!(
+                "it is {:.1} stops {} than its neighbours",
+                stops.abs(),
+                if *stops > 0.0 { "brighter" } else { "darker" }
+            ),
+            Diagnosis::Clipped { fraction, bright, .. } => format!(
+                "{:.0} % of it are {} without detail",
+                100.0 * fraction,
+                if *bright { "white" } else { "black" }
+            ),
+            Diagnosis::FewFeatures { features, .. } => format!("only {features} features: it shows little texture"),
+            Diagnosis::Zoom { ratio, .. } => format!("it has {ratio:.2} times the focal length of the others"),
+            _ => continue,
+        };
+        for photo in diagnosis.photos() {
+            causes.entry(photo).or_insert_with(|| cause.clone());
+        }
+    }
+    evidence
+        .left_out
+        .iter()
+        .map(|left| Diagnosis::LeftOut {
+            photo: left.photo,
+            // A photograph from the same place as all its partners is good as a photograph.
+            reason: match (causes.get(&left.photo), left.reason) {
+                (_, Reason::RotationOnly { .. }) | (None, _) => left.reason.to_string(),
+                (Some(cause), _) => cause.clone(),
+            },
+        })
+        .collect()
+}
+
+/// The median; `None` of nothing.
+fn median(mut values: Vec<f64>) -> Option<f64> {
+    let middle = values.len() / 2;
+    (!values.is_empty()).then(|| *values.select_nth_unstable_by(middle, f64::total_cmp).1)
+}
+
+/// The pair's kind is a turn on the spot.
+fn turns_only(pair: &VerifiedPair) -> bool {
+    pair.kind == PairKind::Rotation
+}

@@ -1,0 +1,106 @@
+//! Where to stand to mend a capture.
+
+use super::Diagnosis;
+use crate::geometry::pose::DPose;
+use crate::map::Model;
+use glam::{DQuat, DVec3};
+
+/// Degrees between photographs around a scene that match well.
+const STEP: f64 = 15.0;
+/// Photographs at most for one fault.
+const MOST: usize = 8;
+/// Degrees, seen from the middle of the model, from which on the way between two cameras is an arc around it.
+const ARC: f64 = 10.0;
+
+/// A place for a photograph.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Shot {
+    /// World of the model.
+    pub position: DVec3,
+    /// Unit viewing direction, world.
+    pub forward: DVec3,
+}
+
+/// Photographs that would mend a fault between two posed photographs, from one to the other; none for other faults.
+pub fn shots(diagnosis: &Diagnosis, model: &Model) -> Vec<Shot> {
+    let ([a, b], least) = match diagnosis {
+        Diagnosis::Gap { sides: ends, .. } | Diagnosis::OpenLoop { ends, .. } => (*ends, 1),
+        Diagnosis::Bridge { photos, .. } => (*photos, 2),
+        Diagnosis::CutPoint { .. } | Diagnosis::FewPartners { .. } => match diagnosis.sides() {
+            (a, Some(b)) => ([a, b], 2),
+            _ => return Vec::new(),
+        },
+        _ => return Vec::new(),
+    };
+    match (model.poses[a], model.poses[b]) {
+        (Some(a), Some(b)) => between(&a, &b, least),
+        _ => Vec::new(),
+    }
+}
+
+/// Poses between two, around the vertical axis through the middle of the model where both are on different sides of it.
+fn between(a: &DPose, b: &DPose, least: usize) -> Vec<Shot> {
+    let azimuth = |p: DVec3| p.y.atan2(p.x);
+    let turn = (azimuth(b.position) - azimuth(a.position) + std::f64::consts::PI).rem_euclid(std::f64::consts::TAU)
+        - std::f64::consts::PI;
+    let forward = [a, b].map(|pose| pose.rotation * DVec3::Z);
+    let apart = forward[0]
+        .angle_between(forward[1])
+        .to_degrees()
+        .max(turn.to_degrees().abs());
+    let count = ((apart / STEP).ceil() as usize).saturating_sub(1).clamp(least, MOST);
+    let shot = |i: usize| {
+        let t = (i + 1) as f64 / (count + 1) as f64;
+        let straight = a.position.lerp(b.position, t);
+        let position = if turn.to_degrees().abs() < ARC {
+            straight
+        } else {
+            let radius = |p: DVec3| p.truncate().length();
+            let radius = radius(a.position) * (1.0 - t) + radius(b.position) * t;
+            let (sin, cos) = (azimuth(a.position) + t * turn).sin_cos();
+            DVec3::new(radius * cos, radius * sin, straight.z)
+        };
+        let arc = DQuat::from_rotation_arc(forward[0], forward[1]);
+        let forward = (DQuat::IDENTITY.slerp(arc, t) * forward[0]).normalize_or(DVec3::X);
+        Shot { position, forward }
+    };
+    (0..count).map(shot).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A camera on the unit circle that looks at the origin.
+    fn at(degrees: f64) -> DPose {
+        let position = DQuat::from_rotation_z(degrees.to_radians()) * DVec3::X;
+        DPose {
+            rotation: DQuat::from_rotation_arc(DVec3::Z, -position),
+            position,
+        }
+    }
+
+    #[test]
+    fn a_gap_is_filled_along_its_arc() {
+        let model = Model {
+            poses: vec![Some(at(0.0)), Some(at(60.0)), None],
+            ..Model::default()
+        };
+        let gap = Diagnosis::Gap {
+            sides: [0, 1],
+            degrees: 60.0,
+        };
+        let found = shots(&gap, &model);
+        assert_eq!(found.len(), 3);
+        for (shot, degrees) in found.iter().zip([15.0, 30.0, 45.0]) {
+            assert!((shot.position - at(degrees).position).length() < 1e-6);
+            assert!((shot.forward + shot.position).length() < 1e-6);
+        }
+        let unposed = Diagnosis::Gap {
+            sides: [0, 2],
+            degrees: 60.0,
+        };
+        assert!(shots(&unposed, &model).is_empty());
+        assert!(shots(&Diagnosis::Twice { photos: [0, 1] }, &model).is_empty());
+    }
+}

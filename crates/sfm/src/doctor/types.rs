@@ -1,0 +1,463 @@
+//! What the doctor can find, one variant a diagnosis, each with its evidence and one sentence.
+
+use std::fmt::{self, Display, Formatter};
+
+/// The family of a diagnosis, by which tests and reports count them.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum Kind {
+    /// [`Diagnosis::Blurred`]
+    Blurred,
+    /// [`Diagnosis::ExposureJump`] and [`Diagnosis::Clipped`]
+    Exposure,
+    /// [`Diagnosis::FewFeatures`]
+    FewFeatures,
+    /// [`Diagnosis::Zoom`] and [`Diagnosis::ZoomSettings`]
+    Zoom,
+    /// [`Diagnosis::FocalUnknown`]
+    FocalUnknown,
+    /// [`Diagnosis::SeparateParts`]
+    SeparateParts,
+    /// [`Diagnosis::Bridge`] and [`Diagnosis::CutPoint`]
+    WeakLink,
+    /// [`Diagnosis::FewPartners`]
+    FewPartners,
+    /// [`Diagnosis::Gap`]
+    Gap,
+    /// [`Diagnosis::OpenLoop`]
+    OpenLoop,
+    /// [`Diagnosis::RotationOnly`]
+    RotationOnly,
+    /// [`Diagnosis::StandsStill`]
+    StandsStill,
+    /// [`Diagnosis::Moving`]
+    Moving,
+    /// [`Diagnosis::Twice`]
+    Twice,
+    /// [`Diagnosis::Contradiction`]
+    Contradiction,
+    /// [`Diagnosis::LeftOut`]
+    LeftOut,
+}
+
+impl Kind {
+    /// Its name in `doctor.json`.
+    pub fn name(self) -> &'static str {
+        match self {
+            Kind::Blurred => "blurred",
+            Kind::Exposure => "exposure",
+            Kind::FewFeatures => "few-features",
+            Kind::Zoom => "zoom",
+            Kind::FocalUnknown => "focal-unknown",
+            Kind::SeparateParts => "separate-parts",
+            Kind::WeakLink => "weak-link",
+            Kind::FewPartners => "few-partners",
+            Kind::Gap => "gap",
+            Kind::OpenLoop => "open-loop",
+            Kind::RotationOnly => "rotation-only",
+            Kind::StandsStill => "stands-still",
+            Kind::Moving => "moving",
+            Kind::Twice => "twice",
+            Kind::Contradiction => "contradiction",
+            Kind::LeftOut => "left-out",
+        }
+    }
+}
+
+/// A fault of a capture, with its evidence. Photographs are indices.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Diagnosis {
+    /// Less sharp than those that show the same.
+    Blurred {
+        /// The photograph.
+        photo: usize,
+        /// How many times less sharp than the median of its neighbours.
+        times: f64,
+        /// Those neighbours.
+        neighbours: Vec<usize>,
+    },
+    /// Brighter or darker than those that show the same.
+    ExposureJump {
+        /// The photograph.
+        photo: usize,
+        /// Difference from its neighbours, in stops; positive if brighter.
+        stops: f64,
+        /// Those neighbours.
+        neighbours: Vec<usize>,
+    },
+    /// Much of it is white or black, unlike the others.
+    Clipped {
+        /// The photograph.
+        photo: usize,
+        /// Fraction of its pixels.
+        fraction: f64,
+        /// White rather than black.
+        bright: bool,
+    },
+    /// Without texture.
+    FewFeatures {
+        /// The photograph.
+        photo: usize,
+        /// Its features.
+        features: usize,
+        /// Those of half of the photographs.
+        median: usize,
+    },
+    /// Taken with another focal length than the others of its camera.
+    Zoom {
+        /// The photographs of one focal length.
+        photos: Vec<usize>,
+        /// That focal length by the one of the others.
+        ratio: f64,
+    },
+    /// The metadata name several focal lengths.
+    ZoomSettings {
+        /// Focal lengths in long sides, each with its photographs.
+        settings: Vec<(f64, Vec<usize>)>,
+    },
+    /// The matches fit all focal lengths alike.
+    FocalUnknown {
+        /// Photographs of the camera.
+        photos: Vec<usize>,
+    },
+    /// Parts of the capture without any overlap.
+    SeparateParts {
+        /// Photographs by part, largest first.
+        parts: Vec<Vec<usize>>,
+    },
+    /// Two parts are held together by one pair of photographs.
+    Bridge {
+        /// The pair.
+        photos: [usize; 2],
+        /// Photographs on each side.
+        sides: [usize; 2],
+    },
+    /// Two parts are held together by one photograph.
+    CutPoint {
+        /// The photograph.
+        photo: usize,
+        /// Photographs of the smaller part.
+        behind: Vec<usize>,
+    },
+    /// Fewer than three partners.
+    FewPartners {
+        /// The photograph.
+        photo: usize,
+        /// Its partners.
+        partners: Vec<usize>,
+    },
+    /// A stretch around the scene without photographs.
+    Gap {
+        /// The photographs on both sides.
+        sides: [usize; 2],
+        /// Its width as seen from the middle, degrees.
+        degrees: f64,
+    },
+    /// A chain of photographs around the scene whose ends do not meet.
+    OpenLoop {
+        /// Both ends.
+        ends: [usize; 2],
+        /// The angle between them, degrees.
+        degrees: f64,
+    },
+    /// Photographs from one place.
+    RotationOnly {
+        /// The photographs.
+        photos: Vec<usize>,
+        /// Pairs among them.
+        pairs: usize,
+    },
+    /// A part of the pictures stands still while the rest moves.
+    StandsStill {
+        /// Photographs of such pairs.
+        photos: Vec<usize>,
+        /// Such pairs, and all that were compared.
+        pairs: [usize; 2],
+        /// Median fraction of the matches that stands still.
+        fraction: f64,
+    },
+    /// Something moved between photographs.
+    Moving {
+        /// Photographs of such pairs.
+        photos: Vec<usize>,
+        /// Such pairs, and all that were compared.
+        pairs: [usize; 2],
+        /// Median matches on what moved.
+        matches: usize,
+    },
+    /// Two photographs of the same from the same place.
+    Twice {
+        /// The photographs.
+        photos: [usize; 2],
+    },
+    /// Pairs that cannot all be right: repeated structures look like one.
+    Contradiction {
+        /// The pairs that contradict the rest, those with most matches first.
+        pairs: Vec<[usize; 2]>,
+        /// Matches of the first.
+        matches: usize,
+        /// The fraction of them that agrees with the rest.
+        agree: f64,
+        /// Verified pairs in all.
+        of: usize,
+    },
+    /// A photograph without a pose.
+    LeftOut {
+        /// The photograph.
+        photo: usize,
+        /// The one reason.
+        reason: String,
+    },
+}
+
+impl Diagnosis {
+    /// The family.
+    pub fn kind(&self) -> Kind {
+        match self {
+            Diagnosis::Blurred { .. } => Kind::Blurred,
+            Diagnosis::ExposureJump { .. } | Diagnosis::Clipped { .. } => Kind::Exposure,
+            Diagnosis::FewFeatures { .. } => Kind::FewFeatures,
+            Diagnosis::Zoom { .. } | Diagnosis::ZoomSettings { .. } => Kind::Zoom,
+            Diagnosis::FocalUnknown { .. } => Kind::FocalUnknown,
+            Diagnosis::SeparateParts { .. } => Kind::SeparateParts,
+            Diagnosis::Bridge { .. } | Diagnosis::CutPoint { .. } => Kind::WeakLink,
+            Diagnosis::FewPartners { .. } => Kind::FewPartners,
+            Diagnosis::Gap { .. } => Kind::Gap,
+            Diagnosis::OpenLoop { .. } => Kind::OpenLoop,
+            Diagnosis::RotationOnly { .. } => Kind::RotationOnly,
+            Diagnosis::StandsStill { .. } => Kind::StandsStill,
+            Diagnosis::Moving { .. } => Kind::Moving,
+            Diagnosis::Twice { .. } => Kind::Twice,
+            Diagnosis::Contradiction { .. } => Kind::Contradiction,
+            Diagnosis::LeftOut { .. } => Kind::LeftOut,
+        }
+    }
+
+    /// The photographs at fault.
+    pub fn photos(&self) -> Vec<usize> {
+        match self {
+            Diagnosis::Blurred { photo, .. }
+            | Diagnosis::ExposureJump { photo, .. }
+            | Diagnosis::Clipped { photo, .. }
+            | Diagnosis::FewFeatures { photo, .. }
+            | Diagnosis::CutPoint { photo, .. }
+            | Diagnosis::FewPartners { photo, .. }
+            | Diagnosis::LeftOut { photo, .. } => vec![*photo],
+            Diagnosis::Zoom { photos, .. }
+            | Diagnosis::FocalUnknown { photos }
+            | Diagnosis::RotationOnly { photos, .. }
+            | Diagnosis::StandsStill { photos, .. }
+            | Diagnosis::Moving { photos, .. } => photos.clone(),
+            Diagnosis::ZoomSettings { settings } => settings.iter().flat_map(|s| s.1.clone()).collect(),
+            Diagnosis::SeparateParts { parts } => parts.iter().skip(1).flatten().copied().collect(),
+            Diagnosis::Bridge { photos, .. } | Diagnosis::Twice { photos } => photos.to_vec(),
+            Diagnosis::Gap { sides: ends, .. } | Diagnosis::OpenLoop { ends, .. } => ends.to_vec(),
+            Diagnosis::Contradiction { pairs, .. } => pairs.iter().flatten().copied().collect(),
+        }
+    }
+
+    /// Two photographs, one of each side, that show what is wrong; the second is missing where there is one side only.
+    pub fn sides(&self) -> (usize, Option<usize>) {
+        match self {
+            Diagnosis::Blurred { photo, neighbours, .. } | Diagnosis::ExposureJump { photo, neighbours, .. } => {
+                (*photo, neighbours.first().copied())
+            }
+            Diagnosis::CutPoint { photo, behind } => (*photo, behind.first().copied()),
+            Diagnosis::FewPartners { photo, partners } => (*photo, partners.first().copied()),
+            Diagnosis::SeparateParts { parts } => (parts[0][0], parts.get(1).map(|part| part[0])),
+            Diagnosis::ZoomSettings { settings } => (settings[0].1[0], settings.get(1).map(|other| other.1[0])),
+            other => {
+                let photos = other.photos();
+                (photos.first().copied().unwrap_or(0), photos.get(1).copied())
+            }
+        }
+    }
+
+    /// One sentence, with the photographs' `names`.
+    pub fn sentence<'a>(&'a self, names: &'a [String]) -> impl Display + 'a {
+        Sentence { diagnosis: self, names }
+    }
+}
+
+/// A diagnosis with the names of its photographs.
+struct Sentence<'a> {
+    diagnosis: &'a Diagnosis,
+    names: &'a [String],
+}
+
+impl Sentence<'_> {
+    /// `a.jpg, b.jpg, c.jpg and 12 others`
+    fn list(&self, photos: &[usize]) -> String {
+        const SHOWN: usize = 4;
+        let shown: Vec<&str> = photos.iter().take(SHOWN).map(|p| self.names[*p].as_str()).collect();
+        match photos.len() {
+            0 => "none".into(),
+            n if n <= SHOWN => shown.join(", "),
+            n => format!("{} and {} others", shown.join(", "), n - SHOWN),
+        }
+    }
+}
+
+impl Display for Sentence<'_> {
+    fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
+        let name = |photo: &usize| self.names[*photo].as_str();
+        match self.diagnosis {
+            Diagnosis::Blurred {
+                photo,
+                times,
+                neighbours,
+            } => write!(
+                f,
+                "{} is blurred: {times:.1} times less sharp than {}, which show the same; take it again, or delete it",
+                name(photo),
+                self.list(neighbours)
+            ),
+            Diagnosis::ExposureJump {
+                photo,
+                stops,
+                neighbours,
+            } => write!(
+                f,
+                "{} is {:.1} stops {} than {}, which show the same; lock the exposure",
+                name(photo),
+                stops.abs(),
+                if *stops > 0.0 { "brighter" } else { "darker" },
+                self.list(neighbours)
+            ),
+            Diagnosis::Clipped {
+                photo,
+                fraction,
+                bright,
+            } => write!(
+                f,
+                "{:.0} % of {} are {} without detail, far more than in the others; expose it as them",
+                100.0 * fraction,
+                name(photo),
+                if *bright { "white" } else { "black" }
+            ),
+            Diagnosis::FewFeatures {
+                photo,
+                features,
+                median,
+            } => write!(
+                f,
+                "{} has {features} features where half of the photographs have {median} or more: it shows little texture; \
+                 include something textured",
+                name(photo)
+            ),
+            Diagnosis::Zoom { photos, ratio } => write!(
+                f,
+                "{} {} taken with {ratio:.2} times the focal length of the others; do not zoom",
+                self.list(photos),
+                if photos.len() == 1 { "was" } else { "were" }
+            ),
+            Diagnosis::ZoomSettings { settings } => {
+                let settings: Vec<String> = settings
+                    .iter()
+                    .map(|(focal, photos)| format!("{focal:.2} (as {})", name(&photos[0])))
+                    .collect();
+                write!(
+                    f,
+                    "the focal length differs between photographs: {} long sides; each setting needs enough photographs of its own",
+                    settings.join(", ")
+                )
+            }
+            Diagnosis::FocalUnknown { photos } => write!(
+                f,
+                "the focal length of {} is a guess: all values fit, as for a plane or for turns on the spot; take some from nearer, \
+                 farther and aside",
+                self.list(photos)
+            ),
+            Diagnosis::SeparateParts { parts } => write!(
+                f,
+                "the photographs fall into {} parts without overlap, of {} photographs, such as {} and {}; take some between them",
+                parts.len(),
+                parts.iter().map(|p| p.len().to_string()).collect::<Vec<_>>().join(", "),
+                name(&parts[0][0]),
+                name(&parts[1][0])
+            ),
+            Diagnosis::Bridge { photos: [a, b], sides } => write!(
+                f,
+                "only {} and {} hold {} and {} photographs together; take more between them",
+                name(a),
+                name(b),
+                sides[0],
+                sides[1]
+            ),
+            Diagnosis::CutPoint { photo, behind } => write!(
+                f,
+                "without {} nothing would hold {} and the rest together; take more around it",
+                name(photo),
+                self.list(behind)
+            ),
+            Diagnosis::FewPartners { photo, partners } => write!(
+                f,
+                "{} overlaps with {} other {}, fewer than 3; take more around it",
+                name(photo),
+                partners.len(),
+                if partners.len() == 1 {
+                    "photograph"
+                } else {
+                    "photographs"
+                }
+            ),
+            Diagnosis::Gap { sides: [a, b], degrees } => write!(
+                f,
+                "there is a gap of {degrees:.0} degrees between {} and {}; take photographs there",
+                name(a),
+                name(b)
+            ),
+            Diagnosis::OpenLoop { ends: [a, b], degrees } => write!(
+                f,
+                "the way around the scene is not closed: {} and {}, {degrees:.0} degrees apart, have no matches; take photographs between them",
+                name(a),
+                name(b)
+            ),
+            Diagnosis::RotationOnly { photos, pairs } => write!(
+                f,
+                "{} were taken from one place ({pairs} pairs only turn); step aside between photographs",
+                self.list(photos)
+            ),
+            Diagnosis::StandsStill {
+                photos,
+                pairs,
+                fraction,
+            } => write!(
+                f,
+                "{:.0} % of the matches stand still while the rest moves, in {} of {} pairs, such as {}: a turntable before a fixed \
+                 background, or writing on the pictures; mask it",
+                100.0 * fraction,
+                pairs[0],
+                pairs[1],
+                self.list(photos)
+            ),
+            Diagnosis::Moving { photos, pairs, matches } => write!(
+                f,
+                "something moves, or repeats: {matches} matches follow a motion of their own in {} of {} pairs, among {}; mask it",
+                pairs[0],
+                pairs[1],
+                self.list(photos)
+            ),
+            Diagnosis::Twice { photos: [a, b] } => write!(
+                f,
+                "{} and {} show the same from the same place; delete one",
+                name(a),
+                name(b)
+            ),
+            Diagnosis::Contradiction {
+                pairs,
+                matches,
+                agree,
+                of,
+            } => write!(
+                f,
+                "{} of {of} pairs contradict the others, such as {} and {}, where {:.0} % of {matches} matches agree with them: parts \
+                 that look alike may be taken for one another, and the model may be folded; include what tells them apart",
+                pairs.len(),
+                name(&pairs[0][0]),
+                name(&pairs[0][1]),
+                100.0 * agree
+            ),
+            Diagnosis::LeftOut { photo, reason } => write!(f, "{} is left out: {reason}", name(photo)),
+        }
+    }
+}

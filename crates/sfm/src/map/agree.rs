@@ -1,0 +1,157 @@
+//! Which pairs agree with a model: a scene with parts that look alike may be folded, and the pairs across the fold tell.
+
+use super::types::{Model, PhotoInfo, VerifiedPair};
+use crate::Features;
+use crate::geometry::camera::DCamera;
+use crate::geometry::correspondences::sampson_squared;
+use crate::geometry::essential::Motion;
+use glam::{DVec2, DVec3};
+use rayon::prelude::*;
+use std::collections::BTreeSet;
+
+/// Matches of a pair that are looked at.
+const MATCHES: usize = 100;
+/// Largest error of a match that agrees, on the plane z = 1: about eight pixels at the usual focal length.
+const AGREES: f64 = 0.01;
+/// Fraction of the matches of a pair below which it contradicts the model.
+pub(super) const CONTRADICTS: f64 = 0.3;
+/// Distance of two cameras, in units of the model, below which their pair only turns.
+const BASELINE: f64 = 0.003;
+/// Partners of a photograph, the strongest, that are its neighbours: what looks alike shares less than what is the same.
+const NEIGHBOURS: usize = 3;
+/// Cells along the long side of a picture in which matches are counted once.
+const CELLS: f32 = 16.0;
+/// Steps along the tree of the strongest pairs within which pairs are used first.
+const HOPS: usize = 4;
+/// Matches of neighbours that tell.
+const TELLS: usize = 30;
+
+/// The fraction of the matches of each pair that agree with a model; `None` where it does not tell.
+pub fn agreement(
+    photos: &[PhotoInfo],
+    features: &[Features],
+    pairs: &[VerifiedPair],
+    model: &Model,
+) -> Vec<Option<f64>> {
+    let agrees = |pair: &VerifiedPair| {
+        let [a, b] = pair.photos.map(|p| model.poses[p as usize]);
+        let (a, b) = (a?, b?);
+        let [camera_a, camera_b] = pair.photos.map(|p| model.cameras[photos[p as usize].group].as_ref());
+        let (camera_a, camera_b) = (camera_a?, camera_b?);
+        let points = on_planes(pair, features, [camera_a, camera_b]);
+        let rotation = b.rotation.inverse() * a.rotation;
+        let shift = b.camera_from_world(a.position);
+        if shift.length() < BASELINE {
+            let close = |[first, second]: &&[DVec2; 2]| {
+                let turned: DVec3 = rotation * first.extend(1.0);
+                turned.z > 0.0 && (turned.truncate() / turned.z - *second).length() < AGREES
+            };
+            return Some(points.iter().filter(close).count() as f64 / points.len().max(1) as f64);
+        }
+        let motion = Motion {
+            rotation,
+            translation: shift.normalize(),
+        };
+        let essential = motion.essential();
+        let agrees = |p: &&[DVec2; 2]| {
+            sampson_squared(&essential, **p) < AGREES * AGREES
+                // Far points are as likely just behind as in front: both rays must point the same way.
+                && (rotation * p[0].extend(1.0)).dot(p[1].extend(1.0)) > 0.0
+        };
+        Some(points.iter().filter(agrees).count() as f64 / points.len().max(1) as f64)
+    };
+    pairs.par_iter().map(agrees).collect()
+}
+
+/// Some of the matches of a pair on the planes z = 1.
+fn on_planes(pair: &VerifiedPair, features: &[Features], cameras: [&DCamera; 2]) -> Vec<[DVec2; 2]> {
+    let thin = pair.matches.len().div_ceil(MATCHES).max(1);
+    let place = |side: usize, keypoint: u32| {
+        let k = features[pair.photos[side] as usize].keypoints[keypoint as usize];
+        cameras[side].unproject(DVec2::new(k.x.into(), k.y.into()))
+    };
+    let matches = pair.matches.iter().step_by(thin);
+    matches
+        .filter_map(|[i, j]| Some([place(0, *i)?, place(1, *j)?]))
+        .collect()
+}
+
+/// `[pairs]` how strong each pair is: the part of the pictures that its matches cover, by that of the third-best pair of the
+/// less covered of its photographs; 1 and more for neighbours. A label that occurs twice has many matches, but on a small part.
+pub fn strengths(photos: &[PhotoInfo], features: &[Features], pairs: &[VerifiedPair]) -> Vec<f64> {
+    let covered: Vec<usize> = pairs.par_iter().map(|pair| covered(photos, features, pair)).collect();
+    let mut of_photo: Vec<Vec<usize>> = vec![Vec::new(); photos.len()];
+    for (pair, covered) in pairs.iter().zip(&covered) {
+        pair.photos.iter().for_each(|p| of_photo[*p as usize].push(*covered));
+    }
+    for of in &mut of_photo {
+        of.sort_unstable_by_key(|covered| std::cmp::Reverse(*covered));
+    }
+    let usual = |photo: u32| {
+        let of = &of_photo[photo as usize];
+        of[NEIGHBOURS.min(of.len()) - 1]
+    };
+    let least = |pair: &VerifiedPair| pair.photos.map(usual).into_iter().min().unwrap_or(1).max(1);
+    pairs
+        .iter()
+        .zip(&covered)
+        .map(|(pair, covered)| *covered as f64 / least(pair) as f64)
+        .collect()
+}
+
+/// Cells with a match in the photograph where they are fewer.
+fn covered(photos: &[PhotoInfo], features: &[Features], pair: &VerifiedPair) -> usize {
+    let of_side = |side: usize| {
+        let photo = pair.photos[side] as usize;
+        let cell = photos[photo].width.max(photos[photo].height) as f32 / CELLS;
+        let place = |seen: &[u32; 2]| {
+            let k = features[photo].keypoints[seen[side] as usize];
+            ((k.x / cell) as u32, (k.y / cell) as u32)
+        };
+        pair.matches.iter().map(place).collect::<BTreeSet<_>>().len()
+    };
+    of_side(0).min(of_side(1))
+}
+
+/// Neighbours whose matches contradict the model, those with most matches first: where it is folded.
+pub fn contradictions(pairs: &[VerifiedPair], strengths: &[f64], agreement: &[Option<f64>]) -> Vec<usize> {
+    let mut found: Vec<usize> = (0..pairs.len())
+        .filter(|i| {
+            pairs[*i].matches.len() >= TELLS && strengths[*i] >= 1.0 && agreement[*i].is_some_and(|a| a < CONTRADICTS)
+        })
+        .collect();
+    found.sort_by_key(|i| (std::cmp::Reverse(pairs[*i].matches.len()), *i));
+    found
+}
+
+/// The strongest pairs that join all photographs, without loops.
+pub fn spanning_tree(photos: usize, pairs: &[VerifiedPair], strengths: &[f64]) -> Vec<usize> {
+    let mut order: Vec<usize> = (0..pairs.len()).collect();
+    order.sort_by(|a, b| strengths[*b].total_cmp(&strengths[*a]).then(a.cmp(b)));
+    let mut part: Vec<u32> = (0..photos as u32).collect();
+    order.retain(|i| {
+        let [to, from] = pairs[*i].photos.map(|p| part[p as usize]);
+        part.iter_mut()
+            .filter(|part| **part == from)
+            .for_each(|part| *part = to);
+        to != from
+    });
+    order
+}
+
+/// `[pairs]` whether at most [`HOPS`] pairs of `tree` join both photographs of each pair.
+pub fn near_in_tree(photos: usize, pairs: &[VerifiedPair], tree: &[usize]) -> Vec<bool> {
+    let mut near: Vec<BTreeSet<usize>> = (0..photos).map(|photo| BTreeSet::from([photo])).collect();
+    for _ in 0..HOPS {
+        let before = near.clone();
+        for i in tree {
+            let [a, b] = pairs[*i].photos.map(|p| p as usize);
+            near[a].extend(&before[b]);
+            near[b].extend(&before[a]);
+        }
+    }
+    pairs
+        .iter()
+        .map(|pair| near[pair.photos[0] as usize].contains(&(pair.photos[1] as usize)))
+        .collect()
+}

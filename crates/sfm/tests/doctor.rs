@@ -1,0 +1,239 @@
+//! The doctor on synthetic worlds: each fault is found where it is, and not elsewhere.
+
+mod world;
+
+use glam::{DQuat, DVec3};
+use irradia_sfm::Features;
+use irradia_sfm::doctor::{Appearance, Diagnosis, Evidence, Kind, diagnose};
+use irradia_sfm::geometry::pose::DPose;
+use irradia_sfm::map::{MapOptions, verify};
+use world::{World, around, look};
+
+/// All diagnoses of a world: with the model, and from its pairs alone.
+fn examine(world: &World, appearances: &[Appearance], colors: &[Vec<[u8; 3]>]) -> [Vec<Diagnosis>; 2] {
+    let found = world.map();
+    let (cameras, pairs) = verify(
+        &world.photos,
+        &world.features,
+        &world.pairs,
+        &MapOptions::default(),
+        &mut |_| (),
+    );
+    let evidence = Evidence {
+        photos: &world.photos,
+        appearances,
+        features: &world.features,
+        colors,
+        matches: &world.pairs,
+        pairs: &pairs,
+        cameras: &cameras,
+        model: found.models.first(),
+        left_out: &found.left_out,
+    };
+    let alone = Evidence {
+        model: None,
+        left_out: &[],
+        ..evidence
+    };
+    [diagnose(&evidence), diagnose(&alone)]
+}
+
+fn sharp(world: &World) -> Vec<Appearance> {
+    vec![Appearance::from_array([0.1, 0.5, 0.0, 0.0]); world.photos.len()]
+}
+
+fn grey(world: &World) -> Vec<Vec<[u8; 3]>> {
+    world
+        .features
+        .iter()
+        .map(|f| vec![[128; 3]; f.keypoints.len()])
+        .collect()
+}
+
+fn plainly(world: &World) -> [Vec<Diagnosis>; 2] {
+    examine(world, &sharp(world), &grey(world))
+}
+
+fn kinds(found: &[Diagnosis]) -> Vec<Kind> {
+    found.iter().map(Diagnosis::kind).collect()
+}
+
+/// A ring of `n` around a scene of `points`, without the photographs `gone`.
+fn ring(n: usize, points: usize, gone: std::ops::Range<usize>) -> World {
+    let poses = around(n, 1.0)
+        .into_iter()
+        .enumerate()
+        .filter(|(i, _)| !gone.contains(i))
+        .map(|p| p.1);
+    World::new(poses.collect(), points, 0.5, 0.1, 21)
+}
+
+#[test]
+fn nothing_is_wrong_with_a_good_ring() {
+    for found in plainly(&ring(24, 2500, 0..0)) {
+        assert_eq!(found, []);
+    }
+}
+
+#[test]
+fn photographs_are_compared_with_their_neighbours() {
+    let world = ring(24, 2500, 0..0);
+    let (mut appearances, mut colors) = (sharp(&world), grey(&world));
+    appearances[5].sharpness = 0.02;
+    // Gamma 2.2: a quarter of the light.
+    colors[9] = vec![[68; 3]; colors[9].len()];
+    appearances[14].white = 0.6;
+    for found in examine(&world, &appearances, &colors) {
+        assert_eq!(
+            kinds(&found),
+            [Kind::Blurred, Kind::Exposure, Kind::Exposure],
+            "{found:?}"
+        );
+        assert!(matches!(found[0], Diagnosis::Blurred { photo: 5, times, .. } if (times - 5.0).abs() < 0.1));
+        assert!(matches!(found[1], Diagnosis::ExposureJump { photo: 9, stops, .. } if (stops + 2.0).abs() < 0.1));
+        assert!(matches!(
+            found[2],
+            Diagnosis::Clipped {
+                photo: 14,
+                bright: true,
+                ..
+            }
+        ));
+        let names: Vec<String> = world.photos.iter().map(|p| p.name.clone()).collect();
+        let sentence = found[1].sentence(&names).to_string();
+        assert!(sentence.starts_with("009.jpg is 2.0 stops darker than "), "{sentence}");
+    }
+}
+
+#[test]
+fn a_gap_in_a_ring_and_an_open_loop_are_told_apart() {
+    // 7.5 degrees between photographs; facing points are seen over about 50 degrees.
+    for (gone, kind, width) in [(10..20, Kind::Gap, 82.5), (44..48, Kind::OpenLoop, 37.5)] {
+        let mut world = ring(48, 2500, gone.clone());
+        // Features match over 30 degrees at most.
+        let azimuth = |pose: &DPose| pose.position.y.atan2(pose.position.x);
+        let poses = world.poses.clone();
+        world.pairs.retain(|pair| {
+            let [a, b] = pair.photos.map(|p| azimuth(&poses[p as usize]));
+            (a - b).sin().atan2((a - b).cos()).abs() < 0.53
+        });
+        for found in plainly(&world) {
+            assert!(kinds(&found).contains(&kind), "{found:?}");
+            let degrees = found.iter().find_map(|diagnosis| match diagnosis {
+                Diagnosis::Gap { degrees, .. } | Diagnosis::OpenLoop { degrees, .. } => Some(*degrees),
+                _ => None,
+            });
+            assert!((degrees.unwrap() - width).abs() < 12.0, "{found:?}");
+        }
+    }
+}
+
+#[test]
+fn two_scenes_are_separate_parts() {
+    let world = World::new(around(10, 0.4), 900, 0.5, 0.2, 3).and(World::new(around(6, 0.3), 900, 0.5, 0.2, 4));
+    let [_, alone] = plainly(&world);
+    let parts = alone.iter().find_map(|d| match d {
+        Diagnosis::SeparateParts { parts } => Some(parts.clone()),
+        _ => None,
+    });
+    assert_eq!(parts, Some(vec![(0..10).collect(), (10..16).collect()]), "{alone:?}");
+}
+
+#[test]
+fn turning_on_the_spot_is_named_and_is_the_one_reason() {
+    let here = look(DVec3::new(5.0, 0.0, 1.0), DVec3::ZERO);
+    let turned = |i: usize| DPose {
+        rotation: here.rotation * DQuat::from_rotation_y(0.05 * i as f64),
+        ..here
+    };
+    let world = World::new((0..8).map(turned).collect(), 1500, 0.3, 0.1, 5);
+    let [mapped, alone] = plainly(&world);
+    assert!(kinds(&alone).contains(&Kind::RotationOnly), "{alone:?}");
+    let reasons: Vec<&Diagnosis> = mapped.iter().filter(|d| d.kind() == Kind::LeftOut).collect();
+    assert_eq!(reasons.len(), 8);
+    assert!(
+        reasons
+            .iter()
+            .all(|d| matches!(d, Diagnosis::LeftOut { reason, .. } if reason.contains("same place")))
+    );
+}
+
+#[test]
+fn a_photograph_taken_twice_is_named_once() {
+    let mut world = ring(24, 2500, 0..0);
+    let last = world.photos.len() as u32;
+    world.photos.push(world.photos[3].clone());
+    world.features.push(world.features[3].clone());
+    let copies: Vec<_> = world
+        .pairs
+        .iter()
+        .filter(|pair| pair.photos.contains(&3))
+        .map(|pair| {
+            let other = pair.photos[0] + pair.photos[1] - 3;
+            let turn = |m: &[u32; 2]| if pair.photos[0] == 3 { [m[1], m[0]] } else { *m };
+            irradia_sfm::PairMatches {
+                photos: [other, last],
+                matches: pair.matches.iter().map(turn).collect(),
+            }
+        })
+        .collect();
+    world.pairs.extend(copies);
+    world.pairs.push(irradia_sfm::PairMatches {
+        photos: [3, last],
+        matches: (0..world.features[3].keypoints.len() as u32).map(|i| [i, i]).collect(),
+    });
+    for found in plainly(&world) {
+        assert_eq!(
+            found,
+            [Diagnosis::Twice {
+                photos: [3, last as usize]
+            }]
+        );
+    }
+}
+
+#[test]
+fn little_texture_and_few_partners_are_named() {
+    let mut world = ring(24, 2500, 0..0);
+    // Its keypoints beyond the first 40 are gone.
+    world.features[7].keypoints.truncate(40);
+    for pair in world.pairs.iter_mut().filter(|pair| pair.photos.contains(&7)) {
+        let side = usize::from(pair.photos[1] == 7);
+        pair.matches.retain(|m| m[side] < 40);
+    }
+    for found in plainly(&world) {
+        assert!(
+            found.iter().any(|d| matches!(
+                d,
+                Diagnosis::FewFeatures {
+                    photo: 7,
+                    features: 40,
+                    ..
+                }
+            )),
+            "{found:?}"
+        );
+        assert!(
+            found
+                .iter()
+                .any(|d| matches!(d, Diagnosis::FewPartners { photo: 7, .. })),
+            "{found:?}"
+        );
+        assert!(found.iter().all(|d| d.photos() == [7]), "{found:?}");
+    }
+}
+
+#[test]
+fn nothing_and_one_photograph_have_nothing_wrong() {
+    let world = World::default();
+    assert_eq!(plainly(&world), [Vec::new(), Vec::new()]);
+    let mut one = ring(24, 100, 1..24);
+    one.features[0] = Features::default();
+    let [found, _] = plainly(&one);
+    assert!(
+        kinds(&found)
+            .iter()
+            .all(|kind| [Kind::LeftOut, Kind::FewFeatures].contains(kind)),
+        "{found:?}"
+    );
+}

@@ -1,0 +1,200 @@
+//! Synthetic worlds of points with known cameras: keypoints and matches without pictures.
+// Each test program uses a part of it.
+#![allow(dead_code)]
+
+use glam::{DQuat, DVec2, DVec3};
+use irradia_scene::Rng;
+use irradia_sfm::geometry::camera::DCamera;
+use irradia_sfm::geometry::pose::DPose;
+use irradia_sfm::map::{MapOptions, Model, PhotoInfo, Reconstruction, reconstruct};
+use irradia_sfm::{Features, Keypoint, PairMatches};
+
+/// Photographs, features and matches with known cameras.
+#[derive(Default)]
+pub struct World {
+    pub photos: Vec<PhotoInfo>,
+    pub features: Vec<Features>,
+    pub pairs: Vec<PairMatches>,
+    pub poses: Vec<DPose>,
+}
+
+pub const CAMERA: DCamera = DCamera {
+    width: 1000,
+    height: 750,
+    parameters: [870.0, 870.0, 500.0, 375.0, 0.06, -0.04, 0.0, 0.0],
+};
+
+/// A pose at `eye` that looks at `target`; +Z is up.
+pub fn look(eye: DVec3, target: DVec3) -> DPose {
+    let forward = (target - eye).normalize();
+    let right = forward.cross(DVec3::Z).normalize();
+    let rotation = DQuat::from_mat3(&glam::DMat3::from_cols(right, forward.cross(right), forward));
+    DPose {
+        rotation,
+        position: eye,
+    }
+}
+
+/// A turn of `photos` cameras around the origin.
+pub fn around(photos: usize, turns: f64) -> Vec<DPose> {
+    (0..photos)
+        .map(|i| {
+            let angle = std::f64::consts::TAU * turns * i as f64 / photos as f64;
+            let eye = DVec3::new(5.0 * angle.cos(), 5.0 * angle.sin(), 1.5 + (3.0 * angle).sin());
+            look(
+                eye,
+                DVec3::new(0.1 * (7.0 * angle).sin(), 0.1 * (5.0 * angle).cos(), 0.0),
+            )
+        })
+        .collect()
+}
+
+impl World {
+    /// Points in a cube of side 5, each seen by those of `poses` it faces, with noise of `noise` px and a fraction `wrong` of
+    /// wrong matches.
+    pub fn new(poses: Vec<DPose>, points: usize, noise: f64, wrong: f64, seed: u64) -> Self {
+        let mut rng = Rng::new(seed, 1);
+        let mut uniform = move || f64::from(rng.range(-1.0, 1.0));
+        let mut direction = move || DVec3::new(uniform(), uniform(), uniform());
+        // Position and the direction in which a point faces.
+        let points: Vec<(DVec3, DVec3)> = (0..points)
+            .map(|_| (2.5 * direction(), direction().normalize()))
+            .collect();
+        Self::of_points(poses, &points, 0, noise, wrong, seed)
+    }
+
+    /// From points with the direction in which each faces. The first `twins` look like the `twins` after them.
+    pub fn of_points(
+        poses: Vec<DPose>,
+        points: &[(DVec3, DVec3)],
+        twins: usize,
+        noise: f64,
+        wrong: f64,
+        seed: u64,
+    ) -> Self {
+        let look = |point: usize| if point < 2 * twins { point % twins } else { point };
+        let mut world = Self {
+            poses,
+            ..Self::default()
+        };
+        // The point of each keypoint.
+        let mut shown: Vec<Vec<usize>> = Vec::new();
+        let mut rng = Rng::new(seed, 2);
+        for (i, pose) in world.poses.iter().enumerate() {
+            let mut keypoints = Vec::new();
+            let mut here = Vec::new();
+            let mut order: Vec<usize> = (0..points.len()).collect();
+            rng.shuffle(&mut order);
+            for point in order {
+                let (place, normal) = points[point];
+                let p = pose.camera_from_world(place);
+                let facing = (pose.position - place).normalize().dot(normal);
+                if p.z < 0.1 || facing < 0.35 || rng.uniform() < 0.2 {
+                    continue;
+                }
+                let at = CAMERA.pixel(p) + noise * DVec2::new(f64::from(rng.normal()), f64::from(rng.normal()));
+                if at.x < 0.0 || at.y < 0.0 || at.x > 1000.0 || at.y > 750.0 {
+                    continue;
+                }
+                keypoints.push(Keypoint {
+                    x: at.x as f32,
+                    y: at.y as f32,
+                    scale: 2.0,
+                    angle: 0.0,
+                });
+                here.push(point);
+            }
+            shown.push(here);
+            world.features.push(Features {
+                keypoints,
+                descriptors: Vec::new(),
+            });
+            world.photos.push(PhotoInfo {
+                name: format!("{i:03}.jpg"),
+                width: CAMERA.width,
+                height: CAMERA.height,
+                group: 0,
+                focal_prior_px: None,
+                up: None,
+            });
+        }
+        for a in 0..shown.len() {
+            for b in a + 1..shown.len() {
+                let mut matches: Vec<[u32; 2]> = Vec::new();
+                let mut free_b = vec![true; shown[b].len()];
+                let mut place_b = vec![None; points.len()];
+                shown[b]
+                    .iter()
+                    .enumerate()
+                    .for_each(|(j, point)| place_b[look(*point)] = Some(j));
+                for (i, point) in shown[a].iter().enumerate() {
+                    let right = place_b[look(*point)];
+                    let chance = rng.below(shown[b].len().max(1) as u32) as usize;
+                    let j = if f64::from(rng.uniform()) < wrong {
+                        Some(chance)
+                    } else {
+                        right
+                    };
+                    if let Some(j) = j
+                        && j < free_b.len()
+                        && free_b[j]
+                    {
+                        free_b[j] = false;
+                        matches.push([i as u32, j as u32]);
+                    }
+                }
+                if matches.len() >= 8 {
+                    world.pairs.push(PairMatches {
+                        photos: [a as u32, b as u32],
+                        matches,
+                    });
+                }
+            }
+        }
+        world
+    }
+
+    /// Both worlds, without matches between them; the second is another camera.
+    pub fn and(mut self, other: Self) -> Self {
+        let shift = self.photos.len() as u32;
+        self.photos
+            .extend(other.photos.into_iter().map(|p| PhotoInfo { group: 1, ..p }));
+        self.features.extend(other.features);
+        self.poses.extend(other.poses);
+        self.pairs.extend(other.pairs.into_iter().map(|p| PairMatches {
+            photos: p.photos.map(|p| p + shift),
+            matches: p.matches,
+        }));
+        self
+    }
+
+    pub fn map(&self) -> Reconstruction {
+        reconstruct(
+            &self.photos,
+            &self.features,
+            &self.pairs,
+            &MapOptions::default(),
+            &mut |_| (),
+        )
+    }
+
+    /// The area under the recall curve of relative poses up to `degrees`, in percent: errors of rotation and of the direction
+    /// of translation, the larger of both; a pair with an unregistered photograph is wrong.
+    pub fn auc(&self, model: &Model, degrees: f64) -> f64 {
+        let mut errors = Vec::new();
+        for a in 0..self.poses.len() {
+            for b in a + 1..self.poses.len() {
+                let (Some(found_a), Some(found_b)) = (model.poses[a], model.poses[b]) else {
+                    errors.push(f64::INFINITY);
+                    continue;
+                };
+                let relative =
+                    |a: &DPose, b: &DPose| (b.rotation.inverse() * a.rotation, b.camera_from_world(a.position));
+                let (truth, found) = (relative(&self.poses[a], &self.poses[b]), relative(&found_a, &found_b));
+                let turn = 2.0 * (truth.0.inverse() * found.0).w.abs().min(1.0).acos();
+                errors.push(turn.max(truth.1.angle_between(found.1)).to_degrees());
+            }
+        }
+        100.0 * errors.iter().map(|e| (1.0 - e / degrees).max(0.0)).sum::<f64>() / errors.len() as f64
+    }
+}

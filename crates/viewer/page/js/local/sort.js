@@ -10,6 +10,8 @@ import { Words } from "./device.js";
 const SCAN_BLOCK = 2048;
 /** Keys of a block of the sort. */
 const SORT_BLOCK = 4096;
+/** Counts of digits that one workgroup sums up. */
+const FEW = 4096;
 /** Bits of a digit. */
 const DIGIT = 4;
 
@@ -19,6 +21,13 @@ export class Scan {
   constructor(gpu, kernels) {
     this.kernels = kernels;
     this.sums = new Words(gpu, "sums of blocks");
+  }
+
+  /** As `run`, of a few thousand words in place, by one workgroup. Word `count` becomes the total.
+   * @param {Work} work @param {Words} params @param {Words} values @param {number} count */
+  runInPlace(work, params, values, count) {
+    params.write(0, Uint32Array.of(count, count));
+    work.run(this.kernels.scan_sums, [params, values], Math.min(count, 1));
   }
 
   /** `before[i]` becomes the sum of the words of `values` before `i`. Each run of a submission has its own `params`, of four words.
@@ -51,7 +60,9 @@ export class Sort {
   run(work, keys, values, count, bits) {
     const blocks = Math.ceil(count / SORT_BLOCK);
     const digits = 1 << DIGIT;
-    for (const array of [this.counts, this.starts]) array.reserve(digits * blocks);
+    const counts = digits * blocks;
+    this.counts.reserve(counts + 1);
+    this.starts.reserve(counts);
     for (const array of this.other) array.reserve(count);
     // An even number, so that what is sorted ends where it was.
     const passes = 2 * Math.ceil(bits / DIGIT / 2);
@@ -60,8 +71,10 @@ export class Sort {
     this.passes.slice(0, passes).forEach(({ params, scan }, i) => {
       params.write(0, Uint32Array.of(count, blocks, DIGIT * i));
       work.run(sort_count, [params, from[0], this.counts], blocks);
-      this.scan.run(work, scan, this.counts, this.starts, digits * blocks);
-      work.run(sort_scatter, [params, from[0], from[1], this.starts, to[0], to[1]], blocks);
+      const isFew = counts <= FEW;
+      if (isFew) this.scan.runInPlace(work, scan, this.counts, counts);
+      else this.scan.run(work, scan, this.counts, this.starts, counts);
+      work.run(sort_scatter, [params, from[0], from[1], isFew ? this.counts : this.starts, to[0], to[1]], blocks);
       [from, to] = [to, from];
     });
   }

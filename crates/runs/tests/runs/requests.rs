@@ -161,7 +161,7 @@ fn a_request_round_trips() {
             downscale: 1.5,
             max_side: None,
             holdout: Some("5".into()),
-            images: Some("photographs".into()),
+            images: Some(std::path::absolute("photographs").expect("a path")),
         },
         ..input(folder.path(), "run", 4)
     };

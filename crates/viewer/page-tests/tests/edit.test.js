@@ -198,8 +198,8 @@ test("turning the scene upright keeps the picture, and views stay in place", asy
   await server.stop();
 });
 
-// WebGPU's software is slow: a small picture.
-for (const [api, size, before] of /** @type {const} */ ([["WebGL2", { width: 800, height: 560 }], ["WebGPU", { width: 640, height: 260 }, pretendGpu]])) test(`a page that draws itself with ${api} shows the selection and the edit`, async () => {
+// WebGPU in software is slow: a small picture, wide enough for the bar of tools.
+for (const [api, size, before] of /** @type {const} */ ([["WebGL2", { width: 800, height: 560 }], ["WebGPU", { width: 800, height: 420 }, pretendGpu]])) test(`a page that draws itself with ${api} shows the selection and the edit`, async () => {
   const local = await browse(api === "WebGPU" ? "webgpu" : "webgl");
   const server = await serve("view", copy(`local_${api}`), "--port", "0");
   const { page, problems } = await open(local, server.address, { ...size, before });

@@ -1,4 +1,4 @@
-//! The kernels, put together from their parts: their text for whoever runs WGSL, such as a browser, and compiled for [`crate::gpu`].
+//! The kernels, put together from their parts: their text for whoever runs WGSL, such as a browser, and compiled for the GPU.
 
 #[cfg(feature = "gpu")]
 use irradia_compute::gpu::{Gpu, Kernel};

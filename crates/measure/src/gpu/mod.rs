@@ -6,21 +6,21 @@ use irradia_compute::DeviceError;
 use irradia_compute::gpu::{Array, GRID, Gpu, Kernel, Shader, Work};
 use std::sync::Arc;
 
-const COMMON: &str = include_str!("shaders/common.wgsl");
+const TARGET: &str = include_str!("shaders/target.wgsl");
 const PHOTO: &str = include_str!("shaders/photo.wgsl");
 const SUM: &str = include_str!("shaders/sum_group.wgsl");
 const SHADERS: [Shader; 3] = [
     Shader {
         name: "ssim_maps",
-        parts: &[GRID, COMMON, PHOTO, SUM, include_str!("shaders/ssim_maps.wgsl")],
+        parts: &[GRID, TARGET, PHOTO, SUM, include_str!("shaders/ssim_maps.wgsl")],
     },
     Shader {
         name: "gradient",
-        parts: &[GRID, COMMON, PHOTO, SUM, include_str!("shaders/gradient.wgsl")],
+        parts: &[GRID, TARGET, PHOTO, SUM, include_str!("shaders/gradient.wgsl")],
     },
     Shader {
         name: "total",
-        parts: &[COMMON, SUM, include_str!("shaders/total.wgsl")],
+        parts: &[TARGET, SUM, include_str!("shaders/total.wgsl")],
     },
 ];
 
@@ -29,7 +29,7 @@ const TILE: usize = 16;
 /// Planes of a frame's gradients: red, green, blue, alpha, depth, error.
 pub const GRADIENT_PLANES: usize = 6;
 
-/// Bits of `Target.flags` in `common.wgsl`.
+/// Bits of `Target.flags` in `target.wgsl`.
 mod flag {
     pub const MASK: u32 = 1;
     pub const SSIM: u32 = 2;

@@ -17,6 +17,13 @@ pub struct AdamStep {
     pub step: u64,
 }
 
+impl AdamStep {
+    /// The bias corrections of the first and second moment (section 3 of the paper): the moments are divided by them.
+    pub fn corrections(&self) -> [f64; 2] {
+        [self.beta1, self.beta2].map(|beta| 1.0 - f64::from(beta).powf(self.step as f64))
+    }
+}
+
 /// Items whose activity is counted together.
 pub const RUN: usize = 512;
 /// Runs of a parallel task.
@@ -116,9 +123,7 @@ impl<L: Lanes<Scalar = f32>> AdamRule<L> {
     /// root once, instead of being applied to every moment.
     #[inline(always)]
     pub fn new<S: Simd<F = L>>(simd: S, step: &AdamStep, rate: f32) -> Self {
-        let t = step.step as f64;
-        let correction1 = 1.0 - f64::from(step.beta1).powf(t);
-        let correction2 = 1.0 - f64::from(step.beta2).powf(t);
+        let [correction1, correction2] = step.corrections();
         Self {
             rate: simd.splat(f64::from(rate) / correction1),
             root_scale: simd.splat(1.0 / correction2.sqrt()),

@@ -28,6 +28,17 @@ impl Regularizers {
     pub fn is_zero(&self) -> bool {
         *self == Self::default()
     }
+
+    /// Weights of a splat's own opacity, its square, the sum of its standard deviations and that of their fourth powers, where lengths
+    /// are in world units and averages weigh it by `per_splat`.
+    pub(crate) fn per_splat(&self, unit: f64, per_splat: f64) -> [f64; 4] {
+        [
+            f64::from(self.opacity) * per_splat,
+            f64::from(self.opacity_square) * per_splat,
+            f64::from(self.scale) * per_splat / (3.0 * unit),
+            f64::from(self.covariance) * per_splat / unit.powi(4),
+        ]
+    }
 }
 
 /// The splats over which the terms are averaged.
@@ -140,11 +151,13 @@ struct WeightLanes<F> {
 impl<F: Lanes> WeightLanes<F> {
     #[inline(always)]
     fn new<S: Simd<F = F>>(simd: S, weights: &Regularizers, unit: f64, per_splat: f64) -> Self {
+        let [opacity, opacity_square, scale, covariance] =
+            weights.per_splat(unit, per_splat).map(|weight| simd.splat(weight));
         Self {
-            opacity: simd.splat(f64::from(weights.opacity) * per_splat),
-            opacity_square: simd.splat(f64::from(weights.opacity_square) * per_splat),
-            scale: simd.splat(f64::from(weights.scale) * per_splat / (3.0 * unit)),
-            covariance: simd.splat(f64::from(weights.covariance) * per_splat / unit.powi(4)),
+            opacity,
+            opacity_square,
+            scale,
+            covariance,
         }
     }
 }
@@ -186,6 +199,16 @@ pub fn cap_condition(splats: &mut Splats, limit: f32) {
         });
 }
 
+/// The size from which on splats are among the largest `fraction` of `sizes`; `None` if all are.
+pub(crate) fn size_limit(mut sizes: Vec<f32>, fraction: f32) -> Option<f32> {
+    let frozen = ((1.0 - fraction) * sizes.len() as f32).round() as usize;
+    if frozen == 0 || sizes.is_empty() {
+        return None;
+    }
+    let at = frozen.min(sizes.len() - 1);
+    Some(*sizes.select_nth_unstable_by(at, f32::total_cmp).1)
+}
+
 /// Freezes position and shape of all but the largest `fraction` of the visible splats. Their opacity and colour are still
 /// trained: floaters in front of the cameras must be able to fade (fern without points, 800 steps: 23.9 dB with everything frozen).
 /// `of` tells whether splats that are not visible have gradients.
@@ -195,18 +218,15 @@ pub fn freeze_small(splats: &Splats, fraction: f32, of: Regularized, gradients: 
     let size = |i: usize| f32::MIN.max(x[i]).max(y[i]).max(z[i]);
     let active_chunks = gradients.counts.par_iter().enumerate().filter(|(_, count)| **count > 0);
     let active = &gradients.active;
-    let mut sizes: Vec<f32> = active_chunks
+    let sizes: Vec<f32> = active_chunks
         .flat_map_iter(|(chunk, _)| {
             let range = chunk * CHUNK..n.min((chunk + 1) * CHUNK);
             range.filter(|i| active[*i] != 0.0).map(size)
         })
         .collect();
-    let frozen = ((1.0 - fraction) * sizes.len() as f32).round() as usize;
-    if frozen == 0 || sizes.is_empty() {
+    let Some(limit) = size_limit(sizes, fraction) else {
         return;
-    }
-    let at = frozen.min(sizes.len() - 1);
-    let limit = *sizes.select_nth_unstable_by(at, f32::total_cmp).1;
+    };
     // One byte a splat: reading three planes of sizes for each of ten planes of gradients takes longer.
     let mut small = vec![false; n];
     let counts = &gradients.counts;

@@ -78,8 +78,9 @@ impl DeviceLoss {
         camera: bool,
         has_lpips: bool,
     ) -> Option<ObjectiveValues> {
+        use crate::objective::photometric_weights;
         use irradia_measure::gpu::{Beside, DeviceFrame};
-        use irradia_measure::{LossWeights, Target, Truth};
+        use irradia_measure::{Target, Truth};
         use irradia_splat::{DeviceGradient, Statistics};
 
         let loss = self.gpu.as_mut().filter(|_| !needs_host(reference, plan, has_lpips))?;
@@ -91,11 +92,7 @@ impl DeviceLoss {
             truth: Truth::Rgb8(&photo.rgb),
             mask: photo.mask.as_deref(),
         };
-        let weights = LossWeights {
-            l1: plan.value(Param::PhotoWeight),
-            ssim: plan.value(Param::SsimWeight),
-            mse: plan.value(Param::MseWeight),
-        };
+        let weights = photometric_weights(plan);
         let depth_weight = plan.value(Param::DepthWeight);
         let beside = Beside {
             depths: reference.depths,

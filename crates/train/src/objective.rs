@@ -113,11 +113,7 @@ impl Objective {
         };
         let color = frame.color;
         self.v_color.resize(3 * pixels, 0.0);
-        let weights = LossWeights {
-            l1: plan.value(Param::PhotoWeight),
-            ssim: plan.value(Param::SsimWeight),
-            mse: plan.value(Param::MseWeight),
-        };
+        let weights = photometric_weights(plan);
         let values = self.photometric.evaluate(color, &target, &weights, &mut self.v_color);
         let mut total = values.total;
         let weight = plan.value(Param::CoarseWeight);
@@ -245,6 +241,15 @@ impl Objective {
     /// The result of [`Objective::error`].
     pub fn gather_error(&self) -> Gather<'_> {
         Gather::Error(&self.error)
+    }
+}
+
+/// The weights of the photometric loss.
+pub(crate) fn photometric_weights(plan: &StepPlan) -> LossWeights {
+    LossWeights {
+        l1: plan.value(Param::PhotoWeight),
+        ssim: plan.value(Param::SsimWeight),
+        mse: plan.value(Param::MseWeight),
     }
 }
 

@@ -6,6 +6,7 @@ use std::borrow::Cow;
 pub struct Kernel {
     name: &'static str,
     pipeline: wgpu::ComputePipeline,
+    layout: wgpu::BindGroupLayout,
 }
 
 impl Kernel {
@@ -29,6 +30,7 @@ impl Kernel {
         });
         Self {
             name: shader.name,
+            layout: pipeline.get_bind_group_layout(0),
             pipeline,
         }
     }
@@ -75,7 +77,7 @@ impl<'a> Work<'a> {
             .collect();
         let bindings = self.gpu.device.create_bind_group(&wgpu::BindGroupDescriptor {
             label: Some(kernel.name),
-            layout: &kernel.pipeline.get_bind_group_layout(0),
+            layout: &kernel.layout,
             entries: &entries,
         });
         let profile = self.gpu.profile.get();

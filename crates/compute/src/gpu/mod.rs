@@ -186,19 +186,14 @@ impl Gpu {
                 reason: one_line(&error.to_string()),
             })?;
         let failure = Arc::new(Mutex::new(None));
-        let note = |failure: &Arc<Mutex<Option<String>>>, reason: String| {
-            let mut failure = failure.lock().unwrap_or_else(PoisonError::into_inner);
-            // The first is the cause.
-            failure.get_or_insert(one_line(&reason));
-        };
         let lost = failure.clone();
         device.set_device_lost_callback(move |reason, message| {
             if reason != wgpu::DeviceLostReason::Destroyed {
-                note(&lost, format!("it was lost: {message}"));
+                note(&lost, &format!("it was lost: {message}"));
             }
         });
         let failed = failure.clone();
-        device.on_uncaptured_error(Arc::new(move |error: wgpu::Error| note(&failed, error.to_string())));
+        device.on_uncaptured_error(Arc::new(move |error: wgpu::Error| note(&failed, &error.to_string())));
         Ok(Arc::new(Self {
             device,
             queue,
@@ -229,8 +224,7 @@ impl Gpu {
 
     /// Reports a failure that the device itself does not see, and those that tests make up.
     pub fn fail(&self, reason: &str) {
-        let mut failure = self.failure.lock().unwrap_or_else(PoisonError::into_inner);
-        failure.get_or_insert(one_line(reason));
+        note(&self.failure, reason);
     }
 
     /// From now on measures each kernel by the device's clock, and waits for every submission. Whether the device has such a clock.
@@ -256,6 +250,17 @@ impl Gpu {
             self.fail(&error.to_string());
         }
     }
+}
+
+/// Keeps a failure; the first is the cause.
+fn note(failure: &Mutex<Option<String>>, reason: &str) {
+    let mut failure = failure.lock().unwrap_or_else(PoisonError::into_inner);
+    failure.get_or_insert(one_line(reason));
+}
+
+/// The sum of the bits that are on, for a kernel's flags.
+pub fn flags(bits: &[(bool, u32)]) -> u32 {
+    bits.iter().filter(|(on, _)| *on).map(|(_, bit)| bit).sum()
 }
 
 fn one_line(text: &str) -> String {

@@ -1,9 +1,10 @@
 //! Bundler's `bundle.out`, version 0.3 (<https://www.cs.cornell.edu/~snavely/bundler/bundler-v0.4-manual.html>, S6). Poses are
 //! camera-from-world with x right, y up and z backward; pixels are counted from the image's centre.
 
-use super::declared::{Declared, DeclaredCamera, DeclaredPoints, DeclaredPose, DeclaredView, Focal, lens_or_pinhole};
+use super::declared::{Declared, DeclaredCamera, DeclaredPose, DeclaredView, Focal, lens_or_pinhole};
 use super::files::{first_file, locate_image};
 use super::tokens::{Tokens, text};
+use super::tracks::{TrackPoint, declared, track_point};
 use crate::error::read_and_parse;
 use crate::{FormatError, Malformed};
 use glam::{DMat3, DVec3};
@@ -21,7 +22,7 @@ pub struct Bundle {
     /// In the order of the list of photographs.
     pub cameras: Vec<BundleCamera>,
     /// Coloured points, each with the numbers of the cameras that see it.
-    pub points: Vec<([f64; 3], [u8; 3], Vec<usize>)>,
+    pub points: Vec<TrackPoint>,
 }
 
 /// A camera.
@@ -74,18 +75,7 @@ pub(super) fn read(path: &Path, downscale: f32) -> Result<Declared, FormatError>
         return Err(FormatError::malformed(&list, message));
     }
     let root = list.parent().unwrap_or(Path::new(".")).to_owned();
-    let mut points = DeclaredPoints::default();
-    let mut seen = vec![Vec::new(); names.len()];
-    for (position, color, cameras) in &bundle.points {
-        let index = points.positions.len() as u32;
-        if points.push((*position).into(), *color) {
-            for i in cameras {
-                if let Some(seen) = seen.get_mut(*i) {
-                    seen.push(index);
-                }
-            }
-        }
-    }
+    let (points, seen) = declared(&bundle.points, names.len());
     let mut views = Vec::with_capacity(names.len());
     // A focal length of 0 says that the photograph has no pose.
     let all = names.iter().zip(&bundle.cameras).zip(seen);
@@ -130,15 +120,7 @@ pub fn parse_bundle(bytes: &[u8]) -> Result<Bundle, Malformed> {
         });
     }
     for _ in 0..points {
-        let position = tokens.numbers("a point")?;
-        let color = tokens.numbers::<3>("a colour")?.map(|v| v as u8);
-        let views: usize = tokens.next("a count of views")?;
-        let mut seen = Vec::new();
-        for _ in 0..views {
-            seen.push(tokens.next("a view")?);
-            tokens.skip(3, "a list of views")?;
-        }
-        bundle.points.push((position, color, seen));
+        bundle.points.push(track_point(&mut tokens)?);
     }
     Ok(bundle)
 }

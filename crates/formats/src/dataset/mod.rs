@@ -22,6 +22,7 @@ pub(crate) mod phone;
 pub(crate) mod realitycapture;
 mod split;
 mod tokens;
+mod tracks;
 pub(crate) mod transforms;
 mod world;
 pub(crate) mod xml;

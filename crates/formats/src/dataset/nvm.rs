@@ -1,9 +1,10 @@
 //! VisualSfM's `.nvm`, version 3 (<http://ccwu.me/vsfm/doc.html#nvm>). Rotations are camera-from-world with x right, y down and z
 //! forward, positions are camera centres.
 
-use super::declared::{Declared, DeclaredCamera, DeclaredPoints, DeclaredPose, DeclaredView, Focal, lens_or_pinhole};
+use super::declared::{Declared, DeclaredCamera, DeclaredPose, DeclaredView, Focal, lens_or_pinhole};
 use super::files::{first_file, locate_image};
 use super::tokens::{Tokens, text};
+use super::tracks::{TrackPoint, declared, track_point};
 use crate::error::read_and_parse;
 use crate::{FormatError, Malformed};
 use glam::DQuat;
@@ -15,16 +16,13 @@ const FOLDERS: [&str; 3] = ["", "images", "../images"];
 /// Numbers behind a photograph's name.
 const NUMBERS: usize = 10;
 
-/// A point: position, sRGB, and the indices of the photographs that see it.
-pub type NvmPoint = ([f64; 3], [u8; 3], Vec<usize>);
-
 /// A model: photographs, and points with the photographs that see them.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct NvmModel {
     /// Photographs.
     pub images: Vec<NvmImage>,
     /// Points that [`Self::images`] see.
-    pub points: Vec<NvmPoint>,
+    pub points: Vec<TrackPoint>,
 }
 
 /// A photograph.
@@ -62,18 +60,7 @@ pub(super) fn read(path: &Path, downscale: f32) -> Result<Declared, FormatError>
         let n = model.images.len();
         warnings.push(format!("the largest of {count} models is used, with {n} photographs"));
     }
-    let mut points = DeclaredPoints::default();
-    let mut seen = vec![Vec::new(); model.images.len()];
-    for (position, color, images) in &model.points {
-        let index = points.positions.len() as u32;
-        if points.push((*position).into(), *color) {
-            for i in images {
-                if let Some(seen) = seen.get_mut(*i) {
-                    seen.push(index);
-                }
-            }
-        }
-    }
+    let (points, seen) = declared(&model.points, model.images.len());
     let views = model.images.iter().zip(seen).map(|(image, points_seen)| {
         let name = image.name.replace('\\', "/");
         let found = locate_image(&root, &FOLDERS, &name);
@@ -117,7 +104,9 @@ pub fn parse_nvm(bytes: &[u8]) -> Result<Vec<NvmModel>, Malformed> {
             model.images.push(image(lines.next().unwrap_or_default())?);
         }
         for _ in 0..count(lines.next())? {
-            model.points.push(point(lines.next().unwrap_or_default())?);
+            model
+                .points
+                .push(track_point(&mut Tokens::new(lines.next().unwrap_or_default()))?);
         }
         models.push(model);
     }
@@ -141,19 +130,6 @@ fn image(line: &str) -> Result<NvmImage, Malformed> {
         center: [cx, cy, cz],
         radial,
     })
-}
-
-fn point(line: &str) -> Result<NvmPoint, Malformed> {
-    let mut tokens = Tokens::new(line);
-    let position = tokens.numbers("a point")?;
-    let color = tokens.numbers::<3>("a colour")?.map(|v| v as u8);
-    let views: usize = tokens.next("a count of views")?;
-    let mut seen = Vec::new();
-    for _ in 0..views {
-        seen.push(tokens.next("a view")?);
-        tokens.skip(3, "a list of views")?;
-    }
-    Ok((position, color, seen))
 }
 
 fn pose(image: &NvmImage) -> Option<DeclaredPose> {

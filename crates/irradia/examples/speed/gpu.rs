@@ -2,8 +2,8 @@
 
 use crate::scale::{camera, scene, update};
 use anyhow::{Result, bail};
+use irradia_compute::Device;
 use irradia_compute::gpu::{Gpu, Wanted};
-use irradia_compute::{Device, DeviceChoice};
 use irradia_measure::gpu::{Beside, DeviceFrame, GpuLoss};
 use irradia_measure::{LossWeights, Target, Truth};
 use irradia_splat::regularize::Regularizers;
@@ -47,12 +47,7 @@ fn measure(number: usize, [width, height]: [u32; 2]) -> Result<()> {
     let state = SplatState::new(scene(number));
     println!("{number} splats, {width} x {height}");
     // The clock stops the device after every kernel: whole frames and steps are timed on one without.
-    let Device::Gpu(timed) = Device::open(&DeviceChoice::Gpu)? else {
-        unreachable!("a GPU was asked for")
-    };
-    let Device::Gpu(profiled) = Device::open(&DeviceChoice::Gpu)? else {
-        unreachable!("a GPU was asked for")
-    };
+    let [timed, profiled] = [Gpu::open(&Wanted::Any)?, Gpu::open(&Wanted::Any)?];
     let (spent, engine) = time(&timed, &state, [width, height], None)?;
     println!(
         "  {} in view, {} entries; a frame {:.2} ms ({:.0} frames/s), a step {:.2} ms ({:.1} steps/s)",

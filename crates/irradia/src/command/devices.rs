@@ -3,11 +3,30 @@
 use crate::terminal::say;
 use anyhow::Result;
 
-/// Lists the GPUs, if this build can use any.
-#[cfg(feature = "gpu")]
+/// Lists what `--device` can name.
 pub fn run() -> Result<()> {
+    let gpus = gpus();
+    for gpu in &gpus {
+        say(gpu)?;
+    }
+    let threads = rayon::current_num_threads();
+    let level = irradia_compute::Level::detect().name();
+    say(format_args!("cpu: {threads} threads, {level}"))?;
+    if cfg!(not(feature = "gpu")) {
+        say(irradia_compute::DeviceError::NotBuilt)?;
+    } else if gpus.is_empty() {
+        say(
+            "no GPU was found: Vulkan, Metal or DX12 comes with its driver; Mesa has Vulkan in software (mesa-vulkan-drivers)",
+        )?;
+    }
+    Ok(())
+}
+
+/// The GPUs, a line each.
+#[cfg(feature = "gpu")]
+fn gpus() -> Vec<String> {
     use irradia_compute::gpu::{AdapterInfo, Gpu};
-    let line = |info: &AdapterInfo| {
+    let line = |info: AdapterInfo| {
         let subgroups = match info.subgroup {
             [0, _] => "no subgroups".to_owned(),
             [fewest, most] if fewest == most => format!("subgroups of {most}"),
@@ -28,30 +47,11 @@ pub fn run() -> Result<()> {
             info.shared_memory / 1024,
         )
     };
-    let gpus = Gpu::adapters();
-    for info in &gpus {
-        say(format_args!("{}", line(info)))?;
-    }
-    let threads = rayon::current_num_threads();
-    say(format_args!(
-        "cpu: {threads} threads, {}",
-        irradia_compute::Level::detect().name()
-    ))?;
-    if gpus.is_empty() {
-        say(format_args!(
-            "no GPU was found: Vulkan, Metal or DX12 comes with its driver; Mesa has Vulkan in software (mesa-vulkan-drivers)"
-        ))?;
-    }
-    Ok(())
+    Gpu::adapters().into_iter().map(line).collect()
 }
 
-/// Lists the CPU alone.
+/// Without the feature there are none.
 #[cfg(not(feature = "gpu"))]
-pub fn run() -> Result<()> {
-    let threads = rayon::current_num_threads();
-    say(format_args!(
-        "cpu: {threads} threads, {}",
-        irradia_compute::Level::detect().name()
-    ))?;
-    say(format_args!("{}", irradia_compute::DeviceError::NotBuilt))
+fn gpus() -> Vec<String> {
+    Vec::new()
 }

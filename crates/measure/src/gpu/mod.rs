@@ -1,22 +1,24 @@
 //! The losses of a training step on any GPU: L1, SSIM and squares against a photograph of 8 bits, sparse depths, and the error of each
 //! pixel. The twin of [`crate::PhotometricLoss`] and of the metric [`crate::DepthLoss`].
 
+use crate::loss::job::Gains;
 use crate::{DepthSample, LossValues, LossWeights, Target, Truth};
 use irradia_compute::DeviceError;
-use irradia_compute::gpu::{Array, GRID, Gpu, Kernel, Shader, Work};
+use irradia_compute::gpu::{Array, GRID, Gpu, Kernel, Shader, Work, flags};
 use std::sync::Arc;
 
 const TARGET: &str = include_str!("shaders/target.wgsl");
+const TILING: &str = include_str!("shaders/tile.wgsl");
 const PHOTO: &str = include_str!("shaders/photo.wgsl");
 const SUM: &str = include_str!("shaders/sum_group.wgsl");
 const SHADERS: [Shader; 3] = [
     Shader {
         name: "ssim_maps",
-        parts: &[GRID, TARGET, PHOTO, SUM, include_str!("shaders/ssim_maps.wgsl")],
+        parts: &[GRID, TARGET, TILING, PHOTO, SUM, include_str!("shaders/ssim_maps.wgsl")],
     },
     Shader {
         name: "gradient",
-        parts: &[GRID, TARGET, PHOTO, SUM, include_str!("shaders/gradient.wgsl")],
+        parts: &[GRID, TARGET, TILING, PHOTO, SUM, include_str!("shaders/gradient.wgsl")],
     },
     Shader {
         name: "total",
@@ -122,32 +124,26 @@ impl GpuLoss {
         let tiles = [width, height].map(|side| side.div_ceil(TILE));
         let groups = 3 * tiles[0] * tiles[1];
         write_bytes(gpu, &mut self.photo, truth);
-        let mut flags = 0;
         if let Some(mask) = target.mask {
             write_bytes(gpu, &mut self.mask, mask);
-            flags |= flag::MASK;
         }
-        if weights.ssim != 0.0 {
-            flags |= flag::SSIM;
-        }
-        if beside.error {
-            flags |= flag::ERROR;
-        }
+        let flags = flags(&[
+            (target.mask.is_some(), flag::MASK),
+            (weights.ssim != 0.0, flag::SSIM),
+            (beside.error, flag::ERROR),
+        ]);
         let samples = packed(beside.depths, width * height);
         self.samples.reserve(gpu, samples.len());
         self.samples.write(gpu, 0, &samples);
         // With nothing to compare, gradients are zero.
-        let gain = |factor: f64, weight: f32| {
-            if count > 0.0 {
-                (factor * f64::from(weight) / count) as f32
-            } else {
-                0.0
-            }
+        let gains = match count > 0.0 {
+            true => Gains::of(weights, count),
+            false => Gains::NONE,
         };
         let gains = [
-            gain(1.0, weights.l1),
-            gain(-1.0, weights.ssim),
-            gain(2.0, weights.mse),
+            gains.l1 as f32,
+            gains.ssim as f32,
+            gains.mse as f32,
             beside.depth_weight,
         ]
         .map(f32::to_bits);

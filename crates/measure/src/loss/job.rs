@@ -29,21 +29,21 @@ pub(super) struct Job<'a, T> {
 
 /// Factors of the gradient of each part: its weight over the number of values, with its sign.
 #[derive(Clone, Copy)]
-pub(super) struct Gains {
-    pub(super) l1: f64,
-    pub(super) ssim: f64,
-    pub(super) mse: f64,
+pub(crate) struct Gains {
+    pub(crate) l1: f64,
+    pub(crate) ssim: f64,
+    pub(crate) mse: f64,
 }
 
 impl Gains {
     /// For losses that scale their own gradients.
-    pub(super) const NONE: Self = Self {
+    pub(crate) const NONE: Self = Self {
         l1: 0.0,
         ssim: 0.0,
         mse: 0.0,
     };
 
-    pub(super) fn of(weights: &LossWeights, count: f64) -> Self {
+    pub(crate) fn of(weights: &LossWeights, count: f64) -> Self {
         Self {
             l1: f64::from(weights.l1) / count,
             ssim: -f64::from(weights.ssim) / count,

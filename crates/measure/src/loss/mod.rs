@@ -11,7 +11,7 @@
 
 pub mod coarse;
 pub mod depth;
-mod job;
+pub(crate) mod job;
 pub mod perceptual;
 mod pointwise;
 mod rows;

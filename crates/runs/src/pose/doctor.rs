@@ -5,6 +5,7 @@ use super::{PoseProgress, check_enough, photo_infos};
 use crate::RunError;
 use crate::folder::to_json;
 use irradia_formats::{PhotoFolder, read_photo_folder, write_atomic, write_png};
+use irradia_scene::resize_area;
 use irradia_sfm::PairMatches;
 use irradia_sfm::doctor::{Diagnosis, Evidence, diagnose, shots};
 use irradia_sfm::features::Sift;
@@ -266,25 +267,13 @@ pub(super) fn write(out: &Path, folder: &PhotoFolder, work: &Work, report: &Doct
 /// A photograph, reduced by a whole number to about [`SMALL`]: its size and RGB.
 fn small(photo: &irradia_formats::PhotoEntry) -> Result<([u32; 2], Vec<u8>), RunError> {
     let pixels = photo.read(SMALL)?;
-    let (from, channels) = (
-        [pixels.width as usize, pixels.height as usize],
-        pixels.channels as usize,
-    );
-    let factor = from[0].max(from[1]).div_ceil(SMALL as usize).max(1);
-    let [width, height] = from.map(|side| (side / factor).max(1));
-    let mut data = Vec::with_capacity(3 * width * height);
-    for y in 0..height {
-        for x in 0..width {
-            for c in 0..3 {
-                let mut sum = 0;
-                for row in y * factor..((y + 1) * factor).min(from[1]) {
-                    for column in x * factor..((x + 1) * factor).min(from[0]) {
-                        sum += usize::from(pixels.data[(row * from[0] + column) * channels + c.min(channels - 1)]);
-                    }
-                }
-                data.push((sum / (factor * factor)) as u8);
-            }
-        }
-    }
-    Ok(([width as u32, height as u32], data))
+    let size = [pixels.width, pixels.height];
+    let factor = size[0].max(size[1]).div_ceil(SMALL).max(1);
+    let to = size.map(|side| (side / factor).max(1));
+    let reduced = resize_area(&pixels.data, pixels.channels, size, to);
+    let channels = pixels.channels as usize;
+    let rgb = reduced
+        .chunks_exact(channels)
+        .flat_map(|pixel| [0, 1, 2].map(|c| pixel[c.min(channels - 1)]));
+    Ok((to, rgb.collect()))
 }

@@ -4,7 +4,7 @@ use crate::render::{FramePlanes, RenderOptions};
 use crate::shaders::Kernels;
 use crate::{Splats, ViewParams};
 use irradia_compute::DeviceError;
-use irradia_compute::gpu::{Array, GROUP, Gpu, Scan, Sort, Work};
+use irradia_compute::gpu::{Array, GROUP, Gpu, Scan, Sort, Work, flags};
 use std::sync::{Arc, OnceLock};
 
 /// Width and height of a tile, pixels.
@@ -353,7 +353,7 @@ impl GpuRenderer {
     }
 
     /// The words of `View`, with further flags.
-    pub(super) fn view_words(&self, last: &Last, flags: u32) -> [u32; VIEW_WORDS] {
+    pub(super) fn view_words(&self, last: &Last, more: u32) -> [u32; VIEW_WORDS] {
         let Last {
             view, options, trains, ..
         } = last;
@@ -374,7 +374,6 @@ impl GpuRenderer {
             (true, flag::CLAMP),
             (*trains, flag::TRAINS),
         ];
-        let own_flags: u32 = bits.iter().filter(|(on, _)| *on).map(|(_, bit)| bit).sum();
         // As the twin draws whole chunks.
         let drawn = options
             .first
@@ -394,7 +393,7 @@ impl GpuRenderer {
             last.found[1] as u32,
             0,
             0,
-            own_flags | flags,
+            flags(&bits) | more,
             0,
             0,
             0,

@@ -2,10 +2,10 @@
 
 use super::frame::{FRAME_PLANES, GEOMETRY, GpuRenderer, flag, read_geometry, write_geometry};
 use crate::engine::Update;
-use crate::regularize::Regularized;
+use crate::regularize::{Regularized, size_limit};
 use crate::render::{CHUNK, CameraGradient, Gather, OutputGradient, RenderOptions, basis_at};
 use crate::{SplatGradients, SplatState, Splats, Statistics, ViewParams};
-use irradia_compute::gpu::{Array, GROUP, Gpu, Work};
+use irradia_compute::gpu::{Array, GROUP, Gpu, Work, flags};
 use irradia_compute::{DeviceError, Planes};
 use irradia_scene::sh;
 use std::sync::Arc;
@@ -20,7 +20,7 @@ const VJP_GROUP: usize = 64;
 const CAMERA: usize = 15;
 
 /// Bits of `Update.flags` in `update.wgsl`.
-mod flags {
+mod update_flag {
     pub const DENSE: u32 = 1;
     pub const ALL: u32 = 2;
     pub const NOISE: u32 = 4;
@@ -181,7 +181,7 @@ impl GpuTraining {
             (of.gather == Some(Statistics::Error), flag::GATHER_ERROR),
             (of.camera, flag::CAMERA),
         ];
-        let more = bits.iter().filter(|(on, _)| *on).map(|(_, bit)| bit).sum();
+        let more = flags(&bits);
         let [visible, entries] = last.found;
         if of.camera {
             self.v_camera.reserve(&gpu, CAMERA * visible);
@@ -330,18 +330,14 @@ impl GpuTraining {
     fn update_words(&self, update: &Update, visible: usize, size: [u32; 2]) -> [u32; UPDATE_WORDS] {
         let [count, stride, degree] = self.renderer.shape;
         let step = &update.optimizer.step;
-        let t = step.step as f64;
-        let correction1 = 1.0 - f64::from(step.beta1).powf(t);
-        let correction2 = 1.0 - f64::from(step.beta2).powf(t);
-        let rate = |rate: f32| (f64::from(rate) / correction1) as f32;
+        let corrections = step.corrections();
+        let rate = |rate: f32| (f64::from(rate) / corrections[0]) as f32;
         let rates = &update.rates;
         let regularizers = &update.regularizers;
         let counted = match update.regularized {
             Regularized::Visible => visible,
             Regularized::All => count,
         };
-        let (per_splat, unit) = (1.0 / counted.max(1) as f64, f64::from(update.regularizer_unit));
-        let regularizer = |weight: f32, scale: f64| (f64::from(weight) * per_splat * scale) as f32;
         let is_regularized = !regularizers.is_zero();
         let all = is_regularized && update.regularized == Regularized::All;
         let limit = match update.trained_fraction < 1.0 {
@@ -350,25 +346,30 @@ impl GpuTraining {
         };
         let noise = update.noise;
         let bits = [
-            (update.optimizer.dense, flags::DENSE),
-            (all, flags::ALL),
-            (noise.is_some(), flags::NOISE),
-            (update.condition_cap.is_some(), flags::CAP),
-            (limit.is_some(), flags::FREEZE),
-            (update.statistics == Some(Statistics::Gradient), flags::GRADIENT),
-            (update.statistics == Some(Statistics::AbsoluteGradient), flags::ABSOLUTE),
-            (update.statistics == Some(Statistics::Error), flags::ERROR),
+            (update.optimizer.dense, update_flag::DENSE),
+            (all, update_flag::ALL),
+            (noise.is_some(), update_flag::NOISE),
+            (update.condition_cap.is_some(), update_flag::CAP),
+            (limit.is_some(), update_flag::FREEZE),
+            (update.statistics == Some(Statistics::Gradient), update_flag::GRADIENT),
+            (
+                update.statistics == Some(Statistics::AbsoluteGradient),
+                update_flag::ABSOLUTE,
+            ),
+            (update.statistics == Some(Statistics::Error), update_flag::ERROR),
         ];
         let floats = [
             [rates.means, rates.quats, rates.log_scales, rates.opacities].map(rate),
             [rate(rates.sh_dc), rate(rates.sh_rest), 0.0, 0.0],
-            [step.beta1, step.beta2, step.epsilon, (1.0 / correction2.sqrt()) as f32],
             [
-                regularizer(regularizers.opacity, 1.0),
-                regularizer(regularizers.opacity_square, 1.0),
-                regularizer(regularizers.scale, 1.0 / (3.0 * unit)),
-                regularizer(regularizers.covariance, unit.powi(-4)),
+                step.beta1,
+                step.beta2,
+                step.epsilon,
+                (1.0 / corrections[1].sqrt()) as f32,
             ],
+            regularizers
+                .per_splat(f64::from(update.regularizer_unit), 1.0 / counted.max(1) as f64)
+                .map(|weight| weight as f32),
             [
                 0.5 * size[0] as f32,
                 0.5 * size[1] as f32,
@@ -386,7 +387,7 @@ impl GpuTraining {
             stride as u32,
             coefficients as u32,
             3 * sh::coefficients(degree as u32) as u32,
-            bits.iter().filter(|(on, _)| *on).map(|(_, bit)| bit).sum(),
+            flags(&bits),
             seed,
             span.to_bits(),
             0,
@@ -407,13 +408,7 @@ impl GpuTraining {
         self.renderer.geometry.read(gpu, 7 * stride, &mut scales);
         let visible: Vec<u32> = self.renderer.visible.to_vec(gpu, count);
         let size = |i: usize| (0..3).map(|c| scales[c * stride + i]).fold(f32::MIN, f32::max);
-        let mut sizes: Vec<f32> = (0..count).filter(|i| visible[*i] != 0).map(size).collect();
-        let frozen = ((1.0 - fraction) * sizes.len() as f32).round() as usize;
-        if frozen == 0 || sizes.is_empty() {
-            return None;
-        }
-        let at = frozen.min(sizes.len() - 1);
-        Some(*sizes.select_nth_unstable_by(at, f32::total_cmp).1)
+        size_limit((0..count).filter(|i| visible[*i] != 0).map(size).collect(), fraction)
     }
 }
 

@@ -8,18 +8,13 @@
 // Planes: red, green, blue, alpha, depth, error.
 @group(0) @binding(6) var<storage, read_write> v_frame: array<f32>;
 
-const THREADS: u32 = 64u;
 var<workgroup> derivatives: array<vec3f, 676>;
 var<workgroup> rows: array<vec3f, 416>;
 var<workgroup> shared_values: array<vec3f, 64>;
 
 @compute @workgroup_size(64)
 fn main(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups: vec3u, @builtin(local_invocation_index) at: u32) {
-    let number = group_index(group, groups);
-    let channel = number / task.size.w;
-    let tile = number % task.size.w;
-    let corner = vec2i(vec2u(tile % task.size.z, tile / task.size.z) * TILE) - i32(RADIUS);
-    let size = vec2i(task.size.xy);
+    let tile = tile_of(group, groups);
     let pixels = task.size.x * task.size.y;
     let has_ssim = (task.flags.x & FLAG_SSIM) != 0u;
     let column = at % TILE;
@@ -27,10 +22,10 @@ fn main(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups: ve
     var adjoint = array<vec3f, 4>();
     if has_ssim {
         for (var i = at; i < SEEN * SEEN; i += THREADS) {
-            let place = corner + vec2i(vec2u(i % SEEN, i / SEEN));
+            let pixel = seen_pixel(tile, i);
             derivatives[i] = vec3f(0.0);
-            if channel < 3u && all(place >= vec2i(0)) && all(place < size) {
-                let plane = 3u * channel * pixels + u32(place.y * size.x + place.x);
+            if pixel >= 0 {
+                let plane = 3u * tile.channel * pixels + u32(pixel);
                 derivatives[i] = vec3f(maps[plane], maps[plane + pixels], maps[plane + 2u * pixels]);
             }
         }
@@ -60,17 +55,17 @@ fn main(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups: ve
     }
     var differences = vec2f(0.0);
     for (var q = 0u; q < 4u; q++) {
-        let pixel = corner + i32(RADIUS) + vec2i(vec2u(column, row + q));
-        if channel < 3u && all(pixel < size) {
-            differences += finish(adjoint[q], u32(pixel.y * size.x + pixel.x), channel);
+        let pixel = own_pixel(tile, column, row + q);
+        if pixel >= 0 {
+            differences += finish(adjoint[q], u32(pixel), tile.channel);
         }
     }
     let sum = sum_group(vec3f(differences, 0.0), at);
-    if at == 0u && channel < 3u {
-        sums[3u * number] = sum.x;
-        sums[3u * number + 1u] = sum.y;
+    if at == 0u && tile.channel < 3u {
+        sums[3u * tile.number] = sum.x;
+        sums[3u * tile.number + 1u] = sum.y;
         if !has_ssim {
-            sums[3u * number + 2u] = 0.0;
+            sums[3u * tile.number + 2u] = 0.0;
         }
     }
 }

@@ -12,7 +12,6 @@
 const C1: f32 = 0.0001;
 const C2: f32 = 0.0009;
 
-const THREADS: u32 = 64u;
 var<workgroup> pairs: array<vec2f, 676>;
 // After the window along x: render, truth, squares, products.
 var<workgroup> rows: array<vec4f, 416>;
@@ -20,16 +19,12 @@ var<workgroup> shared_values: array<vec3f, 64>;
 
 @compute @workgroup_size(64)
 fn main(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups: vec3u, @builtin(local_invocation_index) at: u32) {
-    let number = group_index(group, groups);
-    let channel = number / task.size.w;
-    let tile = number % task.size.w;
-    let corner = vec2i(vec2u(tile % task.size.z, tile / task.size.z) * TILE) - i32(RADIUS);
-    let size = vec2i(task.size.xy);
+    let tile = tile_of(group, groups);
     for (var i = at; i < SEEN * SEEN; i += THREADS) {
-        let place = corner + vec2i(vec2u(i % SEEN, i / SEEN));
+        let pixel = seen_pixel(tile, i);
         pairs[i] = vec2f(0.0);
-        if channel < 3u && all(place >= vec2i(0)) && all(place < size) {
-            pairs[i] = pair_at(u32(place.y * size.x + place.x), channel);
+        if pixel >= 0 {
+            pairs[i] = pair_at(u32(pixel), tile.channel);
         }
     }
     workgroupBarrier();
@@ -61,14 +56,14 @@ fn main(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups: ve
     }
     var dissimilarity = 0.0;
     for (var q = 0u; q < 4u; q++) {
-        let pixel = corner + i32(RADIUS) + vec2i(vec2u(column, row + q));
-        if channel < 3u && all(pixel < size) {
-            dissimilarity += differentiate(means[q], u32(pixel.y * size.x + pixel.x), channel);
+        let pixel = own_pixel(tile, column, row + q);
+        if pixel >= 0 {
+            dissimilarity += differentiate(means[q], u32(pixel), tile.channel);
         }
     }
     let sum = sum_group(vec3f(0.0, 0.0, dissimilarity), at);
-    if at == 0u && channel < 3u {
-        sums[3u * number + 2u] = sum.z;
+    if at == 0u && tile.channel < 3u {
+        sums[3u * tile.number + 2u] = sum.z;
     }
 }
 

@@ -1,0 +1,38 @@
+//! Points with the photographs that see them, as Bundler and VisualSfM list them.
+
+use super::declared::DeclaredPoints;
+use super::tokens::Tokens;
+use crate::Malformed;
+
+/// A point: position, sRGB, and the numbers of the photographs that see it.
+pub type TrackPoint = ([f64; 3], [u8; 3], Vec<usize>);
+
+/// Reads a point: position, colour, the number of its views, and four words a view, the first of which is the photograph's number.
+pub(super) fn track_point(tokens: &mut Tokens) -> Result<TrackPoint, Malformed> {
+    let position = tokens.numbers("a point")?;
+    let color = tokens.numbers::<3>("a colour")?.map(|v| v as u8);
+    let views: usize = tokens.next("a count of views")?;
+    let mut seen = Vec::new();
+    for _ in 0..views {
+        seen.push(tokens.next("a view")?);
+        tokens.skip(3, "a list of views")?;
+    }
+    Ok((position, color, seen))
+}
+
+/// The points that count, and those that each of `photos` photographs sees.
+pub(super) fn declared(tracks: &[TrackPoint], photos: usize) -> (DeclaredPoints, Vec<Vec<u32>>) {
+    let mut points = DeclaredPoints::default();
+    let mut seen = vec![Vec::new(); photos];
+    for (position, color, photos) in tracks {
+        let index = points.positions.len() as u32;
+        if points.push((*position).into(), *color) {
+            for i in photos {
+                if let Some(seen) = seen.get_mut(*i) {
+                    seen.push(index);
+                }
+            }
+        }
+    }
+    (points, seen)
+}

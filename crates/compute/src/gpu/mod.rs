@@ -10,7 +10,7 @@ mod profile;
 mod scan;
 mod sort;
 
-pub use crate::shaders::{GRID, Shader};
+pub use crate::shaders::{ADAM, GRID, HARMONICS, Shader};
 pub use array::Array;
 pub use kernel::{Kernel, Work};
 pub use scan::Scan;

@@ -33,7 +33,7 @@ fn main(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups: ve
         }
         for (var c = 0u; c < 3u; c++) {
             let at = (3u * k + c) * stride + i;
-            let next = adam(b[k] * v_color[c], rate, harmonics[at], moments[at], moments[all + at]);
+            let next = adam(b[k] * v_color[c], rate, harmonics[at], moments[at], moments[all + at], update.adam);
             harmonics[at] = next.x;
             moments[at] = next.y;
             moments[all + at] = next.z;

@@ -144,8 +144,15 @@ fn summary(report: &PoseReport) -> String {
         .iter()
         .map(|stage| format!("{} {:.1} s", stage.name, stage.seconds))
         .collect();
+    let unit = report.scale.as_ref().map_or(String::new(), |scale| {
+        format!(
+            "; in metres by the places of {} photographs, to {:.1} %",
+            scale.photos,
+            100.0 * scale.scale_error
+        )
+    });
     format!(
-        "{} of {} photographs posed, {} points, mean error {:.2} px; {}; {:.1} s in all",
+        "{} of {} photographs posed, {} points, mean error {:.2} px{unit}; {}; {:.1} s in all",
         report.registered,
         report.photos,
         report.points,

@@ -12,6 +12,7 @@ mod doctor;
 mod film;
 mod known;
 mod output;
+mod place;
 mod stages;
 mod store;
 
@@ -97,6 +98,8 @@ pub struct PoseReport {
     pub points: usize,
     /// Its mean reprojection error, px.
     pub mean_error_px: f64,
+    /// How its unit, a metre, was found; `None` if the unit is arbitrary.
+    pub scale: Option<ScaleReport>,
     /// Its cameras.
     pub cameras: Vec<CameraReport>,
     /// Pairs of photographs that were matched.
@@ -142,6 +145,19 @@ pub struct CameraReport {
     pub focal_known: bool,
     /// Whether the focal length was held, because nothing in the photographs determines it.
     pub focal_held: bool,
+}
+
+/// The scale of a model in metres, by the places in the photographs' metadata; +X is east and +Y north then.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct ScaleReport {
+    /// Photographs whose places agree with the model.
+    pub photos: usize,
+    /// Posed photographs that tell their place.
+    pub with_place: usize,
+    /// Root mean square of the horizontal distances between places and the model, m.
+    pub residual_m: f64,
+    /// Relative standard deviation of the scale.
+    pub scale_error: f64,
 }
 
 /// Time of a stage.
@@ -206,12 +222,18 @@ pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Resu
             progress(PoseProgress::Done(photos));
         }
     };
-    let reconstruction = match known {
+    let is_new = known.is_none();
+    let mut reconstruction = match known {
         None => reconstruct(&infos, work.features(), &pairs, &input.mapping, &mut tell),
         Some(known) => {
             let known = known.of(&mut infos)?;
             extend(&infos, work.features(), &pairs, &known, &input.mapping, &mut tell)
         }
+    };
+    let scale = match reconstruction.models.first_mut() {
+        // What is known keeps its unit.
+        Some(model) if is_new => place::scale(&folder, &work, model, progress),
+        _ => None,
     };
     clock.end("poses");
     let examined = doctor::examine(&work, &infos, &pairs, &reconstruction);
@@ -230,6 +252,7 @@ pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Resu
 
     let mut report = output::report(&folder, &work, &infos, &reconstruction);
     report.findings = examined.findings;
+    report.scale = scale;
     report.pairs = pairs.len();
     report.warnings = work.warnings().to_vec();
     report.stages = clock.stages;

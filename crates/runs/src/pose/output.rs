@@ -189,6 +189,7 @@ pub(super) fn report(folder: &PhotoFolder, work: &Work, infos: &[PhotoInfo], fou
         models: found.models.iter().map(Model::registered).collect(),
         points: model.points.len(),
         mean_error_px: model.mean_error(),
+        scale: None,
         cameras,
         pairs: 0,
         verified_pairs: found.pairs.len(),

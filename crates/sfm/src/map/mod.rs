@@ -8,6 +8,7 @@ mod agree;
 mod finish;
 mod focal;
 mod grow;
+mod metric;
 mod model;
 mod refine;
 mod seed;
@@ -20,6 +21,7 @@ mod verify;
 pub use agree::{agreement, contradictions, strengths};
 pub(crate) use finish::up;
 pub use focal::Source;
+pub use metric::{Metric, to_metres};
 pub use types::{
     Known, LeftOut, MapOptions, Model, ModelPoint, PairKind, PhotoInfo, Progress, Reason, Reconstruction, VerifiedPair,
 };

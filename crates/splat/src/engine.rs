@@ -182,13 +182,29 @@ impl Engine {
         self.state.get_mut().expect("just filled")
     }
 
+    /// Edits the state between two steps as density control does: by geometry, statistics and filter. Harmonics and moments may be
+    /// moved, copied from splat to splat and set to zero, but `edit` must neither read nor change them: on a GPU they stay there,
+    /// and the columns it sees have other values.
+    pub fn edit_density<R>(&mut self, edit: impl FnOnce(&mut SplatState) -> R) -> R {
+        #[cfg(feature = "gpu")]
+        if let Some(gpu) = self.gpu.as_mut().filter(|gpu| !gpu.stale) {
+            self.state = OnceLock::new();
+            let mut state = gpu.download_numbered();
+            let result = edit(&mut state);
+            gpu.upload_numbered(&state);
+            return result;
+        }
+        edit(self.state_mut())
+    }
+
     /// From the next frame on, convolves every splat with the state's 3D smoothing filter, or with none.
     pub fn use_filter(&mut self, on: bool) {
+        self.filters = on;
         #[cfg(feature = "gpu")]
         if let Some(gpu) = &mut self.gpu {
-            gpu.stale |= on || self.filters;
+            gpu.renderer.filters = on;
+            return;
         }
-        self.filters = on;
         self.set_filter();
     }
 
@@ -266,6 +282,16 @@ impl Engine {
             return gpu.renderer.frame();
         }
         self.renderer.frame()
+    }
+
+    /// Pixels of the last frame.
+    pub fn pixels(&self) -> usize {
+        #[cfg(feature = "gpu")]
+        if let Some(gpu) = &self.gpu {
+            return gpu.renderer.pixels();
+        }
+        let [width, height] = self.renderer.size().unwrap_or_default();
+        width as usize * height as usize
     }
 
     /// Splats that touched the last frame.

@@ -59,6 +59,8 @@ kernels! {
     update_harmonics: [GRID, VIEW, UPDATE, HARMONICS],
     /// Twin: `SplatState::step`, `regularize` and `mcmc::add_noise`.
     update_geometry: [GRID, VIEW, UPDATE],
+    /// Twin: `Planes::rearrange`.
+    move_rows: [GRID],
 }
 
 /// Kernels of [`SHADERS`] that make a frame.

@@ -479,19 +479,12 @@ impl Trainer {
     }
 
     fn control_density(&mut self, plan: &StepPlan) -> Option<DensityChange> {
-        let change = plan.densify.as_ref().map(|round| {
-            let cleared = self.free_space.clear(self.engine.state_mut());
-            let change = self.densify(round);
-            DensityChange {
-                pruned: change.pruned + cleared,
-                ..change
-            }
-        });
+        let change = plan.densify.as_ref().map(|round| self.densify(round));
         let merged = plan
             .merge
             .map(|knobs| merge::merge(self.engine.state_mut(), &knobs.options()));
         if let Some(ceiling) = plan.reset_opacity {
-            classic::reset_opacity(self.engine.state_mut(), ceiling);
+            self.engine.edit_density(|state| classic::reset_opacity(state, ceiling));
         }
         if change.is_some() && self.recipe.render.smoothing_filter {
             self.update_filter();
@@ -506,30 +499,34 @@ impl Trainer {
     }
 
     fn densify(&mut self, round: &Round) -> DensityChange {
-        let pixels = self.engine.frame().color.len() / 3;
-        let by_memory = self
-            .memory
-            .splats_at(self.engine.intersections(), self.engine.len(), pixels);
-        let limit = self.limit(self.clock.stage, round.count_share).min(by_memory);
+        let (intersections, pixels) = (self.engine.intersections(), self.engine.pixels());
+        let limit = self.limit(self.clock.stage, round.count_share);
         let first = first_count(&self.dataset, &self.recipe);
         let mut rng = Rng::new(self.options.seed ^ self.clock.step << 20, STREAM_DENSIFY);
-        let state = self.engine.state_mut();
-        match round.density {
-            DensityControl::Classic(knobs) => {
-                let options = knobs.options(self.extent, round.prune_large, limit);
-                classic::densify(state, &options, &mut rng)
+        self.engine.edit_density(|state| {
+            let cleared = self.free_space.clear(state);
+            let limit = limit.min(self.memory.splats_at(intersections, state.len(), pixels));
+            let change = match round.density {
+                DensityControl::Classic(knobs) => {
+                    let options = knobs.options(self.extent, round.prune_large, limit);
+                    classic::densify(state, &options, &mut rng)
+                }
+                DensityControl::Mcmc(knobs) => mcmc::densify(state, &knobs.options(self.pace, limit), &mut rng),
+                DensityControl::Taming(knobs) => {
+                    let target = taming::next_count(state.len(), limit, round.completed);
+                    let options = knobs.options(self.extent, round.prune_large, round.number, target);
+                    taming::densify(state, &options, &mut rng)
+                }
+                DensityControl::Fast(knobs) => {
+                    let floor = ((f64::from(knobs.floor) * self.pixels) as usize).min(first).min(limit);
+                    fast::densify(state, &knobs.options(self.pace, floor, limit))
+                }
+            };
+            DensityChange {
+                pruned: change.pruned + cleared,
+                ..change
             }
-            DensityControl::Mcmc(knobs) => mcmc::densify(state, &knobs.options(self.pace, limit), &mut rng),
-            DensityControl::Taming(knobs) => {
-                let target = taming::next_count(state.len(), limit, round.completed);
-                let options = knobs.options(self.extent, round.prune_large, round.number, target);
-                taming::densify(state, &options, &mut rng)
-            }
-            DensityControl::Fast(knobs) => {
-                let floor = ((f64::from(knobs.floor) * self.pixels) as usize).min(first).min(limit);
-                fast::densify(state, &knobs.options(self.pace, floor, limit))
-            }
-        }
+        })
     }
 
     /// Maximum number of splats of stage `stage` at `count_share`, a fraction of the cap.
@@ -547,7 +544,7 @@ impl Trainer {
             .iter()
             .map(|i| ViewParams::new(&self.dataset.views[*i].camera))
             .collect();
-        filter::update(self.engine.state_mut(), &views);
+        self.engine.edit_density(|state| filter::update(state, &views));
         self.restore_filter();
     }
 

@@ -42,7 +42,8 @@ pub struct GpuRenderer {
     pub(super) filter: Array,
     /// Number of splats, stride of their planes, SH degree.
     pub(super) shape: [usize; 3],
-    filters: bool,
+    /// Whether splats are convolved with `filter`.
+    pub(crate) filters: bool,
     pub(super) footprints: Array,
     pub(super) visible: Array,
     pub(super) touched: Array,
@@ -152,13 +153,19 @@ impl GpuRenderer {
 
     /// Takes the splats of the frames to come, and the variances of their 3D smoothing filter, if any.
     pub fn upload(&mut self, splats: &Splats, filter: &[f32]) {
-        let (gpu, stride) = (&self.gpu, splats.stride());
-        self.shape = [splats.len(), stride, splats.sh_degree() as usize];
-        self.geometry.reserve(gpu, GEOMETRY * stride);
-        self.harmonics.reserve(gpu, splats.sh.as_slice().len());
-        write_geometry(gpu, &self.geometry, 0, splats);
-        self.harmonics.write(gpu, 0, splats.sh.as_slice());
+        self.harmonics.reserve(&self.gpu, splats.sh.as_slice().len());
+        self.harmonics.write(&self.gpu, 0, splats.sh.as_slice());
+        self.upload_geometry(splats, filter, splats.sh_degree() as usize);
         self.filters = !filter.is_empty();
+        self.last = None;
+    }
+
+    /// Takes everything but the harmonics, of which there is room for `degree`.
+    pub(super) fn upload_geometry(&mut self, splats: &Splats, filter: &[f32], degree: usize) {
+        let (gpu, stride) = (&self.gpu, splats.stride());
+        self.shape = [splats.len(), stride, degree];
+        self.geometry.reserve(gpu, GEOMETRY * stride);
+        write_geometry(gpu, &self.geometry, 0, splats);
         self.filter.reserve(gpu, filter.len());
         self.filter.write(gpu, 0, filter);
         self.footprints.reserve(gpu, 12 * stride);
@@ -173,7 +180,6 @@ impl GpuRenderer {
         ] {
             array.reserve(gpu, stride);
         }
-        self.last = None;
     }
 
     /// Renders the uploaded splats.
@@ -335,6 +341,11 @@ impl GpuRenderer {
             alpha: &host[3 * pixels..4 * pixels],
             depth: if last.options.depth { &host[4 * pixels..] } else { &[] },
         }
+    }
+
+    /// Pixels of the last frame.
+    pub fn pixels(&self) -> usize {
+        self.last.as_ref().map_or(0, Last::pixels)
     }
 
     /// Splats that touched the last frame.

@@ -5,6 +5,7 @@
 //! differently from the CPU; what differs is rounding alone.
 
 mod frame;
+mod moves;
 mod training;
 
 pub use frame::GpuRenderer;

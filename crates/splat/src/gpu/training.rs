@@ -1,6 +1,7 @@
 //! Splats in training on the GPU: their state, the backward pass and the update.
 
 use super::frame::{FRAME_PLANES, GEOMETRY, GpuRenderer, flag, read_geometry, write_geometry};
+use super::moves::Moves;
 use crate::engine::Update;
 use crate::regularize::{Regularized, size_limit};
 use crate::render::{CHUNK, CameraGradient, Gather, OutputGradient, RenderOptions, basis_at};
@@ -47,15 +48,17 @@ pub struct DeviceGradient {
 /// The twin of the CPU's state, renderer and gradients.
 pub(crate) struct GpuTraining {
     pub renderer: GpuRenderer,
-    moments_geometry: Array,
-    moments_harmonics: Array,
+    /// First moments, then second ones.
+    pub(super) moments_geometry: Array,
+    /// First and second moments: with the harmonics, the largest arrays of a state.
+    pub(super) moments_harmonics: [Array; 2],
     statistics: Array,
-    filter: Array,
     v_frame: Array,
     sums: Array,
     v_splats: Array,
     v_camera: Array,
     update: Array,
+    pub(super) moves: Moves,
     camera: Option<CameraGradient>,
     /// Whether the host's state was edited since it was uploaded.
     pub stale: bool,
@@ -66,14 +69,14 @@ impl GpuTraining {
         let array = |label| Array::zeros(&gpu, label, 0);
         Ok(Self {
             moments_geometry: array("moments of geometry"),
-            moments_harmonics: array("moments of harmonics"),
+            moments_harmonics: ["first moments of harmonics", "second moments of harmonics"].map(array),
             statistics: array("statistics"),
-            filter: array("filter variances"),
             v_frame: array("gradients of the frame"),
             sums: array("sums of blending"),
             v_splats: array("gradients of splats"),
             v_camera: array("gradients of the camera"),
             update: Array::zeros(&gpu, "update", UPDATE_WORDS),
+            moves: Moves::new(&gpu),
             camera: None,
             stale: true,
             renderer: GpuRenderer::new(gpu)?,
@@ -82,23 +85,25 @@ impl GpuTraining {
 
     /// Takes the whole state.
     pub fn upload(&mut self, state: &SplatState, filters: bool) {
-        let filter = if filters { state.filter.plane(0) } else { &[] };
-        self.renderer.upload(&state.splats, filter);
+        self.renderer.upload(&state.splats, state.filter.plane(0));
+        self.renderer.filters = filters;
         let gpu = &self.renderer.gpu;
-        let stride = state.splats.stride();
-        self.moments_geometry.reserve(gpu, 2 * GEOMETRY * stride);
-        let harmonics = state.splats.sh.as_slice().len();
-        self.moments_harmonics.reserve(gpu, 2 * harmonics);
+        self.moments_geometry.reserve(gpu, 2 * GEOMETRY * state.splats.stride());
         for (i, moment) in state.moments.iter().enumerate() {
             write_geometry(gpu, &self.moments_geometry, i * GEOMETRY, moment);
-            self.moments_harmonics.write(gpu, i * harmonics, moment.sh.as_slice());
+            let harmonics = &mut self.moments_harmonics[i];
+            harmonics.reserve(gpu, moment.sh.as_slice().len());
+            harmonics.write(gpu, 0, moment.sh.as_slice());
         }
+        self.upload_statistics(state);
+        self.stale = false;
+    }
+
+    pub(super) fn upload_statistics(&mut self, state: &SplatState) {
+        let gpu = &self.renderer.gpu;
         self.statistics.reserve(gpu, state.statistics.as_slice().len());
         self.statistics.write(gpu, 0, state.statistics.as_slice());
-        self.filter.reserve(gpu, stride);
-        self.filter.write(gpu, 0, state.filter.as_slice());
-        self.v_splats.reserve(gpu, GRADIENTS * stride);
-        self.stale = false;
+        self.v_splats.reserve(gpu, GRADIENTS * state.splats.stride());
     }
 
     /// The state as it is now.
@@ -109,20 +114,26 @@ impl GpuTraining {
         let mut state = SplatState {
             splats: zeros(),
             moments: [zeros(), zeros()],
-            statistics: Planes::zeros(SplatState::STATISTICS, count),
-            filter: Planes::zeros(1, count),
+            ..SplatState::default()
         };
-        read_geometry(gpu, &self.renderer.geometry, 0, &mut state.splats);
         self.renderer.harmonics.read(gpu, 0, state.splats.sh.as_mut_slice());
-        let harmonics = state.splats.sh.as_slice().len();
         for (i, moment) in state.moments.iter_mut().enumerate() {
             read_geometry(gpu, &self.moments_geometry, i * GEOMETRY, moment);
-            self.moments_harmonics
-                .read(gpu, i * harmonics, moment.sh.as_mut_slice());
+            self.moments_harmonics[i].read(gpu, 0, moment.sh.as_mut_slice());
         }
-        self.statistics.read(gpu, 0, state.statistics.as_mut_slice());
-        self.filter.read(gpu, 0, state.filter.as_mut_slice());
+        self.download_decisive(&mut state);
         state
+    }
+
+    /// Reads what density control decides by: geometry, statistics and filter.
+    pub(super) fn download_decisive(&self, state: &mut SplatState) {
+        let gpu = &self.renderer.gpu;
+        let count = self.renderer.shape[0];
+        read_geometry(gpu, &self.renderer.geometry, 0, &mut state.splats);
+        state.statistics = Planes::zeros(SplatState::STATISTICS, count);
+        self.statistics.read(gpu, 0, state.statistics.as_mut_slice());
+        state.filter = Planes::zeros(1, count);
+        self.renderer.filter.read(gpu, 0, state.filter.as_mut_slice());
     }
 
     pub fn len(&self) -> usize {
@@ -307,7 +318,8 @@ impl GpuTraining {
                 &renderer.geometry,
                 &self.v_splats,
                 &renderer.harmonics,
-                &self.moments_harmonics,
+                &self.moments_harmonics[0],
+                &self.moments_harmonics[1],
             ],
             groups,
         );

@@ -119,6 +119,12 @@ impl Engine {
         Ok(())
     }
 
+    /// Whether the state is on a GPU.
+    #[cfg(feature = "gpu")]
+    pub fn is_on_gpu(&self) -> bool {
+        self.gpu.is_some()
+    }
+
     /// What has gone wrong on the device: the state and everything made from it are then unspecified.
     ///
     /// # Errors
@@ -232,17 +238,42 @@ impl Engine {
     /// Renders a frame of the splats that were placed last, for any pinhole camera.
     pub fn render_view(&mut self, view: &ViewParams, options: &RenderOptions) {
         #[cfg(feature = "gpu")]
-        if let Some(gpu) = &mut self.gpu {
-            if gpu.stale {
-                let state = self.state.get().expect("what was edited is here");
-                gpu.upload(state, self.filters);
-            }
-            gpu.render(view, options);
+        if self.gpu.is_some() {
+            self.on_gpu().render(view, options);
             return;
         }
         self.update_bounds();
         let (splats, bounds) = placed(known(&self.state), self.moved.as_ref(), &self.bounds);
         self.renderer.render_within(splats, bounds, view, options);
+    }
+
+    /// Begins a frame of the state's splats on the GPU, without waiting for what it finds: until [`Self::settle`], only the device knows.
+    ///
+    /// # Panics
+    /// When the engine is on the CPU.
+    #[cfg(feature = "gpu")]
+    pub fn render_ahead(&mut self, camera: &Camera, options: &RenderOptions) {
+        self.moved = None;
+        self.on_gpu().render_ahead(&ViewParams::new(camera), options);
+    }
+
+    /// Waits for the last [`Self::render_ahead`]: whether there was room on the device for it. If not, the frame and what was made from it
+    /// since are void: the backward pass and the update changed nothing, and are to be repeated after another frame.
+    #[cfg(feature = "gpu")]
+    #[must_use]
+    pub fn settle(&mut self) -> bool {
+        self.gpu.as_mut().is_none_or(|gpu| gpu.renderer.settle())
+    }
+
+    /// The GPU's training, with the latest state.
+    #[cfg(feature = "gpu")]
+    fn on_gpu(&mut self) -> &mut GpuTraining {
+        let gpu = self.gpu.as_mut().expect("the engine is on a GPU");
+        if gpu.stale {
+            let state = self.state.get().expect("what was edited is here");
+            gpu.upload(state, self.filters);
+        }
+        gpu
     }
 
     /// The first half of a frame with added colours; [`Self::composite`] is the second.

@@ -41,6 +41,8 @@ kernels! {
     project: [GRID, VIEW, GEOMETRY, LOAD, HARMONICS, TILES],
     /// Visible splats and their depths, ascending.
     compact: [GRID, VIEW],
+    /// Numbers of visible splats and entries, if there is room for them.
+    admit: [VIEW],
     /// Tiles of each visible splat, front to back.
     count: [GRID, VIEW],
     /// Twin: `render::bin`, with `ranges` and `segments`.

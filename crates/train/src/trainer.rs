@@ -362,25 +362,28 @@ impl Trainer {
             depth: plan.compares_depth(),
             ..self.render_options(plan.sh_degree)
         };
-        self.sockets.render(&mut self.engine, view, placement, &options, &plan);
         let reference = Reference {
             photo: &photo,
             background,
             depths: &self.known_depths(view, &camera, &plan),
         };
-        let camera_gradient = self.sockets.needs_camera_gradient();
-        let on_device = self.sockets.exposure.is_none().then(|| {
-            let has_lpips = self.options.lpips.is_some();
+        let (update, has_lpips) = (self.update(&plan), self.options.lpips.is_some());
+        let ahead = self.sockets.are_empty().then(|| {
+            let frame = (&camera, &options);
             self.device_loss
-                .step(&mut self.engine, &reference, &plan, camera_gradient, has_lpips)
+                .whole_step(&mut self.engine, frame, &reference, &plan, &update, has_lpips)
         });
-        let loss = match on_device.flatten() {
+        let loss = match ahead.flatten() {
             Some(loss) => loss,
-            None => self.step_losses(&reference, view, &plan, &mut rng),
+            None => {
+                self.sockets.render(&mut self.engine, view, placement, &options, &plan);
+                let loss = self.step_losses(&reference, view, &plan, &mut rng);
+                self.sockets
+                    .step_before_blending(&mut self.engine, view, &camera, self.extent, &plan);
+                self.engine.update(&update);
+                loss
+            }
         };
-        self.sockets
-            .step_before_blending(&mut self.engine, view, &camera, self.extent, &plan);
-        self.engine.update(&self.update(&plan));
         let density_started = Instant::now();
         if let Some(change) = self.control_density(&plan) {
             events.push(Event::densified(self.clock.step + 1, change, self.engine.len()));
@@ -415,8 +418,17 @@ impl Trainer {
         Ok((report, metrics))
     }
 
-    /// The losses of the last frame, on the host, and its backward pass.
+    /// The losses of the last frame, and its backward pass.
     fn step_losses(&mut self, reference: &Reference, view: usize, plan: &StepPlan, rng: &mut Rng) -> ObjectiveValues {
+        let camera_gradient = self.sockets.needs_camera_gradient();
+        let on_device = self.sockets.exposure.is_none().then(|| {
+            let has_lpips = self.options.lpips.is_some();
+            self.device_loss
+                .step(&mut self.engine, reference, plan, camera_gradient, has_lpips)
+        });
+        if let Some(loss) = on_device.flatten() {
+            return loss;
+        }
         let frame = FramePlanes {
             color: self.sockets.frame_color(&self.engine),
             ..self.engine.frame()
@@ -432,7 +444,7 @@ impl Trainer {
         self.sockets
             .step_after_blending(&self.engine, view, self.objective.v_color_mut(), plan);
         let mut v_out = self.objective.gradient();
-        v_out.camera = self.sockets.needs_camera_gradient();
+        v_out.camera = camera_gradient;
         v_out.gather = match plan.gathers {
             Some(Statistics::AbsoluteGradient) => Gather::Absolute,
             Some(Statistics::Error) => self.objective.gather_error(),

@@ -7,12 +7,14 @@
 mod array;
 mod kernel;
 mod profile;
+mod readback;
 mod scan;
 mod sort;
 
 pub use crate::shaders::{GRID, Shader};
-pub use array::Array;
+pub use array::{Array, PART};
 pub use kernel::{Kernel, Work};
+pub use readback::Readback;
 pub use scan::Scan;
 pub use sort::Sort;
 
@@ -88,6 +90,8 @@ pub struct Gpu {
     info: AdapterInfo,
     failure: Arc<Mutex<Option<String>>>,
     profile: OnceLock<Profile>,
+    /// For [`Array::read`].
+    staging: Mutex<Option<Readback>>,
 }
 
 impl fmt::Debug for Gpu {
@@ -200,6 +204,7 @@ impl Gpu {
             info,
             failure,
             profile: OnceLock::new(),
+            staging: Mutex::default(),
         }))
     }
 
@@ -246,7 +251,16 @@ impl Gpu {
 
     /// Waits until everything submitted is done.
     pub fn wait(&self) {
-        if let Err(error) = self.device.poll(wgpu::PollType::wait_indefinitely()) {
+        self.wait_for(None);
+    }
+
+    /// Waits for a submission, or for all so far.
+    fn wait_for(&self, submission_index: Option<wgpu::SubmissionIndex>) {
+        let until = wgpu::PollType::Wait {
+            submission_index,
+            timeout: None,
+        };
+        if let Err(error) = self.device.poll(until) {
             self.fail(&error.to_string());
         }
     }

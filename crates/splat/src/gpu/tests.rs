@@ -450,11 +450,12 @@ fn density_control_with_harmonics_on_the_device_gives_the_same_bits_as_the_whole
             engine.update(&update);
         }
     };
+    let mut engine = Engine::new(SplatState::default());
+    engine.use_device(&Device::Gpu(gpu.clone())).unwrap();
+    engine.use_filter(true);
     for (name, edit) in edits {
         let [on_device, whole] = [true, false].map(|stays| {
-            let mut engine = Engine::new(SplatState::new(splats.clone()));
-            engine.use_device(&Device::Gpu(gpu.clone())).unwrap();
-            engine.use_filter(true);
+            *engine.state_mut() = SplatState::new(splats.clone());
             train(&mut engine);
             match stays {
                 true => engine.edit_density(edit),
@@ -467,5 +468,55 @@ fn density_control_with_harmonics_on_the_device_gives_the_same_bits_as_the_whole
         });
         assert!(on_device == whole, "{name}");
     }
+    gpu.check().unwrap();
+}
+
+#[test]
+fn a_step_without_room_changes_nothing_and_its_repetition_is_that_of_a_step_that_waits() {
+    let Some(gpu) = gpu() else { return };
+    // Large splats, which touch many tiles each.
+    let (mut splats, camera) = scene(300, 1, 70);
+    splats
+        .log_scales
+        .as_mut_slice()
+        .iter_mut()
+        .for_each(|s| *s = s.max(-2.0));
+    let update = Update {
+        optimizer: Optimizer {
+            dense: true,
+            ..usual_update().optimizer
+        },
+        regularizers: Regularizers {
+            opacity: 0.01,
+            ..Regularizers::default()
+        },
+        noise: Some(Noise {
+            amount: 0.01,
+            seed: 1,
+            step: 1,
+        }),
+        ..usual_update()
+    };
+    let [v_color, ..] = gradients(&camera, 8);
+    let mut engines = [0, 1].map(|_| Engine::new(SplatState::new(splats.clone())));
+    for engine in &mut engines {
+        engine.use_device(&Device::Gpu(gpu.clone())).unwrap();
+    }
+    let [ahead, waits] = &mut engines;
+    let before = ahead.state().clone();
+    let step = |engine: &mut Engine, ahead: bool| {
+        match ahead {
+            true => engine.render_ahead(&camera, &RenderOptions::default()),
+            false => engine.render(camera.into(), &RenderOptions::default()),
+        }
+        engine.backward(&OutputGradient::of_color(&v_color));
+        engine.update(&update);
+        engine.settle()
+    };
+    assert!(!step(ahead, true), "there is no room for {}", ahead.intersections());
+    assert!(*ahead.state() == before, "a void step changes nothing");
+    assert!(step(ahead, true) && step(waits, false));
+    assert!(*ahead.state() != before && ahead.state() == waits.state());
+    assert_eq!(ahead.intersections(), waits.intersections());
     gpu.check().unwrap();
 }

@@ -141,6 +141,11 @@ impl GpuTraining {
     }
 
     pub fn render(&mut self, view: &ViewParams, options: &RenderOptions) {
+        self.renderer.draw_whole(view, options, true);
+    }
+
+    /// As [`Self::render`], without waiting for it.
+    pub fn render_ahead(&mut self, view: &ViewParams, options: &RenderOptions) {
         self.renderer.draw(view, options, true);
     }
 
@@ -193,14 +198,15 @@ impl GpuTraining {
             (of.camera, flag::CAMERA),
         ];
         let more = flags(&bits);
-        let [visible, entries] = last.found;
+        let [count, ..] = renderer.shape;
         if of.camera {
-            self.v_camera.reserve(&gpu, CAMERA * visible);
+            self.v_camera.reserve(&gpu, CAMERA * count);
         }
-        renderer.view.write(&gpu, 0, &renderer.view_words(&last, more));
-        self.sums.reserve(&gpu, SUMS * entries);
+        renderer.add_flags(&last, more);
+        self.sums.reserve(&gpu, SUMS * last.room);
 
         let mut work = Work::new(&gpu);
+        work.clear(&renderer.found.part(2, 1), 1);
         work.run(
             &renderer.kernels.blend_vjp,
             &[
@@ -236,10 +242,10 @@ impl GpuTraining {
                 &renderer.found,
                 &self.v_camera,
             ],
-            visible.div_ceil(VJP_GROUP),
+            count.div_ceil(VJP_GROUP),
         );
         work.submit();
-        self.camera = of.camera.then(|| self.sum_camera(&last.view, visible));
+        self.camera = of.camera.then(|| self.sum_camera(&last.view, last.found[0]));
     }
 
     /// Sums the camera's gradients in order, in double precision.
@@ -303,7 +309,7 @@ impl GpuTraining {
     /// The twin of the CPU's update.
     pub fn update(&mut self, update: &Update) {
         let Some(last) = self.renderer.last.clone() else { return };
-        let words = self.update_words(update, last.found[0], [last.view.width, last.view.height]);
+        let words = self.update_words(update, [last.view.width, last.view.height]);
         let renderer = &self.renderer;
         let gpu = &renderer.gpu;
         self.update.write(gpu, 0, &words);
@@ -326,6 +332,7 @@ impl GpuTraining {
         work.run(
             &renderer.kernels.update_geometry,
             &[
+                &renderer.view,
                 &self.update,
                 &renderer.visible,
                 &renderer.footprints,
@@ -339,17 +346,13 @@ impl GpuTraining {
         work.submit();
     }
 
-    fn update_words(&self, update: &Update, visible: usize, size: [u32; 2]) -> [u32; UPDATE_WORDS] {
+    fn update_words(&self, update: &Update, size: [u32; 2]) -> [u32; UPDATE_WORDS] {
         let [count, stride, degree] = self.renderer.shape;
         let step = &update.optimizer.step;
         let corrections = step.corrections();
         let rate = |rate: f32| (f64::from(rate) / corrections[0]) as f32;
         let rates = &update.rates;
         let regularizers = &update.regularizers;
-        let counted = match update.regularized {
-            Regularized::Visible => visible,
-            Regularized::All => count,
-        };
         let is_regularized = !regularizers.is_zero();
         let all = is_regularized && update.regularized == Regularized::All;
         let limit = match update.trained_fraction < 1.0 {
@@ -380,7 +383,7 @@ impl GpuTraining {
                 (1.0 / corrections[1].sqrt()) as f32,
             ],
             regularizers
-                .per_splat(f64::from(update.regularizer_unit), 1.0 / counted.max(1) as f64)
+                .per_splat(f64::from(update.regularizer_unit), 1.0)
                 .map(|weight| weight as f32),
             [
                 0.5 * size[0] as f32,

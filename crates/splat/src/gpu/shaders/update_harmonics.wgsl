@@ -11,7 +11,7 @@
 @compute @workgroup_size(256)
 fn main(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups: vec3u, @builtin(local_invocation_index) thread: u32) {
     let i = group_index(group, groups) * 256u + thread;
-    if i >= update.splats.x {
+    if i >= update.splats.x || view.found.w != 0u {
         return;
     }
     let is_active = visible[i] != 0u;

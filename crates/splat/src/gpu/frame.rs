@@ -8,7 +8,7 @@ use irradia_compute::gpu::{Array, GROUP, Gpu, PART, Readback, Scan, Sort, Work, 
 use std::sync::{Arc, OnceLock};
 
 /// Width and height of a tile, pixels.
-const TILE: u32 = 16;
+pub(super) const TILE: u32 = 16;
 /// Entries of a segment, between whose beginnings the state of pixels is kept.
 const SEGMENT: usize = 256;
 /// Words of a segment's state: five channels of each pixel of a tile.
@@ -101,10 +101,14 @@ impl Last {
         [self.view.width, self.view.height].map(|size| size.div_ceil(TILE))
     }
 
+    pub fn tile_count(&self) -> usize {
+        let [x, y] = self.tiles();
+        x as usize * y as usize
+    }
+
     /// Segments at most.
     pub fn segments(&self) -> usize {
-        let [x, y] = self.tiles();
-        self.room / SEGMENT + x as usize * y as usize
+        self.room / SEGMENT + self.tile_count()
     }
 }
 
@@ -233,7 +237,6 @@ impl GpuRenderer {
     pub(super) fn draw(&mut self, view: &ViewParams, options: &RenderOptions, trains: bool) {
         let gpu = self.gpu.clone();
         let [count, ..] = self.shape;
-        let groups = |items: usize| items.div_ceil(GROUP as usize);
         self.host = OnceLock::new();
         // What is next to nothing, to begin with.
         self.room = self.room.max(count);
@@ -245,8 +248,7 @@ impl GpuRenderer {
             found: [0; 2],
             non_finite: 0,
         };
-        let [tiles_x, tiles_y] = last.tiles();
-        let tiles = tiles_x as usize * tiles_y as usize;
+        let tiles = last.tile_count();
         for array in [&mut self.tiles, &mut self.slots, &mut self.splat_of_slot] {
             array.reserve(&gpu, last.room);
         }
@@ -263,10 +265,18 @@ impl GpuRenderer {
         self.view.write(&gpu, 0, &self.view_words(&last));
 
         let mut work = Work::new(&gpu);
+        self.project(&mut work);
+        self.bin(&mut work, &last);
+        self.blend(&mut work, &last);
+        work.submit_reading(&self.found, &mut self.readback);
+        self.last = Some(last);
+    }
+
+    /// Splats to footprints, and how many tiles each touches.
+    pub(super) fn project(&self, work: &mut Work) {
         work.clear(&self.found, 2);
-        let kernels = &self.kernels;
         work.run(
-            &kernels.project,
+            &self.kernels.project,
             &[
                 &self.view,
                 &self.geometry,
@@ -277,10 +287,17 @@ impl GpuRenderer {
                 &self.touched,
                 &self.found,
             ],
-            groups(count),
+            groups(self.shape[0]),
         );
+    }
+
+    /// Footprints to the lists of all tiles, front to back, and to the segments of these lists.
+    pub(super) fn bin(&mut self, work: &mut Work, last: &Last) {
+        let [count, ..] = self.shape;
+        let tiles = last.tile_count();
         self.scan
-            .run(&mut work, &self.scan_params[0], &self.visible, &self.places, count);
+            .run(work, &self.scan_params[0], &self.visible, &self.places, count);
+        let kernels = &self.kernels;
         work.run(
             &kernels.compact,
             &[
@@ -296,8 +313,7 @@ impl GpuRenderer {
         work.run(&kernels.admit, &[&self.found, &self.view, &self.all_counted], 1);
         let [visible, entries] = &self.counted;
         self.sort_depths
-            .run(&mut work, &self.depths, &self.order, visible, count, u32::BITS);
-        let kernels = &self.kernels;
+            .run(work, &self.depths, &self.order, visible, count, u32::BITS);
         work.run(
             &kernels.count,
             &[&self.view, &self.order, &self.touched, &self.counts],
@@ -305,7 +321,7 @@ impl GpuRenderer {
         );
         // What lies beyond the visible splats is added to nothing.
         self.scan
-            .run(&mut work, &self.scan_params[1], &self.counts, &self.firsts, count);
+            .run(work, &self.scan_params[1], &self.counts, &self.firsts, count);
         work.run(
             &kernels.emit,
             &[
@@ -322,7 +338,7 @@ impl GpuRenderer {
         );
         let bits = u32::BITS - (tiles as u32).leading_zeros();
         self.sort_tiles
-            .run(&mut work, &self.tiles, &self.slots, entries, last.room, bits);
+            .run(work, &self.tiles, &self.slots, entries, last.room, bits);
         work.clear(&self.ranges, 2 * (tiles + 1));
         work.run(
             &kernels.ranges,
@@ -335,14 +351,18 @@ impl GpuRenderer {
             groups(tiles + 1),
         );
         self.scan.run(
-            &mut work,
+            work,
             &self.scan_params[2],
             &self.segment_counts,
             &self.first_segments,
             tiles + 1,
         );
+    }
+
+    /// The lists of tiles to pixels.
+    pub(super) fn blend(&self, work: &mut Work, last: &Last) {
         work.run(
-            &kernels.blend,
+            &self.kernels.blend,
             &[
                 &self.view,
                 &self.ranges,
@@ -355,10 +375,8 @@ impl GpuRenderer {
                 &self.states,
                 &self.planes,
             ],
-            tiles,
+            last.tile_count(),
         );
-        work.submit_reading(&self.found, &mut self.readback);
-        self.last = Some(last);
     }
 
     /// What the backward pass needs beyond what the frame needed.
@@ -460,6 +478,11 @@ impl GpuRenderer {
 
 /// Words of `View` in `view.wgsl`.
 const VIEW_WORDS: usize = 44;
+
+/// Workgroups for so many items.
+fn groups(items: usize) -> usize {
+    items.div_ceil(GROUP as usize)
+}
 
 /// Writes everything but the harmonics, plane by plane, from plane `first` on.
 pub(super) fn write_geometry(gpu: &Gpu, to: &Array, first: usize, splats: &Splats) {

@@ -13,4 +13,6 @@ pub use training::DeviceGradient;
 pub(crate) use training::GpuTraining;
 
 #[cfg(test)]
+mod bisect;
+#[cfg(test)]
 mod tests;

@@ -16,7 +16,7 @@ use irradia_compute::gpu::{Gpu, Wanted};
 use irradia_scene::{Camera, Intrinsics, Pose, Rng};
 use std::sync::Arc;
 
-fn gpu() -> Option<Arc<Gpu>> {
+pub(super) fn gpu() -> Option<Arc<Gpu>> {
     irradia_testkit::gpu_or_skip(|| Gpu::open(&Wanted::Any))
 }
 
@@ -28,7 +28,7 @@ fn every_shader_is_valid() {
 }
 
 /// `n` splats of all sizes about the origin, some behind the camera, a few needles, and a camera with an awkward lens.
-fn scene(n: usize, degree: u32, seed: u64) -> (Splats, Camera) {
+pub(super) fn scene(n: usize, degree: u32, seed: u64) -> (Splats, Camera) {
     let mut rng = Rng::new(seed, 7);
     let mut splats = Splats::zeros(n, degree);
     for i in 0..n {
@@ -117,7 +117,7 @@ fn the_same_frame_has_the_same_bytes() {
 }
 
 /// What the loss of a frame might be.
-fn gradients(camera: &Camera, seed: u64) -> [Vec<f32>; 4] {
+pub(super) fn gradients(camera: &Camera, seed: u64) -> [Vec<f32>; 4] {
     let pixels = camera.intrinsics.width as usize * camera.intrinsics.height as usize;
     let mut rng = Rng::new(seed, 9);
     [3 * pixels, pixels, pixels, pixels].map(|n| (0..n).map(|_| rng.range(-1.0, 1.0) / pixels as f32).collect())
@@ -197,7 +197,7 @@ fn gradients_agree_with_the_cpu() {
 }
 
 /// Of every parameter, with the norms of screen gradients as statistics.
-fn usual_update() -> Update {
+pub(super) fn usual_update() -> Update {
     Update {
         statistics: Some(Statistics::Gradient),
         regularizers: Regularizers::default(),

@@ -1,6 +1,6 @@
 //! Splats in training on the GPU: their state, the backward pass and the update.
 
-use super::frame::{FRAME_PLANES, GEOMETRY, GpuRenderer, flag, read_geometry, write_geometry};
+use super::frame::{FRAME_PLANES, GEOMETRY, GpuRenderer, Last, flag, read_geometry, write_geometry};
 use super::moves::Moves;
 use crate::engine::Update;
 use crate::regularize::{Regularized, size_limit};
@@ -12,7 +12,7 @@ use irradia_scene::sh;
 use std::sync::Arc;
 
 /// Gradients of each splat, planes: geometry, colour, screen, gathered.
-const GRADIENTS: usize = GEOMETRY + 7;
+pub(super) const GRADIENTS: usize = GEOMETRY + 7;
 /// Sums of blending of each slot.
 const SUMS: usize = 12;
 /// Threads of a workgroup of `project_vjp.wgsl`, which needs many registers.
@@ -54,8 +54,8 @@ pub(crate) struct GpuTraining {
     pub(super) moments_harmonics: [Array; 2],
     statistics: Array,
     v_frame: Array,
-    sums: Array,
-    v_splats: Array,
+    pub(super) sums: Array,
+    pub(super) v_splats: Array,
     v_camera: Array,
     update: Array,
     pub(super) moves: Moves,
@@ -206,7 +206,15 @@ impl GpuTraining {
         self.sums.reserve(&gpu, SUMS * last.room);
 
         let mut work = Work::new(&gpu);
-        work.clear(&renderer.found.part(2, 1), 1);
+        self.blend_vjp(&mut work, &last);
+        self.project_vjp(&mut work);
+        work.submit();
+        self.camera = of.camera.then(|| self.sum_camera(&last.view, last.found[0]));
+    }
+
+    /// Gradients of pixels to sums of each slot.
+    pub(super) fn blend_vjp(&self, work: &mut Work, last: &Last) {
+        let renderer = &self.renderer;
         work.run(
             &renderer.kernels.blend_vjp,
             &[
@@ -225,6 +233,12 @@ impl GpuTraining {
             ],
             last.segments(),
         );
+    }
+
+    /// Sums of slots to gradients of splats.
+    pub(super) fn project_vjp(&self, work: &mut Work) {
+        let renderer = &self.renderer;
+        work.clear(&renderer.found.part(2, 1), 1);
         work.run(
             &renderer.kernels.project_vjp,
             &[
@@ -242,10 +256,8 @@ impl GpuTraining {
                 &renderer.found,
                 &self.v_camera,
             ],
-            count.div_ceil(VJP_GROUP),
+            renderer.shape[0].div_ceil(VJP_GROUP),
         );
-        work.submit();
-        self.camera = of.camera.then(|| self.sum_camera(&last.view, last.found[0]));
     }
 
     /// Sums the camera's gradients in order, in double precision.

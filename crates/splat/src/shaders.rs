@@ -2,12 +2,12 @@
 
 #[cfg(feature = "gpu")]
 use irradia_compute::gpu::{Gpu, Kernel};
-use irradia_compute::shaders::{GRID, SCAN, SORT, Shader};
+use irradia_compute::shaders::{ADAM, GRID, HARMONICS, SCAN, SORT, Shader};
 
 const VIEW: &str = include_str!("gpu/shaders/view.wgsl");
 const GEOMETRY: &str = include_str!("gpu/shaders/geometry.wgsl");
 const LOAD: &str = include_str!("gpu/shaders/load.wgsl");
-const HARMONICS: &str = include_str!("gpu/shaders/harmonics.wgsl");
+const DIRECTION: &str = include_str!("gpu/shaders/direction.wgsl");
 const TILES: &str = include_str!("gpu/shaders/tiles.wgsl");
 const FRAGMENT: &str = include_str!("gpu/shaders/fragment.wgsl");
 const UPDATE: &str = include_str!("gpu/shaders/update.wgsl");
@@ -38,7 +38,7 @@ macro_rules! kernels {
 
 kernels! {
     /// Twin: `render::project::project` and `render::touch`.
-    project: [GRID, VIEW, GEOMETRY, LOAD, HARMONICS, TILES],
+    project: [GRID, VIEW, GEOMETRY, LOAD, HARMONICS, DIRECTION, TILES],
     /// Visible splats and their depths, ascending.
     compact: [GRID, VIEW],
     /// Numbers of visible splats and entries, if there is room for them.
@@ -56,11 +56,11 @@ kernels! {
     /// Twin: `render::blend::BlendTileVjp`.
     blend_vjp: [GRID, VIEW, FRAGMENT],
     /// Twin: `render::project::project_vjp`.
-    project_vjp: [GRID, VIEW, GEOMETRY, LOAD, HARMONICS],
+    project_vjp: [GRID, VIEW, GEOMETRY, LOAD, HARMONICS, DIRECTION],
     /// Twin: `SplatState::step`, the colours' part.
-    update_harmonics: [GRID, VIEW, UPDATE, HARMONICS],
+    update_harmonics: [GRID, VIEW, UPDATE, ADAM, HARMONICS, DIRECTION],
     /// Twin: `SplatState::step`, `regularize` and `mcmc::add_noise`.
-    update_geometry: [GRID, VIEW, UPDATE],
+    update_geometry: [GRID, VIEW, UPDATE, ADAM],
     /// Twin: `Planes::rearrange`.
     move_rows: [GRID],
 }

@@ -16,25 +16,43 @@ use {
     irradia_splat::{DeviceGradient, Statistics},
 };
 
-/// Puts the engine on the device, as far as the recipe's splats can be trained there. Returns what is told of it.
+/// Puts the engine of the splats on the device, as far as the recipe's can be trained there. Returns what is told of the device, with
+/// the recipe's field, which follows.
 pub(crate) fn use_device(engine: &mut Engine, device: &Device, recipe: &Recipe) -> Result<Vec<String>, DeviceError> {
     if device.is_cpu() {
         return Ok(Vec::new());
     }
     let fields = (0..recipe.stage.len()).filter(|stage| is_field(recipe, *stage)).count();
-    let name = &recipe.name;
-    if recipe.residual.is_some() || fields == recipe.stage.len() {
-        return Ok(vec![format!(
-            "recipe {name} trains a field: on the CPU, not on {device}"
-        )]);
+    let mut told = Vec::new();
+    if fields < recipe.stage.len() {
+        told.push(if recipe.residual.is_some() {
+            format!("splats with a residual field are trained on the CPU, not on {device}")
+        } else {
+            engine.use_device(device)?;
+            format!("splats are trained on {device}")
+        });
     }
-    engine.use_device(device)?;
-    let of_fields = if fields > 0 {
-        "; its field is trained on the CPU"
-    } else {
-        ""
-    };
-    Ok(vec![format!("splats are trained on {device}{of_fields}")])
+    if fields > 0 {
+        told.push(if has_form(recipe) {
+            format!("the field is trained on {device}")
+        } else {
+            format!("the field is trained on the CPU, not on {device}, which takes hash grids marched by occupancy")
+        });
+    }
+    Ok(told)
+}
+
+/// Whether the recipe's field can be trained on a GPU.
+#[cfg(feature = "gpu")]
+fn has_form(recipe: &Recipe) -> bool {
+    let space = irradia_field::Space::contracted([0.0; 3], 1.0);
+    let config = recipe.field.as_ref().map(|knobs| knobs.config(1, &space, false));
+    config.is_some_and(|config| irradia_field::gpu::supports(&config))
+}
+
+#[cfg(not(feature = "gpu"))]
+fn has_form(_: &Recipe) -> bool {
+    false
 }
 
 impl Trainer {
@@ -44,6 +62,17 @@ impl Trainer {
     /// When the device has failed: what it returned is not to be saved.
     pub fn read_back(&self) -> Result<(), TrainError> {
         self.engine.state();
+        if let Some(field) = &self.field {
+            field.state();
+        }
+        self.check_device()
+    }
+
+    /// What has gone wrong on the device.
+    pub(crate) fn check_device(&self) -> Result<(), TrainError> {
+        if let Some(field) = &self.field {
+            field.check_device()?;
+        }
         Ok(self.engine.check_device()?)
     }
 }

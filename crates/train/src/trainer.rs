@@ -19,7 +19,7 @@ use crate::transients::Hidden;
 use cpu_time::ProcessTime;
 use irradia_compute::adam::AdamStep;
 use irradia_compute::{Device, DeviceError};
-use irradia_field::{FieldError, FieldState, KnownDepth};
+use irradia_field::{FieldEngine, FieldError, FieldState, KnownDepth};
 use irradia_measure::{DepthSample, Lpips};
 use irradia_scene::{Camera, Dataset, LoadError, Rng, sh};
 use irradia_splat::densify::{DensityChange, classic, fast, mcmc, merge, taming};
@@ -92,7 +92,7 @@ pub struct TrainOptions {
     pub memory: Option<usize>,
     /// Weights of the perceptual loss; without them a recipe's perceptual loss is skipped.
     pub lpips: Option<Arc<Lpips>>,
-    /// Where splats are trained.
+    /// Where the scene is trained.
     pub device: Device,
 }
 
@@ -130,7 +130,7 @@ pub struct Trainer {
     /// The splats; none while a field is trained.
     pub engine: Engine,
     /// The field, in stages that train one.
-    pub field: Option<FieldState>,
+    pub field: Option<FieldEngine>,
     /// The trained components beside the splats.
     pub sockets: Sockets,
     /// Position in the schedule.
@@ -176,7 +176,8 @@ impl Trainer {
             trainer.recipe.max_splats = trainer.memory.splats;
         }
         if is_field(&trainer.recipe, 0) {
-            trainer.field = Some(trainer.first_field()?);
+            let state = trainer.first_field()?;
+            trainer.set_field(state)?;
         } else {
             let splats = trainer.first_splats()?;
             *trainer.engine.state_mut() = SplatState::new(splats);
@@ -269,6 +270,12 @@ impl Trainer {
         Ok(field)
     }
 
+    /// Continues with this field, on the device of the run.
+    pub(crate) fn set_field(&mut self, state: FieldState) -> Result<(), TrainError> {
+        self.field = Some(FieldEngine::new(state, &self.options.device)?);
+        Ok(())
+    }
+
     /// The recipe's components in the sockets of a step, untrained.
     pub(crate) fn first_sockets(&mut self) -> Result<Sockets, TrainError> {
         // Only a residual field's space depends on transparency; photographs are not read for the others.
@@ -294,7 +301,7 @@ impl Trainer {
 
     /// Number of parameters of the field, in stages that train one.
     pub fn parameters(&self) -> Option<usize> {
-        self.field.as_ref().map(|state| state.field.len())
+        self.field.as_ref().map(FieldEngine::len)
     }
 
     /// Name of the current stage.
@@ -313,7 +320,7 @@ impl Trainer {
         } else {
             self.splat_step(events)?
         };
-        self.engine.check_device()?;
+        self.check_device()?;
         let before = self.clock.time;
         let entered = self.tick(metrics) && !self.finished();
         let total = self.recipe.total_steps() as f64;
@@ -704,8 +711,8 @@ impl Trainer {
 
     /// The scene as exported and evaluated: with the smoothing filter baked in.
     pub fn scene(&self) -> Model<'_> {
-        if let Some(state) = &self.field {
-            return Model::Field(Cow::Borrowed(&state.field));
+        if let Some(field) = &self.field {
+            return Model::Field(Cow::Borrowed(&field.state().field));
         }
         Model::Splats {
             splats: if self.recipe.render.smoothing_filter {

@@ -12,9 +12,14 @@ pub struct Kernel {
 impl Kernel {
     /// Compiles. Drivers keep what they compiled on disk.
     pub fn new(gpu: &Gpu, shader: &Shader) -> Self {
+        Self::with_constants(gpu, shader, "")
+    }
+
+    /// As [`Kernel::new`], with the text `constants` before the shader's.
+    pub fn with_constants(gpu: &Gpu, shader: &Shader, constants: &str) -> Self {
         let module = gpu.device.create_shader_module(wgpu::ShaderModuleDescriptor {
             label: Some(shader.name),
-            source: wgpu::ShaderSource::Wgsl(Cow::Owned(shader.source())),
+            source: wgpu::ShaderSource::Wgsl(Cow::Owned(format!("{constants}{}", shader.source()))),
         });
         let pipeline = gpu.device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
             label: Some(shader.name),

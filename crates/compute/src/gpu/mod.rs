@@ -11,7 +11,7 @@ mod readback;
 mod scan;
 mod sort;
 
-pub use crate::shaders::{GRID, Shader};
+pub use crate::shaders::{ADAM, GRID, HARMONICS, Shader};
 pub use array::{Array, PART};
 pub use kernel::{Kernel, Work};
 pub use readback::Readback;

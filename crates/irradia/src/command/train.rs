@@ -52,7 +52,7 @@ pub struct Args {
     /// Threads; all cores when absent. The result does not depend on it
     #[arg(long, value_name = "N", value_parser = thread_count())]
     pub threads: Option<usize>,
-    /// Where splats are trained: cpu, gpu, auto (a real GPU if there is one), or a part of a GPU's name; see irradia devices. cpu when
+    /// Where the scene is trained: cpu, gpu, auto (a real GPU if there is one), or a part of a GPU's name; see irradia devices. cpu when
     /// absent, or as the run began with --resume
     #[arg(long, value_name = "DEVICE")]
     pub device: Option<String>,

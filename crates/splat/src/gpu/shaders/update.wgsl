@@ -26,17 +26,3 @@ const UPDATE_FREEZE: u32 = 16u;
 const UPDATE_GRADIENT: u32 = 32u;
 const UPDATE_ABSOLUTE: u32 = 64u;
 const UPDATE_ERROR: u32 = 128u;
-
-// First moments below this are zero.
-const FAINTEST_MOMENT: f32 = 1e-30;
-
-// Parameter, first and second moment after the gradient g.
-fn adam(g: f32, rate: f32, parameter: f32, first: f32, second: f32) -> vec3f {
-    var m = fma(first, update.adam.x, (1.0 - update.adam.x) * g);
-    let v = fma(second, update.adam.y, (1.0 - update.adam.y) * g * g);
-    let p = parameter - rate * m / fma(sqrt(v), update.adam.w, update.adam.z);
-    if abs(m) < FAINTEST_MOMENT {
-        m = 0.0;
-    }
-    return vec3f(p, m, v);
-}

@@ -98,7 +98,7 @@ fn optimize(i: u32, stride: u32, is_active: bool, is_dense: bool, shapes_all: bo
         if rate != 0.0 {
             let place = p * stride + i;
             let second = (GEOMETRY + p) * stride + i;
-            let next = adam(g[p], rate, geometry[place], moments[place], moments[second]);
+            let next = adam(g[p], rate, geometry[place], moments[place], moments[second], update.adam);
             geometry[place] = next.x;
             moments[place] = next.y;
             moments[second] = next.z;

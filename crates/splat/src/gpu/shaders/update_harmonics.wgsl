@@ -32,7 +32,7 @@ fn main(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups: ve
         }
         for (var c = 0u; c < 3u; c++) {
             let at = (3u * k + c) * stride + i;
-            let next = adam(b[k] * v_color[c], rate, harmonics[at], first_moments[at], second_moments[at]);
+            let next = adam(b[k] * v_color[c], rate, harmonics[at], first_moments[at], second_moments[at], update.adam);
             harmonics[at] = next.x;
             first_moments[at] = next.y;
             second_moments[at] = next.z;

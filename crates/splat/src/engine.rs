@@ -132,9 +132,20 @@ impl Engine {
     pub fn check_device(&self) -> Result<(), DeviceError> {
         #[cfg(feature = "gpu")]
         if let Some(gpu) = &self.gpu {
-            return gpu.renderer.gpu().check();
+            let checked = gpu.renderer.gpu().check();
+            return checked.map_err(|error| error.at_splats(self.len()));
         }
         Ok(())
+    }
+
+    /// Splats at most: as many as the largest arrays of a GPU have room for, with as many entries of tiles each as in the frames so far.
+    pub fn most_splats(&self) -> usize {
+        #[cfg(feature = "gpu")]
+        if let Some(gpu) = &self.gpu {
+            let on_device = gpu.renderer.sh_degree();
+            return gpu.most_splats(self.state.get().map_or(on_device, |state| state.splats.sh_degree()));
+        }
+        usize::MAX
     }
 
     /// Continues on the CPU.

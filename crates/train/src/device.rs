@@ -16,9 +16,14 @@ use {
     irradia_splat::{DeviceGradient, Statistics},
 };
 
-/// Puts the engine of the splats on the device, as far as the recipe's can be trained there. Returns what is told of the device, with
-/// the recipe's field, which follows.
-pub(crate) fn use_device(engine: &mut Engine, device: &Device, recipe: &Recipe) -> Result<Vec<String>, DeviceError> {
+/// Puts the engine of the splats on the device, as far as the recipe's can be trained there, which begin as `first_splats`. Returns what is
+/// told of the device, with the recipe's field, which follows.
+pub(crate) fn use_device(
+    engine: &mut Engine,
+    device: &Device,
+    recipe: &Recipe,
+    first_splats: usize,
+) -> Result<Vec<String>, DeviceError> {
     if device.is_cpu() {
         return Ok(Vec::new());
     }
@@ -29,7 +34,15 @@ pub(crate) fn use_device(engine: &mut Engine, device: &Device, recipe: &Recipe) 
             format!("splats with a residual field are trained on the CPU, not on {device}")
         } else {
             engine.use_device(device)?;
-            format!("splats are trained on {device}")
+            let most = engine.most_splats();
+            if first_splats > most {
+                engine.use_device(&Device::Cpu)?;
+                format!("splats are trained on the CPU: {device} has room for {most} of {first_splats} (--max-splats {most})")
+            } else if recipe.max_splats > most {
+                format!("splats are trained on {device}, which has room for {most}")
+            } else {
+                format!("splats are trained on {device}")
+            }
         });
     }
     if fields > 0 {
@@ -224,5 +237,39 @@ impl DeviceLoss {
     /// Losses always need the host.
     pub fn step(&mut self, _: &mut Engine, _: &Reference, _: &StepPlan, _: bool, _: bool) -> Option<ObjectiveValues> {
         None
+    }
+}
+
+#[cfg(all(test, feature = "gpu"))]
+mod tests {
+    use super::*;
+    use irradia_compute::DeviceChoice;
+    use irradia_scene::sh;
+    use irradia_splat::{SplatState, Splats};
+
+    #[test]
+    fn more_splats_than_a_gpu_has_room_for_are_trained_on_the_cpu_and_fewer_within_its_limit() {
+        let Some(device) = irradia_testkit::gpu_or_skip(|| Device::open(&DeviceChoice::Gpu)) else {
+            return;
+        };
+        let recipe = Recipe::parse("mcmc", Recipe::built_in("mcmc").unwrap(), &[]).unwrap();
+        let told_of = |splats: usize| {
+            let mut engine = Engine::new(SplatState::new(Splats::zeros(0, sh::MAX_DEGREE)));
+            let told = use_device(&mut engine, &device, &recipe, splats).unwrap().remove(0);
+            (engine.is_on_gpu(), engine.most_splats(), told)
+        };
+        let (is_on_gpu, most, told) = told_of(1000);
+        assert!(is_on_gpu && told.contains("trained on the GPU"), "{told}");
+        let Device::Gpu(gpu) = &device else { unreachable!() };
+        assert!(
+            192 * most as u64 <= gpu.info().largest_array,
+            "harmonics of degree 3 take 192 bytes a splat"
+        );
+        let (is_on_gpu, any, told) = told_of(most + 1);
+        assert!(!is_on_gpu && any == usize::MAX);
+        assert!(
+            told.contains("on the CPU") && told.contains(&format!("--max-splats {most}")),
+            "{told}"
+        );
     }
 }

@@ -147,7 +147,7 @@ pub struct Trainer {
     pub cpu_seconds: f64,
     /// Wall time between the first step and the last, and its breakdown.
     pub times: Times,
-    /// Maximum number of splats: the recipe's limits for this dataset, and that of the memory.
+    /// Maximum number of splats: the recipe's limits for this dataset, and those of the memory and the device.
     pub cap: usize,
     /// Pixels of a training image, averaged over views.
     pixels: f64,
@@ -229,7 +229,7 @@ impl Trainer {
         };
         let memory = MemoryPlan::new(&needs, options.memory)?;
         let mut engine = Engine::new(SplatState::new(Splats::zeros(0, sh::MAX_DEGREE)));
-        let decisions = use_device(&mut engine, &options.device, &recipe)?;
+        let decisions = use_device(&mut engine, &options.device, &recipe, first_splats)?;
         Ok(Self {
             clock: Clock::new(&recipe),
             pace: options.steps.map_or(1.0, |steps| total / steps.max(1) as f64),
@@ -238,7 +238,7 @@ impl Trainer {
             times: Times::default(),
             extent: init::camera_extent(&cameras),
             photos: PhotoCache::new(dataset.clone(), recipe.render.background, memory.photos),
-            cap: cap(&recipe, &cameras).min(memory.splats),
+            cap: cap(&recipe, &cameras).min(memory.splats).min(engine.most_splats()),
             memory,
             pixels: mean_pixels(&cameras),
             decisions,
@@ -519,7 +519,9 @@ impl Trainer {
 
     fn densify(&mut self, round: &Round) -> DensityChange {
         let (intersections, pixels) = (self.engine.intersections(), self.engine.pixels());
-        let limit = self.limit(self.clock.stage, round.count_share);
+        let limit = self
+            .limit(self.clock.stage, round.count_share)
+            .min(self.engine.most_splats());
         let first = first_count(&self.dataset, &self.recipe);
         let mut rng = Rng::new(self.options.seed ^ self.clock.step << 20, STREAM_DENSIFY);
         self.engine.edit_density(|state| {

@@ -116,6 +116,7 @@ impl Array {
                 label,
                 needed: needed.div_ceil(1_000_000),
                 limit: limit / 1_000_000,
+                fitting: None,
             }),
         }
     }
@@ -146,9 +147,10 @@ fn bytes(words: usize) -> u64 {
 
 fn buffer(gpu: &Gpu, label: &'static str, words: usize) -> wgpu::Buffer {
     if let Err(error) = Array::check(gpu, label, words) {
-        gpu.fail(&error.to_string());
+        gpu.note(error);
     }
-    gpu.device.create_buffer(&wgpu::BufferDescriptor {
+    let scope = gpu.device.push_error_scope(wgpu::ErrorFilter::OutOfMemory);
+    let buffer = gpu.device.create_buffer(&wgpu::BufferDescriptor {
         label: Some(label),
         size: bytes(words),
         usage: wgpu::BufferUsages::STORAGE
@@ -156,5 +158,15 @@ fn buffer(gpu: &Gpu, label: &'static str, words: usize) -> wgpu::Buffer {
             | wgpu::BufferUsages::COPY_SRC
             | wgpu::BufferUsages::COPY_DST,
         mapped_at_creation: false,
-    })
+    });
+    if pollster::block_on(scope.pop()).is_some() {
+        gpu.note(DeviceError::OutOfMemory {
+            name: gpu.info.name.clone(),
+            label,
+            needed: bytes(words).div_ceil(1_000_000),
+            held: gpu.held() / 1_000_000,
+            fitting: None,
+        });
+    }
+    buffer
 }

@@ -402,6 +402,11 @@ impl GpuRenderer {
         }
     }
 
+    /// SH degree for which there is room.
+    pub(crate) fn sh_degree(&self) -> u32 {
+        self.shape[2] as u32
+    }
+
     /// Pixels of the last frame.
     pub fn pixels(&self) -> usize {
         self.last.as_ref().map_or(0, Last::pixels)

@@ -83,6 +83,20 @@ impl GpuTraining {
         })
     }
 
+    /// Splats of `degree` at most, by the device's largest array: what a state needs, and what frames need with as many entries a splat as
+    /// the last one, or twice as many, since views differ.
+    pub fn most_splats(&self, degree: u32) -> usize {
+        let words = (self.renderer.gpu.info().largest_array / 4) as usize;
+        let by_state = words / (3 * sh::coefficients(degree)).max(2 * GEOMETRY);
+        let [count, ..] = self.renderer.shape;
+        let by_entries = match 2 * self.renderer.intersections() {
+            0 => usize::MAX,
+            entries => (words / SUMS).saturating_mul(count) / entries,
+        };
+        // Planes are padded.
+        by_state.saturating_sub(Planes::ALIGN).min(by_entries).max(1)
+    }
+
     /// Takes the whole state.
     pub fn upload(&mut self, state: &SplatState, filters: bool) {
         self.renderer.upload(&state.splats, state.filter.plane(0));

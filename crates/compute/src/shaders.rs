@@ -40,6 +40,12 @@ pub const SCAN: [Shader; 3] = [
     },
 ];
 
+/// Parameters of a sort by the number of keys that the device knows.
+pub const SORT_SIZES: Shader = Shader {
+    name: "sort_sizes",
+    parts: &[include_str!("gpu/shaders/sort_sizes.wgsl")],
+};
+
 /// A pass of the stable radix sort: digits of blocks, keys to their places.
 pub const SORT: [Shader; 2] = [
     Shader {

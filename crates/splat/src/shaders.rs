@@ -41,6 +41,8 @@ kernels! {
     project: [GRID, VIEW, GEOMETRY, LOAD, HARMONICS, DIRECTION, TILES],
     /// Visible splats and their depths, ascending.
     compact: [GRID, VIEW],
+    /// Numbers of visible splats and entries, if there is room for them.
+    admit: [VIEW],
     /// Tiles of each visible splat, front to back.
     count: [GRID, VIEW],
     /// Twin: `render::bin`, with `ranges` and `segments`.
@@ -59,7 +61,55 @@ kernels! {
     update_harmonics: [GRID, VIEW, UPDATE, ADAM, HARMONICS, DIRECTION],
     /// Twin: `SplatState::step`, `regularize` and `mcmc::add_noise`.
     update_geometry: [GRID, VIEW, UPDATE, ADAM],
+    /// Twin: `Planes::rearrange`.
+    move_rows: [GRID],
 }
+
+/// A stage of a training step: what the CPU does in one function or two.
+#[derive(Clone, Copy, Debug)]
+pub struct Stage {
+    /// Its name.
+    pub name: &'static str,
+    /// Its own kernels, in order; prefix sums and sorts come between them.
+    pub kernels: &'static [&'static str],
+    /// The same on the CPU, in this crate.
+    pub twin: &'static str,
+}
+
+/// The stages in their order. Tests run the GPU from any of them on, with the twin's results before it, so that an error is found at its
+/// stage (`gpu/bisect.rs`).
+pub const STAGES: [Stage; 6] = [
+    Stage {
+        name: "project",
+        kernels: &["project"],
+        twin: "render::project, render::harmonics, render::touch",
+    },
+    Stage {
+        name: "bin",
+        kernels: &["compact", "admit", "count", "emit", "ranges", "segments"],
+        twin: "render::bin",
+    },
+    Stage {
+        name: "blend",
+        kernels: &["blend"],
+        twin: "render::blend::BlendTile, render::develop",
+    },
+    Stage {
+        name: "blend_vjp",
+        kernels: &["blend_vjp"],
+        twin: "render::blend::BlendTileVjp",
+    },
+    Stage {
+        name: "project_vjp",
+        kernels: &["project_vjp"],
+        twin: "render::chunk::ProjectChunkVjp",
+    },
+    Stage {
+        name: "update",
+        kernels: &["update_harmonics", "update_geometry"],
+        twin: "SplatState::gather_statistics, regularize, SplatState::step, mcmc::add_noise",
+    },
+];
 
 /// Kernels of [`SHADERS`] that make a frame.
 const FRAME: [&str; 7] = ["project", "compact", "count", "emit", "ranges", "segments", "blend"];

@@ -6,7 +6,7 @@ struct Update {
     sh_rates: vec4f,
     // Decay of the moments, epsilon, inverse root of the second moment's bias correction.
     adam: vec4f,
-    // Weights of opacity, its square, standard deviations, covariance, as the formulas apply them to a splat.
+    // Weights of opacity, its square, standard deviations, covariance, as the formulas apply them to all splats that count.
     regularizers: vec4f,
     // Screen pixels to normalised device coordinates; size below which position and shape rest; noise.
     scales: vec4f,

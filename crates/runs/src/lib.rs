@@ -82,8 +82,8 @@ pub use levels::{LEVELS, Level, level_file, read_levels, write_levels};
 pub use orbit::Outlook;
 pub use path::{CameraPath, Film, PathKey};
 pub use pose::{
-    CameraReport, DoctorInput, DoctorReport, Finding, LeftOutPhoto, PoseInput, PoseProgress, PoseReport, StageReport,
-    doctor, is_film, pose,
+    CameraReport, DoctorInput, DoctorReport, Finding, LeftOutPhoto, PoseInput, PoseProgress, PoseReport, ScaleReport,
+    StageReport, doctor, is_film, pose,
 };
 pub use protocol::Protocol;
 pub use provenance::{data_fingerprint, program_fingerprint};

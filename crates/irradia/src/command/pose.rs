@@ -22,11 +22,14 @@ const LINE_EVERY: Duration = Duration::from_secs(5);
 
 #[derive(clap::Args)]
 pub struct Args {
-    /// Folder of photographs (JPEG, PNG), or a film, which needs ffmpeg
+    /// Folder of photographs (JPEG, PNG, WebP, TIFF; masks, if any, in its folder masks), or a film, which needs ffmpeg
     pub photos: PathBuf,
     /// Folder for the dataset: the photographs and their poses in COLMAP's format. Features and matches are kept there too, and reused
-    #[arg(long, value_name = "DATA")]
-    pub out: PathBuf,
+    #[arg(long, value_name = "DATA", required_unless_present = "into")]
+    pub out: Option<PathBuf>,
+    /// Adds the photographs to this dataset, in COLMAP's format, whose poses and cameras stay as they are
+    #[arg(long, value_name = "DATA", conflicts_with = "out")]
+    pub into: Option<PathBuf>,
     /// Maximum number of features of a photograph; 4096 when absent
     #[arg(long, value_name = "N", value_parser = RangedU64ValueParser::<usize>::new().range(1..=65_536))]
     pub max_features: Option<usize>,
@@ -37,13 +40,16 @@ pub struct Args {
 
 pub fn run(args: &Args) -> Result<()> {
     use_threads(args.threads)?;
-    let mut input = PoseInput::new(&args.photos, &args.out);
+    let data = args.into.as_ref().or(args.out.as_ref());
+    let data = data.expect("clap requires one of them");
+    let mut input = PoseInput::new(&args.photos, data);
+    input.into = args.into.is_some();
     input.max_features = args.max_features.unwrap_or(input.max_features);
     let report = pose_with_progress(&input)?;
     say(summary(&report))?;
     say(format_args!(
         "train on it with: irradia train {} --out RUN",
-        args.out.display()
+        data.display()
     ))
 }
 
@@ -138,8 +144,15 @@ fn summary(report: &PoseReport) -> String {
         .iter()
         .map(|stage| format!("{} {:.1} s", stage.name, stage.seconds))
         .collect();
+    let unit = report.scale.as_ref().map_or(String::new(), |scale| {
+        format!(
+            "; in metres by the places of {} photographs, to {:.1} %",
+            scale.photos,
+            100.0 * scale.scale_error
+        )
+    });
     format!(
-        "{} of {} photographs posed, {} points, mean error {:.2} px; {}; {:.1} s in all",
+        "{} of {} photographs posed, {} points, mean error {:.2} px{unit}; {}; {:.1} s in all",
         report.registered,
         report.photos,
         report.points,

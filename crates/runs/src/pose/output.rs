@@ -25,19 +25,29 @@ pub(super) fn write(
         if found.models.iter().any(|model| model.poses[photo].is_some()) {
             let entry = &folder.photos[*i];
             link(&entry.path, &images.join(&entry.name))?;
+            if let Some(mask) = &entry.mask {
+                let masks = out.join("masks");
+                fs::create_dir_all(&masks).map_err(RunError::io("create", &masks))?;
+                let extension = mask.extension().unwrap_or_default().to_string_lossy();
+                link(mask, &masks.join(format!("{}.{extension}", entry.name)))?;
+            }
         }
     }
     let sparse = out.join("sparse");
-    if sparse.exists() {
-        // Models of an earlier call, which may have been more.
-        fs::remove_dir_all(&sparse).map_err(RunError::io("clear", &sparse))?;
+    // Beside the models of an earlier call, which may have been more and remain until these are complete.
+    let written = out.join("sparse.new");
+    if written.exists() {
+        fs::remove_dir_all(&written).map_err(RunError::io("clear", &written))?;
     }
     for (number, model) in found.models.iter().enumerate() {
-        let to = sparse.join(number.to_string());
+        let to = written.join(number.to_string());
         fs::create_dir_all(&to).map_err(RunError::io("create", &to))?;
         write_colmap(&to, &colmap_model(work, infos, model))?;
     }
-    Ok(())
+    if sparse.exists() {
+        fs::remove_dir_all(&sparse).map_err(RunError::io("clear", &sparse))?;
+    }
+    fs::rename(&written, &sparse).map_err(RunError::io("rename", &written))
 }
 
 /// Makes `to` the file `from`: a hard link where the file system allows it, else a copy.
@@ -179,6 +189,7 @@ pub(super) fn report(folder: &PhotoFolder, work: &Work, infos: &[PhotoInfo], fou
         models: found.models.iter().map(Model::registered).collect(),
         points: model.points.len(),
         mean_error_px: model.mean_error(),
+        scale: None,
         cameras,
         pairs: 0,
         verified_pairs: found.pairs.len(),

@@ -2,7 +2,8 @@
 //!
 //! A step never reads single splats, footprints or gradients. It requests a frame, the surfaces in view, the gradients of added
 //! colours: whole lists, which a device can compute where its data resides and return late or in bulk. Code that edits single
-//! splats (density control, initialisation, files) takes the state with [`Engine::state_mut`], rarely.
+//! splats (initialisation, files) takes the state with [`Engine::state_mut`], rarely; density control, more often, takes what it decides by
+//! with [`Engine::edit_density`].
 
 use crate::densify::mcmc;
 #[cfg(feature = "gpu")]

@@ -57,6 +57,8 @@ kernels! {
     blend_vjp: [GRID, VIEW, FRAGMENT],
     /// Twin: `render::project::project_vjp`.
     project_vjp: [GRID, VIEW, GEOMETRY, LOAD, HARMONICS, DIRECTION],
+    /// Of the camera's gradient, which the CPU sums up splat by splat.
+    sum_camera: [GRID, VIEW],
     /// Twin: `SplatState::step`, the colours' part.
     update_harmonics: [GRID, VIEW, UPDATE, ADAM, HARMONICS, DIRECTION],
     /// Twin: `SplatState::step`, `regularize` and `mcmc::add_noise`.
@@ -101,7 +103,7 @@ pub const STAGES: [Stage; 6] = [
     },
     Stage {
         name: "project_vjp",
-        kernels: &["project_vjp"],
+        kernels: &["project_vjp", "sum_camera"],
         twin: "render::chunk::ProjectChunkVjp",
     },
     Stage {

@@ -57,6 +57,7 @@ pub(crate) struct GpuTraining {
     pub(super) sums: Array,
     pub(super) v_splats: Array,
     v_camera: Array,
+    v_camera_sums: Array,
     update: Array,
     pub(super) moves: Moves,
     camera: Option<CameraGradient>,
@@ -75,6 +76,7 @@ impl GpuTraining {
             sums: array("sums of blending"),
             v_splats: array("gradients of splats"),
             v_camera: array("gradients of the camera"),
+            v_camera_sums: array("sums of the camera's gradients"),
             update: Array::zeros(&gpu, "update", UPDATE_WORDS),
             moves: Moves::new(&gpu),
             camera: None,
@@ -223,7 +225,7 @@ impl GpuTraining {
         self.blend_vjp(&mut work, &last);
         self.project_vjp(&mut work);
         work.submit();
-        self.camera = of.camera.then(|| self.sum_camera(&last.view, last.found[0]));
+        self.camera = of.camera.then(|| self.sum_camera(&last));
     }
 
     /// Gradients of pixels to sums of each slot.
@@ -274,13 +276,25 @@ impl GpuTraining {
         );
     }
 
-    /// Sums the camera's gradients in order, in double precision.
-    fn sum_camera(&self, view: &ViewParams, visible: usize) -> CameraGradient {
-        let of_splats: Vec<f32> = self.v_camera.to_vec(&self.renderer.gpu, CAMERA * visible);
-        let sums: [f64; CAMERA] = std::array::from_fn(|plane| {
-            let values = &of_splats[plane * visible..][..visible];
-            values.iter().map(|v| f64::from(*v)).sum()
-        });
+    /// Sums the camera's gradients: those of 256 splats on the device, then these in order, in double precision.
+    fn sum_camera(&mut self, last: &Last) -> CameraGradient {
+        let gpu = &self.renderer.gpu;
+        let groups = last.found[0].div_ceil(GROUP as usize);
+        self.v_camera_sums.reserve(gpu, CAMERA * groups);
+        let mut work = Work::new(gpu);
+        work.run(
+            &self.renderer.kernels.sum_camera,
+            &[&self.renderer.view, &self.v_camera, &self.v_camera_sums],
+            groups,
+        );
+        work.submit();
+        let mut sums = [0.0f64; CAMERA];
+        for of_group in self.v_camera_sums.to_vec::<[f32; CAMERA]>(gpu, CAMERA * groups) {
+            for (sum, value) in sums.iter_mut().zip(of_group) {
+                *sum += f64::from(value);
+            }
+        }
+        let view = &last.view;
         view.gradient(
             std::array::from_fn(|i| std::array::from_fn(|j| sums[3 * i + j])),
             std::array::from_fn(|i| sums[9 + i]),

@@ -54,6 +54,7 @@ mod levels;
 mod lock;
 mod orbit;
 mod path;
+mod photographs;
 mod pose;
 mod protocol;
 mod provenance;
@@ -81,6 +82,7 @@ pub use journal::logged_errors;
 pub use levels::{LEVELS, Level, level_file, read_levels, write_levels};
 pub use orbit::Outlook;
 pub use path::{CameraPath, Film, PathKey};
+pub use photographs::photographs_of;
 pub use pose::{
     CameraReport, DoctorInput, DoctorReport, Finding, LeftOutPhoto, Mapper, PoseInput, PoseProgress, PoseReport,
     ScaleReport, StageReport, doctor, is_film, pose,

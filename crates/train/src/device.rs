@@ -2,7 +2,7 @@
 
 use crate::field_step::is_field;
 use crate::objective::{ObjectiveValues, Reference};
-use crate::recipe::{Param, Recipe};
+use crate::recipe::Recipe;
 use crate::schedule::StepPlan;
 use crate::trainer::{TrainError, Trainer};
 use irradia_compute::{Device, DeviceError};
@@ -11,6 +11,7 @@ use irradia_splat::{Engine, RenderOptions, Update};
 #[cfg(feature = "gpu")]
 use {
     crate::objective::photometric_weights,
+    crate::recipe::Param,
     irradia_measure::gpu::{Beside, DeviceFrame, GpuLoss},
     irradia_measure::{Target, Truth},
     irradia_splat::{DeviceGradient, Statistics},

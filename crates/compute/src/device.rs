@@ -35,8 +35,9 @@ pub enum DeviceError {
     },
     /// Memory for one array is above what the device binds at once.
     #[error(
-        "{label} need {needed} MB in one piece, and the GPU {name} binds {limit} MB at most: use fewer splats (--max-splats), smaller \
-         photographs (--max-side), or --device cpu"
+        "{label} need {needed} MB in one piece, and the GPU {name} binds {limit} MB at most: use fewer splats ({}), smaller photographs \
+         (--max-side), or --device cpu",
+        max_splats(fitting)
     )]
     TooLarge {
         /// Its name.
@@ -47,7 +48,51 @@ pub enum DeviceError {
         needed: u64,
         /// Megabytes.
         limit: u64,
+        /// About how many splats would fit.
+        fitting: Option<usize>,
     },
+    /// The device has no more memory.
+    #[error(
+        "{label} need {needed} MB, and the GPU {name} has no room for them beside the {held} MB in use: use fewer splats ({}), smaller \
+         photographs (--max-side), or --device cpu",
+        max_splats(fitting)
+    )]
+    OutOfMemory {
+        /// Its name.
+        name: String,
+        /// What was to be stored.
+        label: &'static str,
+        /// Megabytes.
+        needed: u64,
+        /// Megabytes.
+        held: u64,
+        /// About how many splats would fit.
+        fitting: Option<usize>,
+    },
+}
+
+fn max_splats(fitting: &Option<usize>) -> String {
+    fitting.map_or_else(|| "--max-splats".to_owned(), |splats| format!("--max-splats {splats}"))
+}
+
+impl DeviceError {
+    /// With the number of splats that would fit, in whole thousands, where `splats` did not: all that is stored grows with them.
+    #[must_use]
+    pub fn at_splats(mut self, splats: usize) -> Self {
+        let share = |part: u64, whole: u64| splats as u64 * part / whole.max(1);
+        let (fitting, most) = match &mut self {
+            DeviceError::TooLarge {
+                needed, limit, fitting, ..
+            } => (fitting, share(*limit, *needed)),
+            // A tenth less than what is in use, since arrays are not all of one size.
+            DeviceError::OutOfMemory {
+                needed, held, fitting, ..
+            } => (fitting, share(*held * 9, (*held + *needed) * 10)),
+            _ => return self,
+        };
+        *fitting = Some((most / 1000 * 1000) as usize).filter(|splats| *splats > 0);
+        self
+    }
 }
 
 /// Which device is wanted.
@@ -135,5 +180,41 @@ impl fmt::Display for Device {
                 write!(f, "the GPU {} ({}, {})", info.name, info.kind, info.api)
             }
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_does_not_fit_is_said_with_what_would_in_one_line() {
+        let name = "card".to_owned();
+        let error = DeviceError::TooLarge {
+            name: name.clone(),
+            label: "harmonics",
+            needed: 4000,
+            limit: 2000,
+            fitting: None,
+        };
+        assert!(error.to_string().contains("fewer splats (--max-splats)"));
+        let line = error.at_splats(6_000_500).to_string();
+        assert!(
+            line.contains("harmonics need 4000 MB") && line.contains("--max-splats 3000000"),
+            "{line}"
+        );
+        let error = DeviceError::OutOfMemory {
+            name,
+            label: "harmonics",
+            needed: 1000,
+            held: 9000,
+            fitting: None,
+        };
+        let line = error.at_splats(1_000_000).to_string();
+        assert!(
+            line.contains("beside the 9000 MB") && line.contains("--max-splats 810000"),
+            "{line}"
+        );
+        assert!(!line.contains('\n'));
     }
 }

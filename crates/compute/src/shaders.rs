@@ -2,6 +2,10 @@
 
 /// `group_index`: the number of a workgroup, for kernels whose workgroups are dispatched in rows.
 pub const GRID: &str = include_str!("gpu/shaders/grid.wgsl");
+/// `adam`: one step.
+pub const ADAM: &str = include_str!("gpu/shaders/adam.wgsl");
+/// `basis`: real spherical harmonics of a direction, and `basis_vjp`.
+pub const HARMONICS: &str = include_str!("gpu/shaders/harmonics.wgsl");
 const GROUP_SCAN: &str = include_str!("gpu/shaders/scan_group.wgsl");
 
 /// The source of a kernel. Its entry point is `main`, its bindings are those of group 0, in order, all of them used.
@@ -35,6 +39,12 @@ pub const SCAN: [Shader; 3] = [
         parts: &[GRID, GROUP_SCAN, include_str!("gpu/shaders/scan_apply.wgsl")],
     },
 ];
+
+/// Parameters of a sort by the number of keys that the device knows.
+pub const SORT_SIZES: Shader = Shader {
+    name: "sort_sizes",
+    parts: &[include_str!("gpu/shaders/sort_sizes.wgsl")],
+};
 
 /// A pass of the stable radix sort: digits of blocks, keys to their places.
 pub const SORT: [Shader; 2] = [

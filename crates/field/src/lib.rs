@@ -1,9 +1,10 @@
-//! Radiance fields on the CPU: NeRF (Mildenhall et al. 2020) and the hash grid (Mueller et al. 2022) as two configurations
+//! Radiance fields: NeRF (Mildenhall et al. 2020) and the hash grid (Mueller et al. 2022) as two configurations
 //! of one [`Field`], with the proposal sampling and contraction of mip-NeRF 360 (Barron et al. 2022).
 //!
 //! To train: [`Space::around`] or [`Space::ndc`] from the cameras, [`Field::new`], [`FieldState::new`], then [`train_views`]
 //! once per step. [`render_view`] renders, [`to_points`] extracts surfaces, and [`FieldState::tensors`] with the step and the
-//! number of rays forms a checkpoint from which training resumes bit for bit.
+//! number of rays forms a checkpoint from which training resumes bit for bit. [`FieldEngine`] does so on a GPU where the field has a
+//! form there.
 #![forbid(unsafe_code)]
 
 mod background;
@@ -11,8 +12,11 @@ mod batch;
 mod config;
 pub mod contraction;
 pub mod encoding;
+mod engine;
 mod facing;
 mod field;
+#[cfg(feature = "gpu")]
+pub mod gpu;
 pub mod mlp;
 pub mod net;
 mod optimise;
@@ -21,6 +25,8 @@ mod query;
 pub mod render;
 mod rows;
 pub mod sample;
+#[cfg(feature = "gpu")]
+mod shaders;
 mod space;
 mod state;
 mod tensors;
@@ -31,6 +37,7 @@ mod walk;
 pub use background::{background_color, background_vjp};
 pub use batch::{Background, Draw, KnownDepth, RayBatch, TrainView};
 pub use config::{FieldConfig, Occupancy, Sampler};
+pub use engine::FieldEngine;
 pub use facing::{FORWARD_CONE, Facing};
 pub use field::{Field, FieldError};
 pub use query::{color_at, density_at, update_occupancy};

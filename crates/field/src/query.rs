@@ -18,6 +18,23 @@ const CHUNK: usize = 1024;
 /// Updates cells of the occupancy grid: all of them, or the occupied ones and a random fraction `1 / one_in` of the others.
 /// Does nothing for other samplers.
 pub fn update_occupancy(state: &mut FieldState, all: bool, one_in: u32, seed: u64) {
+    update_occupancy_by(state, all, one_in, seed, |field, points| {
+        let mut densities = vec![0.0; points.len()];
+        query(field, points, &mut densities, |block, _, to| {
+            to.copy_from_slice(&block.density[..to.len()])
+        });
+        densities
+    });
+}
+
+/// As [`update_occupancy`], with densities at points of the unit cube from `densities`.
+pub(crate) fn update_occupancy_by(
+    state: &mut FieldState,
+    all: bool,
+    one_in: u32,
+    seed: u64,
+    densities: impl FnOnce(&Field, &[[f32; 3]]) -> Vec<f32>,
+) {
     let field = &mut state.field;
     let Sampler::Occupancy(options) = field.config.sampler else {
         return;
@@ -27,11 +44,7 @@ pub fn update_occupancy(state: &mut FieldState, all: bool, one_in: u32, seed: u6
     };
     let mut rng = Rng::new(seed, (state.step << 8) + STREAM_OCCUPANCY);
     let (cells, points) = grid.sample_cells(all, one_in, &mut rng);
-    let mut densities = vec![0.0; points.len()];
-    query(field, &points, &mut densities, |block, _, to| {
-        to.copy_from_slice(&block.density[..to.len()])
-    });
-    grid.update(&cells, &densities, options.decay);
+    grid.update(&cells, &densities(field, &points), options.decay);
     field.occupancy = Some(grid);
     field.mark_occupied();
 }

@@ -43,7 +43,7 @@ pub(crate) enum Colour {
     Grey,
 }
 
-/// Reads a JPEG or PNG of any depth as 3 or (if the file has alpha) 4 channels of 8 bits, with the EXIF orientation applied.
+/// Reads a JPEG, PNG, WebP or TIFF of any depth as 3 or (if the file has alpha) 4 channels of 8 bits, with the EXIF orientation applied.
 ///
 /// # Errors
 /// When the file cannot be read, is not an image, or is truncated.
@@ -282,7 +282,7 @@ fn open_source(path: &Path) -> io::Result<(Box<dyn Source>, bool, bool)> {
 fn undecodable(path: &Path, error: &image::ImageError) -> FormatError {
     FormatError::malformed(
         path,
-        format!("not a readable JPEG or PNG image ({error}); restore or remove it"),
+        format!("not a readable JPEG, PNG, WebP or TIFF image ({error}); restore or remove it"),
     )
 }
 

@@ -26,7 +26,7 @@ mod zip;
 
 pub use atomic::write_atomic;
 pub use dataset::colmap::{
-    ColmapCamera, ColmapImage, ColmapModel, ColmapPoint, PosedImage, TrackedPoint, write_colmap,
+    ColmapCamera, ColmapImage, ColmapModel, ColmapPoint, PosedImage, TrackedPoint, read_colmap_poses, write_colmap,
 };
 pub use dataset::{DEFAULT_MAX_SIDE, DatasetFormat, DatasetOptions, Holdout, read_dataset};
 pub use describe::{Description, Kind, describe, detect};

@@ -57,6 +57,36 @@ fn what_is_no_photograph_or_a_copy_is_named_with_its_reason() {
 }
 
 #[test]
+fn other_kinds_of_pictures_and_masks_are_read() {
+    let folder = tempfile::tempdir().unwrap();
+    let root = folder.path();
+    fs::create_dir(root.join("masks")).unwrap();
+    for (i, name) in ["a.webp", "b.tif", "c.TIFF"].into_iter().enumerate() {
+        picture(40, 30, 10 + i as u8).save(root.join(name)).unwrap();
+    }
+    // COLMAP's convention, at half the size.
+    let half = image::GrayImage::from_fn(20, 15, |x, _| image::Luma([if x < 10 { 0 } else { 255 }]));
+    half.save(root.join("masks/b.tif.png")).unwrap();
+    let found = read_photo_folder(root).unwrap();
+    assert!(found.left_out.is_empty(), "{:?}", found.left_out);
+    assert_eq!(found.photos.len(), 3);
+    for (i, photo) in found.photos.iter().enumerate() {
+        let pixels = photo.read(1).unwrap();
+        assert_eq!((pixels.width, pixels.height), (40, 30));
+        let expected = picture(40, 30, 10 + i as u8).into_raw();
+        assert!(pixels.data == expected, "{}", photo.name);
+        let mask = photo.read_mask(40, 30).unwrap();
+        assert_eq!(mask.is_some(), i == 1, "{}", photo.name);
+        if let Some(mask) = mask {
+            assert!((0..1200).all(|p| mask[p] == if p % 40 < 20 { 0 } else { 255 }));
+        }
+    }
+    // Another mask makes it another photograph: its features are not reused.
+    fs::remove_file(root.join("masks/b.tif.png")).unwrap();
+    assert_ne!(read_photo_folder(root).unwrap().photos[1].hash, found.photos[1].hash);
+}
+
+#[test]
 fn photographs_are_as_read_dataset_decodes_them() {
     let folder = tempfile::tempdir().unwrap();
     let images = folder.path().join("images");

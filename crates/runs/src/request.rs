@@ -180,7 +180,7 @@ pub struct TrainInput {
     /// A scene whose splats the training begins with, a file or a run's folder, in the coordinates of the dataset.
     #[serde(default)]
     pub from: Option<PathBuf>,
-    /// Where splats are trained: `cpu`, `gpu`, `auto` (a real GPU if there is one), or a part of a GPU's name.
+    /// Where the scene is trained: `cpu`, `gpu`, `auto` (a real GPU if there is one), or a part of a GPU's name.
     #[serde(default = "default_device")]
     pub device: String,
     /// Whether to replace an existing run in `out`.

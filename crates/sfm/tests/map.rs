@@ -6,7 +6,7 @@ use glam::{DQuat, DVec3};
 use irradia_scene::Rng;
 use irradia_sfm::Features;
 use irradia_sfm::geometry::pose::DPose;
-use irradia_sfm::map::{MapOptions, Model, PairKind, Reason, Reconstruction, agreement, reconstruct};
+use irradia_sfm::map::{Known, MapOptions, Model, PairKind, Reason, Reconstruction, agreement, extend, reconstruct};
 use world::{World, around};
 
 #[test]
@@ -41,6 +41,37 @@ fn cameras_return_from_noise_wrong_matches_and_an_unknown_lens() {
     for point in &model.points {
         assert!(point.track.len() >= 2 && point.track.is_sorted() && point.error < 4.0);
     }
+}
+
+#[test]
+fn photographs_are_registered_into_a_known_model_that_stays_as_it_is() {
+    let mut world = World::new(around(24, 1.0), 2000, 0.5, 0.3, 4);
+    // The last photographs are by a camera of their own.
+    for photo in &mut world.photos[20..] {
+        photo.group = 1;
+    }
+    let known = Known {
+        poses: (0..24).map(|i| (i < 16).then_some(world.poses[i])).collect(),
+        cameras: vec![Some(world::CAMERA), None],
+    };
+    let options = MapOptions::default();
+    let result = extend(
+        &world.photos,
+        &world.features,
+        &world.pairs,
+        &known,
+        &options,
+        &mut |_| (),
+    );
+    let model = &result.models[0];
+    assert_eq!(model.registered(), 24);
+    assert!(model.poses[..16] == known.poses[..16] && model.cameras[0] == known.cameras[0]);
+    // In the world of what is known: places, not only relative poses.
+    for (found, truth) in model.poses.iter().flatten().zip(&world.poses) {
+        assert!((found.position - truth.position).length() < 0.03, "{found:?} {truth:?}");
+    }
+    let focal = model.cameras[1].expect("registered").focal();
+    assert!((focal / 870.0 - 1.0).abs() < 0.02, "{focal}");
 }
 
 #[test]

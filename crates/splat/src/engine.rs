@@ -2,7 +2,8 @@
 //!
 //! A step never reads single splats, footprints or gradients. It requests a frame, the surfaces in view, the gradients of added
 //! colours: whole lists, which a device can compute where its data resides and return late or in bulk. Code that edits single
-//! splats (density control, initialisation, files) takes the state with [`Engine::state_mut`], rarely.
+//! splats (initialisation, files) takes the state with [`Engine::state_mut`], rarely; density control, more often, takes what it decides by
+//! with [`Engine::edit_density`].
 
 use crate::densify::mcmc;
 #[cfg(feature = "gpu")]
@@ -119,6 +120,12 @@ impl Engine {
         Ok(())
     }
 
+    /// Whether the state is on a GPU.
+    #[cfg(feature = "gpu")]
+    pub fn is_on_gpu(&self) -> bool {
+        self.gpu.is_some()
+    }
+
     /// What has gone wrong on the device: the state and everything made from it are then unspecified.
     ///
     /// # Errors
@@ -126,9 +133,20 @@ impl Engine {
     pub fn check_device(&self) -> Result<(), DeviceError> {
         #[cfg(feature = "gpu")]
         if let Some(gpu) = &self.gpu {
-            return gpu.renderer.gpu().check();
+            let checked = gpu.renderer.gpu().check();
+            return checked.map_err(|error| error.at_splats(self.len()));
         }
         Ok(())
+    }
+
+    /// Splats at most: as many as the largest arrays of a GPU have room for, with as many entries of tiles each as in the frames so far.
+    pub fn most_splats(&self) -> usize {
+        #[cfg(feature = "gpu")]
+        if let Some(gpu) = &self.gpu {
+            let on_device = gpu.renderer.sh_degree();
+            return gpu.most_splats(self.state.get().map_or(on_device, |state| state.splats.sh_degree()));
+        }
+        usize::MAX
     }
 
     /// Continues on the CPU.
@@ -182,13 +200,29 @@ impl Engine {
         self.state.get_mut().expect("just filled")
     }
 
+    /// Edits the state between two steps as density control does: by geometry, statistics and filter. Harmonics and moments may be
+    /// moved, copied from splat to splat and set to zero, but `edit` must neither read nor change them: on a GPU they stay there,
+    /// and the columns it sees have other values.
+    pub fn edit_density<R>(&mut self, edit: impl FnOnce(&mut SplatState) -> R) -> R {
+        #[cfg(feature = "gpu")]
+        if let Some(gpu) = self.gpu.as_mut().filter(|gpu| !gpu.stale) {
+            self.state = OnceLock::new();
+            let mut state = gpu.download_numbered();
+            let result = edit(&mut state);
+            gpu.upload_numbered(&state);
+            return result;
+        }
+        edit(self.state_mut())
+    }
+
     /// From the next frame on, convolves every splat with the state's 3D smoothing filter, or with none.
     pub fn use_filter(&mut self, on: bool) {
+        self.filters = on;
         #[cfg(feature = "gpu")]
         if let Some(gpu) = &mut self.gpu {
-            gpu.stale |= on || self.filters;
+            gpu.renderer.filters = on;
+            return;
         }
-        self.filters = on;
         self.set_filter();
     }
 
@@ -216,17 +250,42 @@ impl Engine {
     /// Renders a frame of the splats that were placed last, for any pinhole camera.
     pub fn render_view(&mut self, view: &ViewParams, options: &RenderOptions) {
         #[cfg(feature = "gpu")]
-        if let Some(gpu) = &mut self.gpu {
-            if gpu.stale {
-                let state = self.state.get().expect("what was edited is here");
-                gpu.upload(state, self.filters);
-            }
-            gpu.render(view, options);
+        if self.gpu.is_some() {
+            self.on_gpu().render(view, options);
             return;
         }
         self.update_bounds();
         let (splats, bounds) = placed(known(&self.state), self.moved.as_ref(), &self.bounds);
         self.renderer.render_within(splats, bounds, view, options);
+    }
+
+    /// Begins a frame of the state's splats on the GPU, without waiting for what it finds: until [`Self::settle`], only the device knows.
+    ///
+    /// # Panics
+    /// When the engine is on the CPU.
+    #[cfg(feature = "gpu")]
+    pub fn render_ahead(&mut self, camera: &Camera, options: &RenderOptions) {
+        self.moved = None;
+        self.on_gpu().render_ahead(&ViewParams::new(camera), options);
+    }
+
+    /// Waits for the last [`Self::render_ahead`]: whether there was room on the device for it. If not, the frame and what was made from it
+    /// since are void: the backward pass and the update changed nothing, and are to be repeated after another frame.
+    #[cfg(feature = "gpu")]
+    #[must_use]
+    pub fn settle(&mut self) -> bool {
+        self.gpu.as_mut().is_none_or(|gpu| gpu.renderer.settle())
+    }
+
+    /// The GPU's training, with the latest state.
+    #[cfg(feature = "gpu")]
+    fn on_gpu(&mut self) -> &mut GpuTraining {
+        let gpu = self.gpu.as_mut().expect("the engine is on a GPU");
+        if gpu.stale {
+            let state = self.state.get().expect("what was edited is here");
+            gpu.upload(state, self.filters);
+        }
+        gpu
     }
 
     /// The first half of a frame with added colours; [`Self::composite`] is the second.
@@ -266,6 +325,16 @@ impl Engine {
             return gpu.renderer.frame();
         }
         self.renderer.frame()
+    }
+
+    /// Pixels of the last frame.
+    pub fn pixels(&self) -> usize {
+        #[cfg(feature = "gpu")]
+        if let Some(gpu) = &self.gpu {
+            return gpu.renderer.pixels();
+        }
+        let [width, height] = self.renderer.size().unwrap_or_default();
+        width as usize * height as usize
     }
 
     /// Splats that touched the last frame.

@@ -2,12 +2,12 @@
 
 #[cfg(feature = "gpu")]
 use irradia_compute::gpu::{Gpu, Kernel};
-use irradia_compute::shaders::{GRID, SCAN, SORT, Shader};
+use irradia_compute::shaders::{ADAM, GRID, HARMONICS, SCAN, SORT, Shader};
 
 const VIEW: &str = include_str!("gpu/shaders/view.wgsl");
 const GEOMETRY: &str = include_str!("gpu/shaders/geometry.wgsl");
 const LOAD: &str = include_str!("gpu/shaders/load.wgsl");
-const HARMONICS: &str = include_str!("gpu/shaders/harmonics.wgsl");
+const DIRECTION: &str = include_str!("gpu/shaders/direction.wgsl");
 const TILES: &str = include_str!("gpu/shaders/tiles.wgsl");
 const FRAGMENT: &str = include_str!("gpu/shaders/fragment.wgsl");
 const UPDATE: &str = include_str!("gpu/shaders/update.wgsl");
@@ -38,9 +38,11 @@ macro_rules! kernels {
 
 kernels! {
     /// Twin: `render::project::project` and `render::touch`.
-    project: [GRID, VIEW, GEOMETRY, LOAD, HARMONICS, TILES],
+    project: [GRID, VIEW, GEOMETRY, LOAD, HARMONICS, DIRECTION, TILES],
     /// Visible splats and their depths, ascending.
     compact: [GRID, VIEW],
+    /// Numbers of visible splats and entries, if there is room for them.
+    admit: [VIEW],
     /// Tiles of each visible splat, front to back.
     count: [GRID, VIEW],
     /// Twin: `render::bin`, with `ranges` and `segments`.
@@ -54,12 +56,62 @@ kernels! {
     /// Twin: `render::blend::BlendTileVjp`.
     blend_vjp: [GRID, VIEW, FRAGMENT],
     /// Twin: `render::project::project_vjp`.
-    project_vjp: [GRID, VIEW, GEOMETRY, LOAD, HARMONICS],
+    project_vjp: [GRID, VIEW, GEOMETRY, LOAD, HARMONICS, DIRECTION],
+    /// Of the camera's gradient, which the CPU sums up splat by splat.
+    sum_camera: [GRID, VIEW],
     /// Twin: `SplatState::step`, the colours' part.
-    update_harmonics: [GRID, VIEW, UPDATE, HARMONICS],
+    update_harmonics: [GRID, VIEW, UPDATE, ADAM, HARMONICS, DIRECTION],
     /// Twin: `SplatState::step`, `regularize` and `mcmc::add_noise`.
-    update_geometry: [GRID, VIEW, UPDATE],
+    update_geometry: [GRID, VIEW, UPDATE, ADAM],
+    /// Twin: `Planes::rearrange`.
+    move_rows: [GRID],
 }
+
+/// A stage of a training step: what the CPU does in one function or two.
+#[derive(Clone, Copy, Debug)]
+pub struct Stage {
+    /// Its name.
+    pub name: &'static str,
+    /// Its own kernels, in order; prefix sums and sorts come between them.
+    pub kernels: &'static [&'static str],
+    /// The same on the CPU, in this crate.
+    pub twin: &'static str,
+}
+
+/// The stages in their order. Tests run the GPU from any of them on, with the twin's results before it, so that an error is found at its
+/// stage (`gpu/bisect.rs`).
+pub const STAGES: [Stage; 6] = [
+    Stage {
+        name: "project",
+        kernels: &["project"],
+        twin: "render::project, render::harmonics, render::touch",
+    },
+    Stage {
+        name: "bin",
+        kernels: &["compact", "admit", "count", "emit", "ranges", "segments"],
+        twin: "render::bin",
+    },
+    Stage {
+        name: "blend",
+        kernels: &["blend"],
+        twin: "render::blend::BlendTile, render::develop",
+    },
+    Stage {
+        name: "blend_vjp",
+        kernels: &["blend_vjp"],
+        twin: "render::blend::BlendTileVjp",
+    },
+    Stage {
+        name: "project_vjp",
+        kernels: &["project_vjp", "sum_camera"],
+        twin: "render::chunk::ProjectChunkVjp",
+    },
+    Stage {
+        name: "update",
+        kernels: &["update_harmonics", "update_geometry"],
+        twin: "SplatState::gather_statistics, regularize, SplatState::step, mcmc::add_noise",
+    },
+];
 
 /// Kernels of [`SHADERS`] that make a frame.
 const FRAME: [&str; 7] = ["project", "compact", "count", "emit", "ranges", "segments", "blend"];

@@ -115,7 +115,7 @@ impl Splats {
             .unwrap_or(0)
     }
 
-    fn from_columns([means, quats, log_scales, opacity_logits, sh]: [Planes; 5]) -> Self {
+    pub(crate) fn from_columns([means, quats, log_scales, opacity_logits, sh]: [Planes; 5]) -> Self {
         Self {
             means,
             quats,

@@ -57,7 +57,7 @@ impl<'a> Checkpoint<'a> {
             others.extend(owned.into_iter().map(|tensor| tensor.prefixed(prefix)));
         };
         if let Some(field) = &trainer.field {
-            keep(FIELD, field_file::state_tensors(field));
+            keep(FIELD, field_file::state_tensors(field.state()));
         }
         for occupant in trainer.sockets.occupants() {
             keep(&format!("{}.", occupant.name()), occupant.tensors());
@@ -347,7 +347,7 @@ pub fn from_bytes(bytes: &[u8], dataset: Arc<Dataset>, options: TrainOptions) ->
         }
         let fresh = trainer.first_field()?.field;
         let state = field_file::state_from(fresh.config, fresh.space, tensors(FIELD));
-        trainer.field = Some(state.map_err(|why| wrong(format!("{FIELD}{why}")))?);
+        trainer.set_field(state.map_err(|why| wrong(format!("{FIELD}{why}")))?)?;
     }
     trainer.sockets = trainer.first_sockets()?;
     // The run decided whether to learn exposures.

@@ -6,27 +6,66 @@ use crate::recipe::{Param, Recipe};
 use crate::schedule::StepPlan;
 use crate::trainer::{TrainError, Trainer};
 use irradia_compute::{Device, DeviceError};
-use irradia_splat::Engine;
+use irradia_scene::Camera;
+use irradia_splat::{Engine, RenderOptions, Update};
+#[cfg(feature = "gpu")]
+use {
+    crate::objective::photometric_weights,
+    irradia_measure::gpu::{Beside, DeviceFrame, GpuLoss},
+    irradia_measure::{Target, Truth},
+    irradia_splat::{DeviceGradient, Statistics},
+};
 
-/// Puts the engine on the device, as far as the recipe's splats can be trained there. Returns what is told of it.
-pub(crate) fn use_device(engine: &mut Engine, device: &Device, recipe: &Recipe) -> Result<Vec<String>, DeviceError> {
+/// Puts the engine of the splats on the device, as far as the recipe's can be trained there, which begin as `first_splats`. Returns what is
+/// told of the device, with the recipe's field, which follows.
+pub(crate) fn use_device(
+    engine: &mut Engine,
+    device: &Device,
+    recipe: &Recipe,
+    first_splats: usize,
+) -> Result<Vec<String>, DeviceError> {
     if device.is_cpu() {
         return Ok(Vec::new());
     }
     let fields = (0..recipe.stage.len()).filter(|stage| is_field(recipe, *stage)).count();
-    let name = &recipe.name;
-    if recipe.residual.is_some() || fields == recipe.stage.len() {
-        return Ok(vec![format!(
-            "recipe {name} trains a field: on the CPU, not on {device}"
-        )]);
+    let mut told = Vec::new();
+    if fields < recipe.stage.len() {
+        told.push(if recipe.residual.is_some() {
+            format!("splats with a residual field are trained on the CPU, not on {device}")
+        } else {
+            engine.use_device(device)?;
+            let most = engine.most_splats();
+            if first_splats > most {
+                engine.use_device(&Device::Cpu)?;
+                format!("splats are trained on the CPU: {device} has room for {most} of {first_splats} (--max-splats {most})")
+            } else if recipe.max_splats > most {
+                format!("splats are trained on {device}, which has room for {most}")
+            } else {
+                format!("splats are trained on {device}")
+            }
+        });
     }
-    engine.use_device(device)?;
-    let of_fields = if fields > 0 {
-        "; its field is trained on the CPU"
-    } else {
-        ""
-    };
-    Ok(vec![format!("splats are trained on {device}{of_fields}")])
+    if fields > 0 {
+        told.push(if has_form(recipe) {
+            format!("the field is trained on {device}")
+        } else {
+            format!("the field is trained on the CPU, not on {device}, which takes hash grids marched by occupancy")
+        });
+    }
+    Ok(told)
+}
+
+/// Whether the recipe's field can be trained on a GPU.
+#[cfg(feature = "gpu")]
+fn has_form(recipe: &Recipe) -> bool {
+    let space = irradia_field::Space::contracted([0.0; 3], 1.0);
+    let config = recipe.field.as_ref().map(|knobs| knobs.config(1, &space, false));
+    config.is_some_and(|config| irradia_field::gpu::supports(&config))
+}
+
+#[cfg(not(feature = "gpu"))]
+fn has_form(_: &Recipe) -> bool {
+    false
 }
 
 impl Trainer {
@@ -36,6 +75,17 @@ impl Trainer {
     /// When the device has failed: what it returned is not to be saved.
     pub fn read_back(&self) -> Result<(), TrainError> {
         self.engine.state();
+        if let Some(field) = &self.field {
+            field.state();
+        }
+        self.check_device()
+    }
+
+    /// What has gone wrong on the device.
+    pub(crate) fn check_device(&self) -> Result<(), TrainError> {
+        if let Some(field) = &self.field {
+            field.check_device()?;
+        }
         Ok(self.engine.check_device()?)
     }
 }
@@ -43,7 +93,7 @@ impl Trainer {
 /// Evaluates losses on the device of a run.
 pub(crate) struct DeviceLoss {
     #[cfg(feature = "gpu")]
-    gpu: Option<irradia_measure::gpu::GpuLoss>,
+    gpu: Option<GpuLoss>,
 }
 
 /// Whether a step's losses need the frame on the host: for random backgrounds, or losses that a GPU lacks.
@@ -64,9 +114,34 @@ impl DeviceLoss {
     pub fn new(device: &Device) -> Result<Self, DeviceError> {
         let gpu = match device {
             Device::Cpu => None,
-            Device::Gpu(gpu) => Some(irradia_measure::gpu::GpuLoss::new(gpu.clone())?),
+            Device::Gpu(gpu) => Some(GpuLoss::new(gpu.clone())?),
         };
         Ok(Self { gpu })
+    }
+
+    /// A whole step of the state's splats: frame, losses, backward pass and update. Nothing waits for the device before all of it is
+    /// submitted, and then only for the values of the losses. `None` if they need the host.
+    pub fn whole_step(
+        &mut self,
+        engine: &mut Engine,
+        (camera, options): (&Camera, &RenderOptions),
+        reference: &Reference,
+        plan: &StepPlan,
+        update: &Update,
+        has_lpips: bool,
+    ) -> Option<ObjectiveValues> {
+        if self.gpu.is_none() || !engine.is_on_gpu() || needs_host(reference, plan, has_lpips) {
+            return None;
+        }
+        loop {
+            engine.render_ahead(camera, options);
+            let values = self.begin(engine, reference, plan, false)?;
+            engine.update(update);
+            let values = values.finish();
+            if engine.settle() {
+                return Some(values);
+            }
+        }
     }
 
     /// The losses of the last frame, and its backward pass; `None` if they need the host.
@@ -78,12 +153,21 @@ impl DeviceLoss {
         camera: bool,
         has_lpips: bool,
     ) -> Option<ObjectiveValues> {
-        use crate::objective::photometric_weights;
-        use irradia_measure::gpu::{Beside, DeviceFrame};
-        use irradia_measure::{Target, Truth};
-        use irradia_splat::{DeviceGradient, Statistics};
+        if needs_host(reference, plan, has_lpips) {
+            return None;
+        }
+        Some(self.begin(engine, reference, plan, camera)?.finish())
+    }
 
-        let loss = self.gpu.as_mut().filter(|_| !needs_host(reference, plan, has_lpips))?;
+    /// Submits the losses of the last frame, and its backward pass. `None` on the CPU.
+    fn begin(
+        &mut self,
+        engine: &mut Engine,
+        reference: &Reference,
+        plan: &StepPlan,
+        camera: bool,
+    ) -> Option<ValuesToCome<'_>> {
+        let loss = self.gpu.as_mut()?;
         let [planes, v_planes] = engine.device_frame()?;
         let photo = reference.photo;
         let target = Target {
@@ -92,14 +176,14 @@ impl DeviceLoss {
             truth: Truth::Rgb8(&photo.rgb),
             mask: photo.mask.as_deref(),
         };
-        let weights = photometric_weights(plan);
         let depth_weight = plan.value(Param::DepthWeight);
         let beside = Beside {
             depths: reference.depths,
             depth_weight,
             error: plan.gathers == Some(Statistics::Error),
         };
-        let values = loss.evaluate(&DeviceFrame { planes, v_planes }, &target, &weights, &beside);
+        let frame = DeviceFrame { planes, v_planes };
+        loss.begin(&frame, &target, &photometric_weights(plan), &beside);
         let has_depth = !reference.depths.is_empty();
         engine.backward_on_device(&DeviceGradient {
             alpha: has_depth,
@@ -107,11 +191,26 @@ impl DeviceLoss {
             gather: plan.gathers.filter(|what| *what != Statistics::Gradient),
             camera,
         });
-        Some(ObjectiveValues {
-            total: values.photometric.total + f64::from(depth_weight) * values.depth,
+        Some(ValuesToCome { loss, depth_weight })
+    }
+}
+
+/// Losses that the device is still computing.
+#[cfg(feature = "gpu")]
+struct ValuesToCome<'a> {
+    loss: &'a mut GpuLoss,
+    depth_weight: f32,
+}
+
+#[cfg(feature = "gpu")]
+impl ValuesToCome<'_> {
+    fn finish(self) -> ObjectiveValues {
+        let values = self.loss.finish();
+        ObjectiveValues {
+            total: values.photometric.total + f64::from(self.depth_weight) * values.depth,
             l1: values.photometric.l1,
             mse: values.photometric.mse,
-        })
+        }
     }
 }
 
@@ -123,7 +222,54 @@ impl DeviceLoss {
     }
 
     /// Losses always need the host.
+    pub fn whole_step(
+        &mut self,
+        _: &mut Engine,
+        _: (&Camera, &RenderOptions),
+        _: &Reference,
+        _: &StepPlan,
+        _: &Update,
+        _: bool,
+    ) -> Option<ObjectiveValues> {
+        None
+    }
+
+    /// Losses always need the host.
     pub fn step(&mut self, _: &mut Engine, _: &Reference, _: &StepPlan, _: bool, _: bool) -> Option<ObjectiveValues> {
         None
+    }
+}
+
+#[cfg(all(test, feature = "gpu"))]
+mod tests {
+    use super::*;
+    use irradia_compute::DeviceChoice;
+    use irradia_scene::sh;
+    use irradia_splat::{SplatState, Splats};
+
+    #[test]
+    fn more_splats_than_a_gpu_has_room_for_are_trained_on_the_cpu_and_fewer_within_its_limit() {
+        let Some(device) = irradia_testkit::gpu_or_skip(|| Device::open(&DeviceChoice::Gpu)) else {
+            return;
+        };
+        let recipe = Recipe::parse("mcmc", Recipe::built_in("mcmc").unwrap(), &[]).unwrap();
+        let told_of = |splats: usize| {
+            let mut engine = Engine::new(SplatState::new(Splats::zeros(0, sh::MAX_DEGREE)));
+            let told = use_device(&mut engine, &device, &recipe, splats).unwrap().remove(0);
+            (engine.is_on_gpu(), engine.most_splats(), told)
+        };
+        let (is_on_gpu, most, told) = told_of(1000);
+        assert!(is_on_gpu && told.contains("trained on the GPU"), "{told}");
+        let Device::Gpu(gpu) = &device else { unreachable!() };
+        assert!(
+            192 * most as u64 <= gpu.info().largest_array,
+            "harmonics of degree 3 take 192 bytes a splat"
+        );
+        let (is_on_gpu, any, told) = told_of(most + 1);
+        assert!(!is_on_gpu && any == usize::MAX);
+        assert!(
+            told.contains("on the CPU") && told.contains(&format!("--max-splats {most}")),
+            "{told}"
+        );
     }
 }

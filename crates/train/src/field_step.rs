@@ -7,9 +7,7 @@ use crate::schedule::{StepMetrics, StepPlan, plan, upcoming_views};
 use crate::trainer::{TrainError, Trainer};
 use crate::{event::StepReport, recipe::Represents};
 use cpu_time::ProcessTime;
-use irradia_field::{
-    Background, Field, FieldState, KnownDepth, PointsOptions, StepOptions, TrainView, to_points, train_views,
-};
+use irradia_field::{Background, Field, FieldState, KnownDepth, PointsOptions, StepOptions, TrainView, to_points};
 use irradia_scene::{Camera, Dataset, PointCloud};
 use irradia_splat::{SplatState, init};
 use std::sync::Arc;
@@ -102,8 +100,8 @@ impl Trainer {
             update_occupancy: plan.update_occupancy,
             seed: self.options.seed,
         };
-        let state = self.field.as_mut().expect("a stage of field has one");
-        let loss = train_views(state, &views, &options);
+        let field = self.field.as_mut().expect("a stage of field has one");
+        let loss = field.train_views(&views, &options);
         self.seconds += started.elapsed().as_secs_f64();
         self.cpu_seconds += cpu_started.elapsed().as_secs_f64();
         let metrics = StepMetrics {
@@ -121,7 +119,7 @@ impl Trainer {
             loss: loss.total,
             mse: loss.color,
             splats: 0,
-            parameters: Some(state.field.len()),
+            parameters: self.parameters(),
             visible: 0,
             non_finite: 0,
         };
@@ -172,7 +170,7 @@ impl Trainer {
     /// # Errors
     /// When the field has no surface.
     pub(crate) fn field_to_splats(&mut self) -> Result<(), TrainError> {
-        let (Some(state), Some(knobs)) = (self.field.take(), &self.recipe.field) else {
+        let (Some(field), Some(knobs)) = (self.field.take(), &self.recipe.field) else {
             return Ok(());
         };
         let (started, cpu_started) = (Instant::now(), ProcessTime::now());
@@ -182,7 +180,7 @@ impl Trainer {
             seed: self.options.seed ^ STREAM_POINTS << 40,
             ..PointsOptions::default()
         };
-        let found = to_points(&state.field, &cameras, &options);
+        let found = to_points(&field.state().field, &cameras, &options);
         let byte = |v: f32| (v.clamp(0.0, 1.0) * 255.0).round() as u8;
         let cloud = PointCloud {
             positions: found.positions.iter().map(|p| glam::Vec3::from_array(*p)).collect(),

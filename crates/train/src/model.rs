@@ -1,7 +1,7 @@
 //! The result of a run: splats or a field. All code that renders them differently is here.
 
 use crate::socket::added_colors;
-use irradia_field::{Field, render_view};
+use irradia_field::{Field, FieldView, render_view};
 use irradia_scene::{Camera, Image};
 use irradia_splat::{FramePlanes, Renderer, Splats, ViewParams};
 use std::borrow::Cow;
@@ -63,6 +63,25 @@ impl Frame {
             depth: planes.depth.to_vec(),
         }
     }
+
+    /// From the view of a field.
+    pub(crate) fn of_view(view: FieldView, camera: &Camera) -> Self {
+        let depth = view.depth.iter().zip(&view.alpha).map(|(depth, alpha)| depth * alpha);
+        Self {
+            color: interleaved(&view.color, camera),
+            depth: depth.collect(),
+            alpha: view.alpha,
+        }
+    }
+}
+
+/// The options of a field.
+pub(crate) fn of_field(options: &RenderOptions) -> irradia_field::RenderOptions {
+    irradia_field::RenderOptions {
+        background: options.background,
+        image: None,
+        normals: false,
+    }
 }
 
 /// `[H, W, 3]` from `[3, H, W]`.
@@ -90,18 +109,8 @@ impl<'a> Model<'a> {
                 Frame::of_planes(renderer.frame(), camera)
             }
             Model::Field(field) => {
-                let options = irradia_field::RenderOptions {
-                    background: options.background,
-                    image: None,
-                    normals: false,
-                };
-                let view = render_view(field, camera, &options);
-                let depth = view.depth.iter().zip(&view.alpha).map(|(depth, alpha)| depth * alpha);
-                Frame {
-                    color: interleaved(&view.color, camera),
-                    depth: depth.collect(),
-                    alpha: view.alpha,
-                }
+                let view = render_view(field, camera, &of_field(options));
+                Frame::of_view(view, camera)
             }
         }
     }

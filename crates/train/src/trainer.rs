@@ -19,7 +19,7 @@ use crate::transients::Hidden;
 use cpu_time::ProcessTime;
 use irradia_compute::adam::AdamStep;
 use irradia_compute::{Device, DeviceError};
-use irradia_field::{FieldError, FieldState, KnownDepth};
+use irradia_field::{FieldEngine, FieldError, FieldState, KnownDepth};
 use irradia_measure::{DepthSample, Lpips};
 use irradia_scene::{Camera, Dataset, LoadError, Rng, sh};
 use irradia_splat::densify::{DensityChange, classic, fast, mcmc, merge, taming};
@@ -92,7 +92,7 @@ pub struct TrainOptions {
     pub memory: Option<usize>,
     /// Weights of the perceptual loss; without them a recipe's perceptual loss is skipped.
     pub lpips: Option<Arc<Lpips>>,
-    /// Where splats are trained.
+    /// Where the scene is trained.
     pub device: Device,
 }
 
@@ -130,7 +130,7 @@ pub struct Trainer {
     /// The splats; none while a field is trained.
     pub engine: Engine,
     /// The field, in stages that train one.
-    pub field: Option<FieldState>,
+    pub field: Option<FieldEngine>,
     /// The trained components beside the splats.
     pub sockets: Sockets,
     /// Position in the schedule.
@@ -147,7 +147,7 @@ pub struct Trainer {
     pub cpu_seconds: f64,
     /// Wall time between the first step and the last, and its breakdown.
     pub times: Times,
-    /// Maximum number of splats: the recipe's limits for this dataset, and that of the memory.
+    /// Maximum number of splats: the recipe's limits for this dataset, and those of the memory and the device.
     pub cap: usize,
     /// Pixels of a training image, averaged over views.
     pixels: f64,
@@ -176,7 +176,8 @@ impl Trainer {
             trainer.recipe.max_splats = trainer.memory.splats;
         }
         if is_field(&trainer.recipe, 0) {
-            trainer.field = Some(trainer.first_field()?);
+            let state = trainer.first_field()?;
+            trainer.set_field(state)?;
         } else {
             let splats = trainer.first_splats()?;
             *trainer.engine.state_mut() = SplatState::new(splats);
@@ -228,7 +229,7 @@ impl Trainer {
         };
         let memory = MemoryPlan::new(&needs, options.memory)?;
         let mut engine = Engine::new(SplatState::new(Splats::zeros(0, sh::MAX_DEGREE)));
-        let decisions = use_device(&mut engine, &options.device, &recipe)?;
+        let decisions = use_device(&mut engine, &options.device, &recipe, first_splats)?;
         Ok(Self {
             clock: Clock::new(&recipe),
             pace: options.steps.map_or(1.0, |steps| total / steps.max(1) as f64),
@@ -237,7 +238,7 @@ impl Trainer {
             times: Times::default(),
             extent: init::camera_extent(&cameras),
             photos: PhotoCache::new(dataset.clone(), recipe.render.background, memory.photos),
-            cap: cap(&recipe, &cameras).min(memory.splats),
+            cap: cap(&recipe, &cameras).min(memory.splats).min(engine.most_splats()),
             memory,
             pixels: mean_pixels(&cameras),
             decisions,
@@ -269,6 +270,12 @@ impl Trainer {
         Ok(field)
     }
 
+    /// Continues with this field, on the device of the run.
+    pub(crate) fn set_field(&mut self, state: FieldState) -> Result<(), TrainError> {
+        self.field = Some(FieldEngine::new(state, &self.options.device)?);
+        Ok(())
+    }
+
     /// The recipe's components in the sockets of a step, untrained.
     pub(crate) fn first_sockets(&mut self) -> Result<Sockets, TrainError> {
         // Only a residual field's space depends on transparency; photographs are not read for the others.
@@ -294,7 +301,7 @@ impl Trainer {
 
     /// Number of parameters of the field, in stages that train one.
     pub fn parameters(&self) -> Option<usize> {
-        self.field.as_ref().map(|state| state.field.len())
+        self.field.as_ref().map(FieldEngine::len)
     }
 
     /// Name of the current stage.
@@ -313,7 +320,7 @@ impl Trainer {
         } else {
             self.splat_step(events)?
         };
-        self.engine.check_device()?;
+        self.check_device()?;
         let before = self.clock.time;
         let entered = self.tick(metrics) && !self.finished();
         let total = self.recipe.total_steps() as f64;
@@ -362,25 +369,28 @@ impl Trainer {
             depth: plan.compares_depth(),
             ..self.render_options(plan.sh_degree)
         };
-        self.sockets.render(&mut self.engine, view, placement, &options, &plan);
         let reference = Reference {
             photo: &photo,
             background,
             depths: &self.known_depths(view, &camera, &plan),
         };
-        let camera_gradient = self.sockets.needs_camera_gradient();
-        let on_device = self.sockets.exposure.is_none().then(|| {
-            let has_lpips = self.options.lpips.is_some();
+        let (update, has_lpips) = (self.update(&plan), self.options.lpips.is_some());
+        let ahead = self.sockets.are_empty().then(|| {
+            let frame = (&camera, &options);
             self.device_loss
-                .step(&mut self.engine, &reference, &plan, camera_gradient, has_lpips)
+                .whole_step(&mut self.engine, frame, &reference, &plan, &update, has_lpips)
         });
-        let loss = match on_device.flatten() {
+        let loss = match ahead.flatten() {
             Some(loss) => loss,
-            None => self.step_losses(&reference, view, &plan, &mut rng),
+            None => {
+                self.sockets.render(&mut self.engine, view, placement, &options, &plan);
+                let loss = self.step_losses(&reference, view, &plan, &mut rng);
+                self.sockets
+                    .step_before_blending(&mut self.engine, view, &camera, self.extent, &plan);
+                self.engine.update(&update);
+                loss
+            }
         };
-        self.sockets
-            .step_before_blending(&mut self.engine, view, &camera, self.extent, &plan);
-        self.engine.update(&self.update(&plan));
         let density_started = Instant::now();
         if let Some(change) = self.control_density(&plan) {
             events.push(Event::densified(self.clock.step + 1, change, self.engine.len()));
@@ -415,8 +425,17 @@ impl Trainer {
         Ok((report, metrics))
     }
 
-    /// The losses of the last frame, on the host, and its backward pass.
+    /// The losses of the last frame, and its backward pass.
     fn step_losses(&mut self, reference: &Reference, view: usize, plan: &StepPlan, rng: &mut Rng) -> ObjectiveValues {
+        let camera_gradient = self.sockets.needs_camera_gradient();
+        let on_device = self.sockets.exposure.is_none().then(|| {
+            let has_lpips = self.options.lpips.is_some();
+            self.device_loss
+                .step(&mut self.engine, reference, plan, camera_gradient, has_lpips)
+        });
+        if let Some(loss) = on_device.flatten() {
+            return loss;
+        }
         let frame = FramePlanes {
             color: self.sockets.frame_color(&self.engine),
             ..self.engine.frame()
@@ -432,7 +451,7 @@ impl Trainer {
         self.sockets
             .step_after_blending(&self.engine, view, self.objective.v_color_mut(), plan);
         let mut v_out = self.objective.gradient();
-        v_out.camera = self.sockets.needs_camera_gradient();
+        v_out.camera = camera_gradient;
         v_out.gather = match plan.gathers {
             Some(Statistics::AbsoluteGradient) => Gather::Absolute,
             Some(Statistics::Error) => self.objective.gather_error(),
@@ -479,19 +498,12 @@ impl Trainer {
     }
 
     fn control_density(&mut self, plan: &StepPlan) -> Option<DensityChange> {
-        let change = plan.densify.as_ref().map(|round| {
-            let cleared = self.free_space.clear(self.engine.state_mut());
-            let change = self.densify(round);
-            DensityChange {
-                pruned: change.pruned + cleared,
-                ..change
-            }
-        });
+        let change = plan.densify.as_ref().map(|round| self.densify(round));
         let merged = plan
             .merge
             .map(|knobs| merge::merge(self.engine.state_mut(), &knobs.options()));
         if let Some(ceiling) = plan.reset_opacity {
-            classic::reset_opacity(self.engine.state_mut(), ceiling);
+            self.engine.edit_density(|state| classic::reset_opacity(state, ceiling));
         }
         if change.is_some() && self.recipe.render.smoothing_filter {
             self.update_filter();
@@ -506,30 +518,36 @@ impl Trainer {
     }
 
     fn densify(&mut self, round: &Round) -> DensityChange {
-        let pixels = self.engine.frame().color.len() / 3;
-        let by_memory = self
-            .memory
-            .splats_at(self.engine.intersections(), self.engine.len(), pixels);
-        let limit = self.limit(self.clock.stage, round.count_share).min(by_memory);
+        let (intersections, pixels) = (self.engine.intersections(), self.engine.pixels());
+        let limit = self
+            .limit(self.clock.stage, round.count_share)
+            .min(self.engine.most_splats());
         let first = first_count(&self.dataset, &self.recipe);
         let mut rng = Rng::new(self.options.seed ^ self.clock.step << 20, STREAM_DENSIFY);
-        let state = self.engine.state_mut();
-        match round.density {
-            DensityControl::Classic(knobs) => {
-                let options = knobs.options(self.extent, round.prune_large, limit);
-                classic::densify(state, &options, &mut rng)
+        self.engine.edit_density(|state| {
+            let cleared = self.free_space.clear(state);
+            let limit = limit.min(self.memory.splats_at(intersections, state.len(), pixels));
+            let change = match round.density {
+                DensityControl::Classic(knobs) => {
+                    let options = knobs.options(self.extent, round.prune_large, limit);
+                    classic::densify(state, &options, &mut rng)
+                }
+                DensityControl::Mcmc(knobs) => mcmc::densify(state, &knobs.options(self.pace, limit), &mut rng),
+                DensityControl::Taming(knobs) => {
+                    let target = taming::next_count(state.len(), limit, round.completed);
+                    let options = knobs.options(self.extent, round.prune_large, round.number, target);
+                    taming::densify(state, &options, &mut rng)
+                }
+                DensityControl::Fast(knobs) => {
+                    let floor = ((f64::from(knobs.floor) * self.pixels) as usize).min(first).min(limit);
+                    fast::densify(state, &knobs.options(self.pace, floor, limit))
+                }
+            };
+            DensityChange {
+                pruned: change.pruned + cleared,
+                ..change
             }
-            DensityControl::Mcmc(knobs) => mcmc::densify(state, &knobs.options(self.pace, limit), &mut rng),
-            DensityControl::Taming(knobs) => {
-                let target = taming::next_count(state.len(), limit, round.completed);
-                let options = knobs.options(self.extent, round.prune_large, round.number, target);
-                taming::densify(state, &options, &mut rng)
-            }
-            DensityControl::Fast(knobs) => {
-                let floor = ((f64::from(knobs.floor) * self.pixels) as usize).min(first).min(limit);
-                fast::densify(state, &knobs.options(self.pace, floor, limit))
-            }
-        }
+        })
     }
 
     /// Maximum number of splats of stage `stage` at `count_share`, a fraction of the cap.
@@ -547,7 +565,7 @@ impl Trainer {
             .iter()
             .map(|i| ViewParams::new(&self.dataset.views[*i].camera))
             .collect();
-        filter::update(self.engine.state_mut(), &views);
+        self.engine.edit_density(|state| filter::update(state, &views));
         self.restore_filter();
     }
 
@@ -695,8 +713,8 @@ impl Trainer {
 
     /// The scene as exported and evaluated: with the smoothing filter baked in.
     pub fn scene(&self) -> Model<'_> {
-        if let Some(state) = &self.field {
-            return Model::Field(Cow::Borrowed(&state.field));
+        if let Some(field) = &self.field {
+            return Model::Field(Cow::Borrowed(&field.state().field));
         }
         Model::Splats {
             splats: if self.recipe.render.smoothing_filter {

@@ -1,12 +1,20 @@
-use super::Gpu;
+use super::{Gpu, Readback, Work};
 use crate::DeviceError;
 use bytemuck::{NoUninit, Pod};
+use std::sync::PoisonError;
+
+/// Words between the beginnings of parts that are bound: 256 bytes, which every implementation accepts.
+pub const PART: usize = 64;
+/// Bytes that are read at once, so that reading a large array takes little memory beside it.
+const PIECE: usize = 32 << 20;
 
 /// Memory on the device, in words of 32 bits, that grows and never shrinks.
 #[derive(Debug)]
 pub struct Array {
     label: &'static str,
     buffer: wgpu::Buffer,
+    /// Where it begins in the buffer, bytes.
+    first: u64,
     words: usize,
 }
 
@@ -16,6 +24,19 @@ impl Array {
         Self {
             label,
             buffer: buffer(gpu, label, words),
+            first: 0,
+            words,
+        }
+    }
+
+    /// `words` of this one from `at` on, as an array of the same memory, for as long as this one does not grow. To be bound, it begins at
+    /// a multiple of [`PART`] words.
+    pub fn part(&self, at: usize, words: usize) -> Self {
+        assert!(at + words <= self.words, "within {}", self.label);
+        Self {
+            label: self.label,
+            buffer: self.buffer.clone(),
+            first: self.first + 4 * at as u64,
             words,
         }
     }
@@ -44,6 +65,7 @@ impl Array {
             let limit = (gpu.info.largest_array / 4) as usize;
             self.words = (words + words / 4).min(limit.max(words));
             self.buffer = buffer(gpu, self.label, self.words);
+            self.first = 0;
         }
     }
 
@@ -51,33 +73,26 @@ impl Array {
     pub fn write<T: NoUninit>(&self, gpu: &Gpu, at: usize, values: &[T]) {
         let bytes: &[u8] = bytemuck::cast_slice(values);
         if !bytes.is_empty() {
-            gpu.queue.write_buffer(&self.buffer, 4 * at as u64, bytes);
+            gpu.queue.write_buffer(&self.buffer, self.offset(at), bytes);
         }
     }
 
     /// Reads words from `at` on into `to`, after everything submitted so far. Where the device has failed, they are zero.
     pub fn read<T: Pod>(&self, gpu: &Gpu, at: usize, to: &mut [T]) {
-        let bytes = size_of_val(to) as u64;
-        if bytes == 0 {
+        let to: &mut [u8] = bytemuck::cast_slice_mut(to);
+        if to.is_empty() {
             return;
         }
-        let staging = gpu.device.create_buffer(&wgpu::BufferDescriptor {
-            label: Some(self.label),
-            size: bytes,
-            usage: wgpu::BufferUsages::MAP_READ | wgpu::BufferUsages::COPY_DST,
-            mapped_at_creation: false,
-        });
-        let mut encoder = gpu.device.create_command_encoder(&Default::default());
-        encoder.copy_buffer_to_buffer(&self.buffer, 4 * at as u64, &staging, 0, bytes);
-        gpu.queue.submit([encoder.finish()]);
-        staging.map_async(wgpu::MapMode::Read, .., |_| {});
-        gpu.wait();
-        match staging.get_mapped_range(..) {
-            Ok(view) => bytemuck::cast_slice_mut(to).copy_from_slice(&view),
-            Err(error) => {
-                gpu.fail(&error.to_string());
-                to.fill(T::zeroed());
-            }
+        let mut staging = gpu.staging.lock().unwrap_or_else(PoisonError::into_inner);
+        let size = to.len().next_power_of_two().min(PIECE);
+        let staging = match &mut *staging {
+            Some(staging) if staging.words() * 4 >= size => staging,
+            staging => staging.insert(Readback::new(gpu, size / 4)),
+        };
+        for (i, piece) in to.chunks_mut(PIECE).enumerate() {
+            let work = Work::new(gpu);
+            work.submit_reading(&self.part(at + i * PIECE / 4, piece.len() / 4), staging);
+            staging.take(gpu, piece);
         }
     }
 
@@ -101,6 +116,7 @@ impl Array {
                 label,
                 needed: needed.div_ceil(1_000_000),
                 limit: limit / 1_000_000,
+                fitting: None,
             }),
         }
     }
@@ -108,20 +124,49 @@ impl Array {
     pub(super) fn buffer(&self) -> &wgpu::Buffer {
         &self.buffer
     }
+
+    /// Where word `at` is in the buffer, bytes.
+    pub(super) fn offset(&self, at: usize) -> u64 {
+        self.first + 4 * at as u64
+    }
+
+    /// All of it, to be bound.
+    pub(super) fn binding(&self) -> wgpu::BufferBinding<'_> {
+        wgpu::BufferBinding {
+            buffer: &self.buffer,
+            offset: self.first,
+            size: std::num::NonZero::new(bytes(self.words)),
+        }
+    }
+}
+
+/// Of memory for so many words: a binding is never empty.
+fn bytes(words: usize) -> u64 {
+    4 * words.max(4) as u64
 }
 
 fn buffer(gpu: &Gpu, label: &'static str, words: usize) -> wgpu::Buffer {
     if let Err(error) = Array::check(gpu, label, words) {
-        gpu.fail(&error.to_string());
+        gpu.note(error);
     }
-    gpu.device.create_buffer(&wgpu::BufferDescriptor {
+    let scope = gpu.device.push_error_scope(wgpu::ErrorFilter::OutOfMemory);
+    let buffer = gpu.device.create_buffer(&wgpu::BufferDescriptor {
         label: Some(label),
-        // A binding is never empty.
-        size: 4 * words.max(4) as u64,
+        size: bytes(words),
         usage: wgpu::BufferUsages::STORAGE
             | wgpu::BufferUsages::UNIFORM
             | wgpu::BufferUsages::COPY_SRC
             | wgpu::BufferUsages::COPY_DST,
         mapped_at_creation: false,
-    })
+    });
+    if pollster::block_on(scope.pop()).is_some() {
+        gpu.note(DeviceError::OutOfMemory {
+            name: gpu.info.name.clone(),
+            label,
+            needed: bytes(words).div_ceil(1_000_000),
+            held: gpu.held() / 1_000_000,
+            fitting: None,
+        });
+    }
+    buffer
 }

@@ -12,9 +12,14 @@ pub struct Kernel {
 impl Kernel {
     /// Compiles. Drivers keep what they compiled on disk.
     pub fn new(gpu: &Gpu, shader: &Shader) -> Self {
+        Self::with_constants(gpu, shader, "")
+    }
+
+    /// As [`Kernel::new`], with the text `constants` before the shader's.
+    pub fn with_constants(gpu: &Gpu, shader: &Shader, constants: &str) -> Self {
         let module = gpu.device.create_shader_module(wgpu::ShaderModuleDescriptor {
             label: Some(shader.name),
-            source: wgpu::ShaderSource::Wgsl(Cow::Owned(shader.source())),
+            source: wgpu::ShaderSource::Wgsl(Cow::Owned(format!("{constants}{}", shader.source()))),
         });
         let pipeline = gpu.device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
             label: Some(shader.name),
@@ -42,7 +47,7 @@ const LINE: u32 = 65_535;
 /// Kernels that run one after another, recorded to be submitted together.
 pub struct Work<'a> {
     gpu: &'a Gpu,
-    encoder: wgpu::CommandEncoder,
+    pub(super) encoder: wgpu::CommandEncoder,
     /// Names of the kernels, for the profile.
     names: Vec<&'static str>,
 }
@@ -72,7 +77,7 @@ impl<'a> Work<'a> {
             .zip(arrays)
             .map(|(binding, array)| wgpu::BindGroupEntry {
                 binding,
-                resource: array.buffer().as_entire_binding(),
+                resource: wgpu::BindingResource::Buffer(array.binding()),
             })
             .collect();
         let bindings = self.gpu.device.create_bind_group(&wgpu::BindGroupDescriptor {
@@ -96,25 +101,33 @@ impl<'a> Work<'a> {
     /// Sets the first `words` of `array` to zero.
     pub fn clear(&mut self, array: &Array, words: usize) {
         if words > 0 {
-            self.encoder.clear_buffer(array.buffer(), 0, Some(4 * words as u64));
+            self.encoder
+                .clear_buffer(array.buffer(), array.offset(0), Some(4 * words as u64));
         }
     }
 
     /// Copies the first `words` of `from` to `to`.
     pub fn copy(&mut self, from: &Array, to: &Array, words: usize) {
         if words > 0 {
-            self.encoder
-                .copy_buffer_to_buffer(from.buffer(), 0, to.buffer(), 0, 4 * words as u64);
+            self.encoder.copy_buffer_to_buffer(
+                from.buffer(),
+                from.offset(0),
+                to.buffer(),
+                to.offset(0),
+                4 * words as u64,
+            );
         }
     }
 
     /// Hands it to the device, which begins at once.
     pub fn submit(self) {
+        self.hand_over();
+    }
+
+    pub(super) fn hand_over(self) -> wgpu::SubmissionIndex {
         match self.gpu.profile.get() {
             Some(profile) => profile.submit(self.gpu, self.encoder, &self.names),
-            None => {
-                self.gpu.queue.submit([self.encoder.finish()]);
-            }
+            None => self.gpu.queue.submit([self.encoder.finish()]),
         }
     }
 }

@@ -7,12 +7,14 @@
 mod array;
 mod kernel;
 mod profile;
+mod readback;
 mod scan;
 mod sort;
 
-pub use crate::shaders::{GRID, Shader};
-pub use array::Array;
+pub use crate::shaders::{ADAM, GRID, HARMONICS, Shader};
+pub use array::{Array, PART};
 pub use kernel::{Kernel, Work};
+pub use readback::Readback;
 pub use scan::Scan;
 pub use sort::Sort;
 
@@ -86,8 +88,10 @@ pub struct Gpu {
     device: wgpu::Device,
     queue: wgpu::Queue,
     info: AdapterInfo,
-    failure: Arc<Mutex<Option<String>>>,
+    failure: Arc<Mutex<Option<DeviceError>>>,
     profile: OnceLock<Profile>,
+    /// For [`Array::read`].
+    staging: Mutex<Option<Readback>>,
 }
 
 impl fmt::Debug for Gpu {
@@ -186,20 +190,23 @@ impl Gpu {
                 reason: one_line(&error.to_string()),
             })?;
         let failure = Arc::new(Mutex::new(None));
-        let lost = failure.clone();
+        let (lost, name) = (failure.clone(), info.name.clone());
         device.set_device_lost_callback(move |reason, message| {
             if reason != wgpu::DeviceLostReason::Destroyed {
-                note(&lost, &format!("it was lost: {message}"));
+                note(&lost, failed(&name, &format!("it was lost: {message}")));
             }
         });
-        let failed = failure.clone();
-        device.on_uncaptured_error(Arc::new(move |error: wgpu::Error| note(&failed, &error.to_string())));
+        let (noted, name) = (failure.clone(), info.name.clone());
+        device.on_uncaptured_error(Arc::new(move |error: wgpu::Error| {
+            note(&noted, failed(&name, &error.to_string()));
+        }));
         Ok(Arc::new(Self {
             device,
             queue,
             info,
             failure,
             profile: OnceLock::new(),
+            staging: Mutex::default(),
         }))
     }
 
@@ -215,16 +222,23 @@ impl Gpu {
     pub fn check(&self) -> Result<(), DeviceError> {
         match &*self.failure.lock().unwrap_or_else(PoisonError::into_inner) {
             None => Ok(()),
-            Some(reason) => Err(DeviceError::Failed {
-                name: self.info.name.clone(),
-                reason: reason.clone(),
-            }),
+            Some(error) => Err(error.clone()),
         }
     }
 
     /// Reports a failure that the device itself does not see, and those that tests make up.
     pub fn fail(&self, reason: &str) {
-        note(&self.failure, reason);
+        self.note(failed(&self.info.name, reason));
+    }
+
+    fn note(&self, error: DeviceError) {
+        note(&self.failure, error);
+    }
+
+    /// Bytes of memory in use, as far as the driver tells.
+    pub fn held(&self) -> u64 {
+        let report = self.device.generate_allocator_report();
+        report.map_or(0, |report| report.total_allocated_bytes)
     }
 
     /// From now on measures each kernel by the device's clock, and waits for every submission. Whether the device has such a clock.
@@ -246,16 +260,32 @@ impl Gpu {
 
     /// Waits until everything submitted is done.
     pub fn wait(&self) {
-        if let Err(error) = self.device.poll(wgpu::PollType::wait_indefinitely()) {
+        self.wait_for(None);
+    }
+
+    /// Waits for a submission, or for all so far.
+    fn wait_for(&self, submission_index: Option<wgpu::SubmissionIndex>) {
+        let until = wgpu::PollType::Wait {
+            submission_index,
+            timeout: None,
+        };
+        if let Err(error) = self.device.poll(until) {
             self.fail(&error.to_string());
         }
     }
 }
 
 /// Keeps a failure; the first is the cause.
-fn note(failure: &Mutex<Option<String>>, reason: &str) {
+fn note(failure: &Mutex<Option<DeviceError>>, error: DeviceError) {
     let mut failure = failure.lock().unwrap_or_else(PoisonError::into_inner);
-    failure.get_or_insert(one_line(reason));
+    failure.get_or_insert(error);
+}
+
+fn failed(name: &str, reason: &str) -> DeviceError {
+    DeviceError::Failed {
+        name: name.to_owned(),
+        reason: one_line(reason),
+    }
 }
 
 /// The sum of the bits that are on, for a kernel's flags.

@@ -52,12 +52,17 @@ impl Profile {
     }
 
     /// Submits, waits, and adds the times of the kernels `names`.
-    pub fn submit(&self, gpu: &Gpu, mut encoder: wgpu::CommandEncoder, names: &[&'static str]) {
+    pub fn submit(
+        &self,
+        gpu: &Gpu,
+        mut encoder: wgpu::CommandEncoder,
+        names: &[&'static str],
+    ) -> wgpu::SubmissionIndex {
         let names = &names[..names.len().min(KERNELS as usize)];
         let count = 2 * names.len() as u32;
         encoder.resolve_query_set(&self.queries, 0..count, &self.resolved, 0);
         encoder.copy_buffer_to_buffer(&self.resolved, 0, &self.staging, 0, 8 * u64::from(count));
-        gpu.queue.submit([encoder.finish()]);
+        let submission = gpu.queue.submit([encoder.finish()]);
         self.staging.map_async(wgpu::MapMode::Read, .., |_| {});
         gpu.wait();
         if let Ok(view) = self.staging.get_mapped_range(..) {
@@ -70,5 +75,6 @@ impl Profile {
             }
         }
         self.staging.unmap();
+        submission
     }
 }

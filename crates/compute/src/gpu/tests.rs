@@ -6,6 +6,14 @@ fn gpu() -> Option<Arc<Gpu>> {
 }
 
 #[test]
+fn every_shader_is_valid() {
+    use crate::shaders::{SCAN, SORT, SORT_SIZES};
+    for shader in SCAN.iter().chain(&SORT).chain([&SORT_SIZES]) {
+        irradia_testkit::validate_shader(shader.name, &shader.source());
+    }
+}
+
+#[test]
 fn prefix_sums_of_few_and_many_words_are_those_of_a_loop() {
     let Some(gpu) = gpu() else { return };
     let (mut scan, params) = (Scan::new(&gpu), Scan::params(&gpu));
@@ -39,7 +47,9 @@ fn sorting_keeps_the_order_of_equal_keys() {
         let key_array = Array::of(&gpu, "keys", &keys);
         let value_array = Array::of(&gpu, "values", &(0..count as u32).collect::<Vec<_>>());
         let mut work = Work::new(&gpu);
-        sort.run(&mut work, &key_array, &value_array, count, bits);
+        // Room for more than there are, as where the device alone knows the number.
+        let known = Array::of(&gpu, "count", &[count as u32]);
+        sort.run(&mut work, &key_array, &value_array, &known, count + count / 3, bits);
         work.submit();
         let mut expected: Vec<u32> = (0..count as u32).collect();
         expected.sort_by_key(|i| keys[*i as usize]);
@@ -48,6 +58,27 @@ fn sorting_keeps_the_order_of_equal_keys() {
         let sorted = key_array.to_vec::<u32>(&gpu, count);
         assert!(sorted.iter().zip(&got).all(|(key, i)| *key == keys[*i as usize]));
     }
+    gpu.check().unwrap();
+}
+
+#[test]
+fn words_are_read_in_pieces_in_parts_and_late() {
+    let Some(gpu) = gpu() else { return };
+    let words: Vec<u32> = (0..9_000_000).collect();
+    let array = Array::of(&gpu, "words", &words);
+    assert!(array.to_vec::<u32>(&gpu, words.len()) == words);
+    let part = array.part(8_388_600, 20);
+    assert_eq!(part.to_vec::<u32>(&gpu, 20), (8_388_600..8_388_620).collect::<Vec<_>>());
+    let (mut readback, mut got) = (Readback::new(&gpu, 2), [9u32; 2]);
+    readback.take(&gpu, &mut got);
+    assert_eq!(got, [0, 0], "nothing was sent");
+    for first in [3, 5] {
+        Work::new(&gpu).submit_reading(&array.part(first, 2), &mut readback);
+    }
+    array.write(&gpu, 5, &[7u32]);
+    Work::new(&gpu).submit();
+    readback.take(&gpu, &mut got);
+    assert_eq!(got, [5, 6], "the last that were sent, as they were then");
     gpu.check().unwrap();
 }
 

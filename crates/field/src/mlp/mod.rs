@@ -36,19 +36,19 @@ pub struct MlpShape {
 
 /// Position of a layer in the flat list of parameters: weights `[inputs + again, outputs]`, then the bias.
 #[derive(Clone, Copy, Debug)]
-struct Layer {
-    inputs: usize,
+pub(crate) struct Layer {
+    pub inputs: usize,
     /// Rows of the network's input taken as additional input (0 or all of it).
     again: usize,
-    outputs: usize,
-    at: usize,
+    pub outputs: usize,
+    pub at: usize,
 }
 
 impl Layer {
     fn weights(&self) -> usize {
         (self.inputs + self.again) * self.outputs
     }
-    fn bias(&self) -> usize {
+    pub fn bias(&self) -> usize {
         self.at + self.weights()
     }
     fn end(&self) -> usize {
@@ -111,6 +111,12 @@ impl Mlp {
             });
         }
         Self { shape, layers }
+    }
+
+    /// The layers, from input to output.
+    #[cfg(feature = "gpu")]
+    pub(crate) fn layers(&self) -> &[Layer] {
+        &self.layers
     }
 
     /// Input rows, padded.

@@ -27,6 +27,18 @@ pub enum Activation {
     Relu,
 }
 
+impl Activation {
+    /// The density.
+    #[cfg(feature = "gpu")]
+    pub(crate) fn of(self, x: f32) -> f32 {
+        match self {
+            Activation::Exp => x.min(10.0).exp(),
+            Activation::Softplus => x.max(0.0) + (-x.abs()).exp().ln_1p(),
+            Activation::Relu => x.max(0.0),
+        }
+    }
+}
+
 /// The colour part of a network.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -287,6 +299,12 @@ impl Net {
                 y.store(&mut block.rgb[p * 3 * PANEL + s..]);
             }
         }
+    }
+
+    /// The networks of density and colour.
+    #[cfg(feature = "gpu")]
+    pub(crate) fn mlps(&self) -> (&Mlp, Option<&Mlp>) {
+        (&self.density, self.color.as_ref())
     }
 
     fn color_parts(&self) -> (&Mlp, &ColorShape) {

@@ -68,6 +68,12 @@ impl OccupancyGrid {
         }
     }
 
+    /// The bits of all bricks, x fastest.
+    #[cfg(feature = "gpu")]
+    pub(crate) fn bricks(&self) -> &[u64] {
+        &self.bricks
+    }
+
     /// The coordinates of the cell with index `cell`.
     pub fn cell(&self, cell: usize) -> [usize; 3] {
         [

@@ -93,11 +93,11 @@ pub(crate) struct Scratch {
     /// Gradients of the tables, zero between steps.
     tables: Vec<Vec<f32>>,
     /// The batch of [`train_views`].
-    batch: RayBatch,
+    pub(crate) batch: RayBatch,
 }
 
 /// One in this many empty cells is updated.
-const EMPTY_ONE_IN: u32 = 16;
+pub(crate) const EMPTY_ONE_IN: u32 = 16;
 /// Bounds of the number of rays in a batch.
 const RAYS: [usize; 2] = [64, 16_384];
 /// One in this many rays passes through a pixel of known depth if the depth loss is on.
@@ -106,6 +106,18 @@ const KNOWN_ONE_IN: usize = 4;
 /// One step on photographs: samples [`FieldState::rays`] rays, trains on them, updates the occupancy grid, and sets the number of
 /// rays of the next batch to yield about `options.samples` samples.
 pub fn train_views(state: &mut FieldState, views: &[TrainView], options: &StepOptions) -> StepLoss {
+    let batch = draw(state, views, options);
+    let loss = train_step(state, &batch, options);
+    state.scratch.batch = batch;
+    if updates_occupancy(&loss, options) {
+        update_occupancy(state, false, EMPTY_ONE_IN, options.seed);
+    }
+    set_rays(state, &loss, options);
+    loss
+}
+
+/// The batch of the next step.
+pub(crate) fn draw(state: &mut FieldState, views: &[TrainView], options: &StepOptions) -> RayBatch {
     let mut batch = std::mem::take(&mut state.scratch.batch);
     let mut rng = Rng::new(options.seed, (state.step << 8) + STREAM_RAYS);
     let what = Draw {
@@ -118,14 +130,17 @@ pub fn train_views(state: &mut FieldState, views: &[TrainView], options: &StepOp
         background: options.background,
     };
     batch.draw(views, &what, &state.field.space, &mut rng);
-    let loss = train_step(state, &batch, options);
-    state.scratch.batch = batch;
-    if options.update_occupancy && loss.rays > 0 {
-        update_occupancy(state, false, EMPTY_ONE_IN, options.seed);
-    }
+    batch
+}
+
+pub(crate) fn updates_occupancy(loss: &StepLoss, options: &StepOptions) -> bool {
+    options.update_occupancy && loss.rays > 0
+}
+
+/// Sets the number of rays of the next batch.
+pub(crate) fn set_rays(state: &mut FieldState, loss: &StepLoss, options: &StepOptions) {
     let wanted = options.samples as f64 * loss.rays as f64 / loss.samples.max(1) as f64;
     state.rays = ((0.8 * state.rays as f64 + 0.2 * wanted) as usize).clamp(RAYS[0], RAYS[1]);
-    loss
 }
 
 /// Takes one step on `batch`.
@@ -146,15 +161,42 @@ fn descend(
     let mut scratch = std::mem::take(&mut state.scratch);
     scratch.workers.resize_with(GROUPS, Worker::default);
     let loss = fill(level, &state.field, state.step, &mut scratch.workers);
-    let step = AdamStep {
-        beta1: 0.9,
-        beta2: options.beta2,
-        epsilon: 1e-15,
-        step: state.step,
-    };
+    let step = adam_step(options, state.step);
     update::update(level, state, &mut scratch, options, step);
     state.scratch = scratch;
     loss
+}
+
+/// Weight of one ray's squared error of distance.
+pub(crate) fn depth_weight(batch: &RayBatch, options: &StepOptions) -> f32 {
+    let known = batch.depths.iter().filter(|depth| **depth > 0.0).count();
+    options.depth / known.max(1) as f32
+}
+
+/// Hyperparameters of Adam in step `step`.
+pub(crate) fn adam_step(options: &StepOptions, step: u64) -> AdamStep {
+    AdamStep {
+        beta1: 0.9,
+        beta2: options.beta2,
+        epsilon: 1e-15,
+        step,
+    }
+}
+
+/// The rays of `group` in a batch of `rays`, and their random numbers in step `step`.
+fn group_of(group: usize, rays: usize, seed: u64, step: u64) -> (std::ops::Range<usize>, Rng) {
+    let range = rays * group / GROUPS..rays * (group + 1) / GROUPS;
+    (range, Rng::new(seed, (step << 8) + group as u64))
+}
+
+/// The fraction of a step by which the samples of each ray are shifted where an occupancy grid is marched.
+#[cfg(feature = "gpu")]
+pub(crate) fn offsets(rays: usize, seed: u64, step: u64) -> Vec<f32> {
+    let of_group = |group| {
+        let (range, mut rng) = group_of(group, rays, seed, step);
+        range.map(move |_| rng.uniform())
+    };
+    (0..GROUPS).flat_map(of_group).collect()
 }
 
 /// Computes all gradients: those of networks, codes and background end up in the first worker, the tables' stay with their points.
@@ -167,19 +209,17 @@ fn gradients(
     workers: &mut [Worker],
 ) -> StepLoss {
     let transposed = field.transposed();
-    let known = batch.depths.iter().filter(|depth| **depth > 0.0).count();
     let task = Task {
         level,
         field,
         transposed: &transposed,
         batch,
         options,
-        depth: options.depth / known.max(1) as f32,
+        depth: depth_weight(batch, options),
     };
     let n = batch.rays.len();
     workers.par_iter_mut().enumerate().for_each(|(group, worker)| {
-        let range = n * group / GROUPS..n * (group + 1) / GROUPS;
-        let mut rng = Rng::new(options.seed, (step << 8) + group as u64);
+        let (range, mut rng) = group_of(group, n, options.seed, step);
         worker.rays(&task, range, &mut rng);
     });
     let loss = add_up(workers);

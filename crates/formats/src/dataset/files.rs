@@ -4,7 +4,9 @@ use crate::FormatError;
 use std::io::Read;
 use std::path::{Component, Path, PathBuf};
 
-const EXTENSIONS: [&str; 6] = ["png", "jpg", "jpeg", "PNG", "JPG", "JPEG"];
+const EXTENSIONS: [&str; 12] = [
+    "png", "jpg", "jpeg", "PNG", "JPG", "JPEG", "webp", "tif", "tiff", "WEBP", "TIF", "TIFF",
+];
 
 /// The image file for a dataset's `path`: that file, or that name with an extension added or replaced.
 pub(super) fn find_image(path: &Path) -> Option<PathBuf> {

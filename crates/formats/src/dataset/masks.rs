@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 const MAX_DEPTH: u32 = 6;
 
 /// The masks in a separate folder, by the image to which they belong.
-pub(super) struct Masks {
+pub(crate) struct Masks {
     folder: String,
     /// By path below the folder, lower case, without extension.
     by_stem: HashMap<String, PathBuf>,

@@ -33,6 +33,7 @@ use declared::Declared;
 pub(crate) use declared::DeclaredPoints;
 pub(crate) use files::{is_image_name, list_files};
 use irradia_scene::Dataset;
+pub(crate) use masks::Masks;
 pub use split::Holdout;
 use std::fmt;
 use std::path::{Path, PathBuf};

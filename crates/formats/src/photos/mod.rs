@@ -2,20 +2,19 @@
 
 mod exif;
 
-use crate::dataset::{is_image_name, list_files, oriented_size, turned_as_stored};
+use crate::dataset::{Masks, is_image_name, list_files, oriented_size, turned_as_stored};
 use crate::error::read_file;
 use crate::image_file::{Colour, decode, decode_jpeg_at, read_exif, read_header};
 use crate::{FormatError, Pixels};
 pub use exif::{CameraTags, parse_camera_tags};
 use image::metadata::Orientation;
+use irradia_scene::resize_area;
 use rayon::prelude::*;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 /// Extensions of photographs that are not read.
-const UNREAD: [&str; 10] = [
-    "heic", "heif", "avif", "webp", "tif", "tiff", "dng", "cr2", "nef", "arw",
-];
+const UNREAD: [&str; 7] = ["heic", "heif", "avif", "dng", "cr2", "nef", "arw"];
 
 /// A photograph on disk.
 #[derive(Clone, Debug, PartialEq)]
@@ -30,8 +29,10 @@ pub struct PhotoEntry {
     pub height: u32,
     /// What the camera wrote.
     pub tags: CameraTags,
-    /// Of the file's bytes.
+    /// Of the bytes of the file, and of its mask.
     pub hash: u64,
+    /// Its mask, in the folder `masks`: what is black there is not looked at.
+    pub mask: Option<PathBuf>,
     /// Where up is in the decoded picture: `[right, down]`; `[0, -1]` unless it is decoded as stored, against its EXIF orientation.
     pub up: [i8; 2],
     orientation: Orientation,
@@ -58,6 +59,23 @@ impl PhotoEntry {
             Some(divisor) => decode_jpeg_at(&self.path, divisor, self.orientation),
             None => decode(&self.path, self.orientation, Colour::Keep),
         }
+    }
+
+    /// The mask at `width` x `height`, 0 where the photograph does not count; `None` if it has none.
+    ///
+    /// # Errors
+    /// When the file cannot be read or decoded.
+    pub fn read_mask(&self, width: u32, height: u32) -> Result<Option<Vec<u8>>, FormatError> {
+        let Some(path) = &self.mask else { return Ok(None) };
+        // A mask has the orientation of the picture as it is seen.
+        let header = read_header(path)?;
+        let mask = decode(path, header.orientation, Colour::Grey)?;
+        Ok(Some(resize_area(
+            &mask.data,
+            1,
+            [mask.width, mask.height],
+            [width, height],
+        )))
     }
 }
 
@@ -91,7 +109,7 @@ impl PhotoFolder {
     }
 }
 
-/// The photographs in `folder` itself, or in its folder `images`. Hidden files and those that are not pictures by their extension
+/// The photographs in `folder` itself, or in its folder `images`, with their masks in its folder `masks`. Hidden files and those that are not pictures by their extension
 /// are ignored; pictures that cannot be read, and copies, are left out.
 ///
 /// # Errors
@@ -101,11 +119,13 @@ pub fn read_photo_folder(folder: &Path) -> Result<PhotoFolder, FormatError> {
     if files.is_empty() && folder.join("images").is_dir() {
         files = list_pictures(&folder.join("images"))?;
     }
+    let masks = Masks::beside(folder, "images");
     let entries: Vec<(String, Result<PhotoEntry, String>)> = files
         .into_par_iter()
         .map(|path| {
             let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-            let entry = read_entry(&path, &name);
+            let mask = masks.as_ref().and_then(|masks| masks.of(&name));
+            let entry = read_entry(&path, &name, mask);
             (name, entry)
         })
         .collect();
@@ -143,7 +163,7 @@ fn is_unread(path: &Path) -> Option<&'static str> {
     UNREAD.into_iter().find(|unread| *unread == extension)
 }
 
-fn read_entry(path: &Path, name: &str) -> Result<PhotoEntry, String> {
+fn read_entry(path: &Path, name: &str, mask: Option<PathBuf>) -> Result<PhotoEntry, String> {
     if let Some(kind) = is_unread(path) {
         return Err(format!("{kind} is not read: convert it to JPEG or PNG"));
     }
@@ -154,7 +174,10 @@ fn read_entry(path: &Path, name: &str) -> Result<PhotoEntry, String> {
         other => other.to_string(),
     };
     let header = read_header(path).map_err(reason)?;
-    let bytes = read_file(path).map_err(reason)?;
+    let mut hash = fnv(&read_file(path).map_err(reason)?);
+    if let Some(mask) = &mask {
+        hash ^= fnv(&read_file(mask).map_err(reason)?).rotate_left(1);
+    }
     let stored = [header.width, header.height];
     let tags = read_exif(path).map_or_else(CameraTags::default, |block| parse_camera_tags(&block, stored));
     let (orientation, up) = turned_as_stored(&header);
@@ -165,7 +188,8 @@ fn read_entry(path: &Path, name: &str) -> Result<PhotoEntry, String> {
         width,
         height,
         tags,
-        hash: fnv(&bytes),
+        hash,
+        mask,
         up,
         orientation,
         jpeg: header.jpeg,

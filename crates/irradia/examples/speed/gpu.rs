@@ -90,7 +90,7 @@ fn time(
         update(false, Regularizers::default()),
     );
     let mut step = |engine: &mut Engine| {
-        engine.render(camera.into(), &options);
+        engine.render_ahead(&camera, &options);
         let [planes, v_planes] = engine.device_frame().expect("on the GPU");
         let target = Target {
             width: width as usize,
@@ -103,7 +103,7 @@ fn time(
             depth_weight: 0.0,
             error: true,
         };
-        loss.evaluate(
+        loss.begin(
             &DeviceFrame { planes, v_planes },
             &target,
             &LossWeights::photometric(0.2),
@@ -116,6 +116,9 @@ fn time(
             camera: false,
         });
         engine.update(&update);
+        loss.finish();
+        // Where there was no room, the next step is the repetition.
+        let _ = engine.settle();
     };
     let each = |engine: &mut Engine, work: &mut dyn FnMut(&mut Engine)| {
         if repeats.is_none() {

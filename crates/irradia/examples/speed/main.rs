@@ -5,10 +5,14 @@
 //! cargo run --release -p irradia --example speed -- blend                the inner loop of blending
 //! cargo run --release -p irradia --example speed -- frame SCENE.ply      a frame of a million splats, and how its cost scales
 //! cargo run --release -p irradia --example speed -- scale [SPLATS ..]    every stage at 0.1, 1 and 5 million splats
+//! cargo run --release -p irradia --example speed -- gpu [CASE ..]        frames, steps and kernels on a GPU
+//! cargo run --release -p irradia --example speed -- counts               bytes and operations of a step on a GPU, beside gsplat's
 //! ```
 //!
 //! CPU time is given beside wall time: on a shared machine it is more stable.
 
+#[cfg(feature = "gpu")]
+mod counts;
 #[cfg(feature = "gpu")]
 mod gpu;
 mod machine;
@@ -37,8 +41,10 @@ fn main() -> Result<()> {
         ["scale", ..] => scale::run(&args[1..].iter().map(|n| n.parse()).collect::<Result<Vec<_>, _>>()?),
         #[cfg(feature = "gpu")]
         ["gpu", ..] => gpu::run(&args[1..]),
+        #[cfg(feature = "gpu")]
+        ["counts"] => counts::run(),
         _ => bail!(
-            "usage: steps DATA [STEPS], blend, frame SCENE.ply, scale [SPLATS ..], or gpu [SPLATS@WIDTHxHEIGHT ..]"
+            "usage: steps DATA [STEPS], blend, frame SCENE.ply, scale [SPLATS ..], gpu [SPLATS@WIDTHxHEIGHT ..], or counts"
         ),
     }
 }

@@ -10,7 +10,7 @@ use std::path::PathBuf;
 
 #[derive(clap::Args)]
 pub struct Args {
-    /// Folder of photographs (JPEG, PNG)
+    /// Folder of photographs (JPEG, PNG, WebP, TIFF)
     pub photos: PathBuf,
     /// Folder for doctor.html, with small pictures, and doctor.json; nothing is written when absent. Features and matches are kept
     /// there too: irradia pose with the same folder reuses them

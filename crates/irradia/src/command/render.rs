@@ -48,7 +48,7 @@ pub struct Args {
     /// Threads; all cores when absent
     #[arg(long, value_parser = thread_count())]
     pub threads: Option<usize>,
-    /// Where splats are rendered: cpu, gpu, auto (a real GPU if there is one), or a part of a GPU's name; see irradia devices
+    /// Where the scene is rendered: cpu, gpu, auto (a real GPU if there is one), or a part of a GPU's name; see irradia devices
     #[arg(long, value_name = "DEVICE", default_value = "cpu")]
     pub device: String,
     #[command(flatten)]

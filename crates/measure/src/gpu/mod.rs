@@ -4,7 +4,7 @@
 use crate::loss::job::Gains;
 use crate::{DepthSample, LossValues, LossWeights, Target, Truth};
 use irradia_compute::DeviceError;
-use irradia_compute::gpu::{Array, GRID, Gpu, Kernel, Shader, Work, flags};
+use irradia_compute::gpu::{Array, GRID, Gpu, Kernel, Readback, Shader, Work, flags};
 use std::sync::Arc;
 
 const TARGET: &str = include_str!("shaders/target.wgsl");
@@ -79,6 +79,9 @@ pub struct GpuLoss {
     sums: Array,
     samples: Array,
     totals: Array,
+    readback: Readback,
+    /// Weights and number of values of what is on its way.
+    begun: (LossWeights, f64),
 }
 
 impl GpuLoss {
@@ -97,16 +100,18 @@ impl GpuLoss {
             sums: array("sums of tiles"),
             samples: array("samples of depth"),
             totals: Array::zeros(&gpu, "totals", 5),
+            readback: Readback::new(&gpu, 5),
+            begun: (LossWeights::photometric(0.0), 0.0),
             gpu,
         };
         loss.gpu.check()?;
         Ok(loss)
     }
 
-    /// Compares `frame`, sets its gradients, and reads the values back.
+    /// Compares `frame`, sets its gradients, and reads the values back: [`Self::begin`] and [`Self::finish`].
     ///
     /// # Panics
-    /// When the truth is not of 8 bits, or its length differs from the target's size: a bug in the caller.
+    /// As [`Self::begin`].
     pub fn evaluate(
         &mut self,
         frame: &DeviceFrame,
@@ -114,6 +119,15 @@ impl GpuLoss {
         weights: &LossWeights,
         beside: &Beside,
     ) -> DeviceValues {
+        self.begin(frame, target, weights, beside);
+        self.finish()
+    }
+
+    /// Compares `frame` and sets its gradients, without waiting for it.
+    ///
+    /// # Panics
+    /// When the truth is not of 8 bits, or its length differs from the target's size: a bug in the caller.
+    pub fn begin(&mut self, frame: &DeviceFrame, target: &Target, weights: &LossWeights, beside: &Beside) {
         let gpu = &*self.gpu;
         let (width, height) = (target.width, target.height);
         let Truth::Rgb8(truth) = target.truth else {
@@ -196,12 +210,22 @@ impl GpuLoss {
             ],
             1,
         );
-        work.submit();
+        work.submit_reading(&self.totals, &mut self.readback);
+        self.begun = (*weights, count);
+    }
+
+    /// The values of the last comparison. It waits for them alone: the device may have more to do already.
+    pub fn finish(&mut self) -> DeviceValues {
         let mut totals = [0.0f32; 5];
-        self.totals.read(gpu, 0, &mut totals);
+        self.readback.take(&self.gpu, &mut totals);
+        let (weights, count) = &self.begun;
         let [l1, mse, dissimilarity, depth, norm] = totals.map(f64::from);
         DeviceValues {
-            photometric: LossValues::of_sums([l1, mse, dissimilarity], weights, if count > 0.0 { count } else { 1.0 }),
+            photometric: LossValues::of_sums(
+                [l1, mse, dissimilarity],
+                weights,
+                if *count > 0.0 { *count } else { 1.0 },
+            ),
             depth: if norm > 0.0 { depth / norm } else { 0.0 },
         }
     }

@@ -8,9 +8,12 @@
 //! features.bin     features and matches, which are reused as long as photographs do not change
 //! ```
 
+mod colmap;
 mod doctor;
 mod film;
+mod known;
 mod output;
+mod place;
 mod stages;
 mod store;
 
@@ -19,7 +22,7 @@ use crate::folder::to_json;
 use irradia_formats::{PhotoFolder, read_photo_folder, write_atomic};
 use irradia_sfm::doctor::Kind;
 use irradia_sfm::features::Sift;
-use irradia_sfm::map::{MapOptions, PhotoInfo, Progress, Reconstruction, reconstruct};
+use irradia_sfm::map::{MapOptions, PhotoInfo, Progress, Reconstruction, extend, reconstruct};
 use irradia_sfm::matching::PairOptions;
 use serde::Serialize;
 use stages::Work;
@@ -44,6 +47,12 @@ pub struct PoseInput {
     pub photos: PathBuf,
     /// The folder of the dataset; created if missing.
     pub out: PathBuf,
+    /// Whether the photographs are added to the dataset in `out`, in COLMAP's format, whose poses and cameras stay as they are.
+    pub into: bool,
+    /// Who finds the poses.
+    pub mapper: Mapper,
+    /// The program that [`Mapper::Colmap`] runs.
+    pub colmap: String,
     /// The most features of a photograph, at least 1.
     pub max_features: usize,
     /// How to verify and map.
@@ -56,10 +65,23 @@ impl PoseInput {
         Self {
             photos: photos.into(),
             out: out.into(),
+            into: false,
+            mapper: Mapper::default(),
+            colmap: "colmap".to_owned(),
             max_features: Sift::default().max_features,
             mapping: MapOptions::default(),
         }
     }
+}
+
+/// Who finds poses.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Mapper {
+    /// This program.
+    #[default]
+    Irradia,
+    /// COLMAP, which must be installed; photographs that it leaves out have no other reason.
+    Colmap,
 }
 
 /// What [`pose`] is doing.
@@ -79,7 +101,7 @@ pub enum PoseProgress {
 }
 
 /// What became of the photographs; `pose.json`.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct PoseReport {
     /// Pictures found.
     pub photos: usize,
@@ -93,6 +115,8 @@ pub struct PoseReport {
     pub points: usize,
     /// Its mean reprojection error, px.
     pub mean_error_px: f64,
+    /// How its unit, a metre, was found; `None` if the unit is arbitrary.
+    pub scale: Option<ScaleReport>,
     /// Its cameras.
     pub cameras: Vec<CameraReport>,
     /// Pairs of photographs that were matched.
@@ -140,10 +164,23 @@ pub struct CameraReport {
     pub focal_held: bool,
 }
 
+/// The scale of a model in metres, by the places in the photographs' metadata; +X is east and +Y north then.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct ScaleReport {
+    /// Photographs whose places agree with the model.
+    pub photos: usize,
+    /// Posed photographs that tell their place.
+    pub with_place: usize,
+    /// Root mean square of the horizontal distances between places and the model, m.
+    pub residual_m: f64,
+    /// Relative standard deviation of the scale.
+    pub scale_error: f64,
+}
+
 /// Time of a stage.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct StageReport {
-    /// `photographs`, `frames`, `features`, `matches`, `poses`, `doctor` or `writing`.
+    /// `photographs`, `frames`, `features`, `matches`, `poses`, `doctor`, `writing` or `colmap`.
     pub name: &'static str,
     /// Wall time.
     pub seconds: f64,
@@ -154,17 +191,25 @@ pub struct StageReport {
 ///
 /// # Errors
 /// When there are fewer than three photographs, a film cannot be read, no three photographs can be posed together, `out` holds a
-/// dataset of another origin, or a file cannot be written.
+/// dataset of another origin, or none where photographs are to be added to it, or a file cannot be written.
 pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Result<PoseReport, RunError> {
     let started = Instant::now();
     if input.max_features == 0 {
         return Err(RunError::setting("max_features", 0, "must be 1 or more"));
     }
     let out = &input.out;
-    check_free(out)?;
+    let known = match input.into {
+        true => Some(known::KnownPoses::read(out)?),
+        false => {
+            check_free(out)?;
+            None
+        }
+    };
     fs::create_dir_all(out).map_err(RunError::io("create", out))?;
     let mut clock = Clock::new();
-    let folder = if is_film(&input.photos) {
+    let folder = if let Some(known) = &known {
+        known.with(&input.photos)?
+    } else if is_film(&input.photos) {
         let frames = film::frames(&input.photos, out, progress)?;
         clock.end("frames");
         read_photo_folder(&frames)?
@@ -173,6 +218,21 @@ pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Resu
     };
     check_enough(&input.photos, &folder)?;
     clock.end("photographs");
+    if input.mapper == Mapper::Colmap {
+        if input.into {
+            return Err(RunError::setting(
+                "mapper",
+                "colmap",
+                "adds nothing to a dataset: leave --into or --poses colmap out",
+            ));
+        }
+        let mut report = colmap::run(input, &folder, progress)?;
+        clock.end("colmap");
+        report.stages = clock.stages;
+        report.seconds = started.elapsed().as_secs_f64();
+        write_atomic(&out.join(REPORT), |file| file.write_all(&to_json(&report)))?;
+        return Ok(report);
+    }
 
     let mut work = Work::new(input.max_features, Some(out), &folder, progress);
     work.find_features()?;
@@ -188,12 +248,25 @@ pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Resu
         name: "poses",
         of: work.photos().len(),
     });
-    let infos = photo_infos(&folder, work.photos());
-    let reconstruction = reconstruct(&infos, work.features(), &pairs, &input.mapping, &mut |event| {
+    let mut infos = photo_infos(&folder, work.photos());
+    let mut tell = |event| {
         if let Progress::Registered { photos, .. } = event {
             progress(PoseProgress::Done(photos));
         }
-    });
+    };
+    let is_new = known.is_none();
+    let mut reconstruction = match known {
+        None => reconstruct(&infos, work.features(), &pairs, &input.mapping, &mut tell),
+        Some(known) => {
+            let known = known.of(&mut infos)?;
+            extend(&infos, work.features(), &pairs, &known, &input.mapping, &mut tell)
+        }
+    };
+    let scale = match reconstruction.models.first_mut() {
+        // What is known keeps its unit.
+        Some(model) if is_new => place::scale(&folder, &work, model, progress),
+        _ => None,
+    };
     clock.end("poses");
     let examined = doctor::examine(&work, &infos, &pairs, &reconstruction);
     doctor::write(out, &folder, &work, &examined)?;
@@ -211,6 +284,7 @@ pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Resu
 
     let mut report = output::report(&folder, &work, &infos, &reconstruction);
     report.findings = examined.findings;
+    report.scale = scale;
     report.pairs = pairs.len();
     report.warnings = work.warnings().to_vec();
     report.stages = clock.stages;

@@ -4,7 +4,8 @@ use super::stages::Work;
 use super::{CameraReport, LeftOutPhoto, PoseReport};
 use crate::RunError;
 use irradia_formats::{
-    ColmapCamera, ColmapImage, ColmapModel, ColmapPoint, PhotoFolder, PosedImage, TrackedPoint, write_colmap,
+    ColmapCamera, ColmapImage, ColmapModel, ColmapPoint, PhotoEntry, PhotoFolder, PosedImage, TrackedPoint,
+    write_colmap,
 };
 use irradia_sfm::geometry::camera::DCamera;
 use irradia_sfm::map::{Model, PhotoInfo, Reconstruction};
@@ -23,19 +24,34 @@ pub(super) fn write(
     fs::create_dir_all(&images).map_err(RunError::io("create", &images))?;
     for (photo, i) in work.photos().iter().enumerate() {
         if found.models.iter().any(|model| model.poses[photo].is_some()) {
-            let entry = &folder.photos[*i];
-            link(&entry.path, &images.join(&entry.name))?;
+            link_photo(out, &folder.photos[*i])?;
         }
     }
     let sparse = out.join("sparse");
-    if sparse.exists() {
-        // Models of an earlier call, which may have been more.
-        fs::remove_dir_all(&sparse).map_err(RunError::io("clear", &sparse))?;
+    // Beside the models of an earlier call, which may have been more and remain until these are complete.
+    let written = out.join("sparse.new");
+    if written.exists() {
+        fs::remove_dir_all(&written).map_err(RunError::io("clear", &written))?;
     }
     for (number, model) in found.models.iter().enumerate() {
-        let to = sparse.join(number.to_string());
+        let to = written.join(number.to_string());
         fs::create_dir_all(&to).map_err(RunError::io("create", &to))?;
         write_colmap(&to, &colmap_model(work, infos, model))?;
+    }
+    if sparse.exists() {
+        fs::remove_dir_all(&sparse).map_err(RunError::io("clear", &sparse))?;
+    }
+    fs::rename(&written, &sparse).map_err(RunError::io("rename", &written))
+}
+
+/// Brings a photograph and its mask into the folders `images`, which exists, and `masks` of the dataset.
+pub(super) fn link_photo(out: &Path, photo: &PhotoEntry) -> Result<(), RunError> {
+    link(&photo.path, &out.join("images").join(&photo.name))?;
+    if let Some(mask) = &photo.mask {
+        let masks = out.join("masks");
+        fs::create_dir_all(&masks).map_err(RunError::io("create", &masks))?;
+        let extension = mask.extension().unwrap_or_default().to_string_lossy();
+        link(mask, &masks.join(format!("{}.{extension}", photo.name)))?;
     }
     Ok(())
 }
@@ -179,6 +195,7 @@ pub(super) fn report(folder: &PhotoFolder, work: &Work, infos: &[PhotoInfo], fou
         models: found.models.iter().map(Model::registered).collect(),
         points: model.points.len(),
         mean_error_px: model.mean_error(),
+        scale: None,
         cameras,
         pairs: 0,
         verified_pairs: found.pairs.len(),

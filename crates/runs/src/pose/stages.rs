@@ -215,8 +215,7 @@ impl<'a> Work<'a> {
 fn extract(sift: &Sift, photo: &PhotoEntry) -> Result<Looks, String> {
     let pixels = photo.read(sift.max_side).map_err(|error| error.to_string())?;
     let grey: Vec<u8> = pixels.data.chunks_exact(pixels.channels as usize).map(luma).collect();
-    let mask: Option<Vec<u8>> =
-        (pixels.channels == 4).then(|| pixels.data.chunks_exact(4).map(|pixel| pixel[3]).collect());
+    let mask = mask_of(photo, &pixels)?;
     let features = sift.extract(&GreyPhoto {
         width: pixels.width,
         height: pixels.height,
@@ -233,6 +232,19 @@ fn extract(sift: &Sift, photo: &PhotoEntry) -> Result<Looks, String> {
         features: features.scaled(enlarge),
         colors,
         appearance: Appearance::measure(width, height, &grey, mask.as_deref()),
+    })
+}
+
+/// What counts of a photograph: its alpha, and its mask where it has one.
+fn mask_of(photo: &PhotoEntry, pixels: &Pixels) -> Result<Option<Vec<u8>>, String> {
+    let given = photo
+        .read_mask(pixels.width, pixels.height)
+        .map_err(|error| error.to_string())?;
+    let alpha = (pixels.channels == 4).then(|| pixels.data.chunks_exact(4).map(|pixel| pixel[3]));
+    Ok(match (given, alpha) {
+        (Some(given), Some(alpha)) => Some(given.into_iter().zip(alpha).map(|(a, b)| a.min(b)).collect()),
+        (Some(given), None) => Some(given),
+        (None, alpha) => alpha.map(Iterator::collect),
     })
 }
 

@@ -7,8 +7,21 @@ use crate::geometry::linear::symmetric_eigen;
 use crate::{Features, PairMatches};
 use glam::{DQuat, DVec3};
 
-/// The model in its final world.
-pub(super) fn finish(working: Working, photos: &[PhotoInfo]) -> Model {
+/// The model in a world of its own.
+pub(super) fn finish(working: &Working, photos: &[PhotoInfo]) -> Model {
+    let mut model = collected(working, photos);
+    let alignment = upright(&model, photos);
+    for pose in model.poses.iter_mut().flatten() {
+        *pose = alignment.pose(pose);
+    }
+    for point in &mut model.points {
+        point.position = alignment.point(point.position);
+    }
+    model
+}
+
+/// The model in the world in which it grew.
+pub(super) fn collected(working: &Working, photos: &[PhotoInfo]) -> Model {
     let mut model = Model {
         cameras: Vec::new(),
         poses: working.poses.clone(),
@@ -39,13 +52,6 @@ pub(super) fn finish(working: Working, photos: &[PhotoInfo]) -> Model {
                 })
                 .collect(),
         });
-    }
-    let alignment = upright(&model, photos);
-    for pose in model.poses.iter_mut().flatten() {
-        *pose = alignment.pose(pose);
-    }
-    for point in &mut model.points {
-        point.position = alignment.point(point.position);
     }
     model
 }

@@ -100,7 +100,7 @@ impl Working<'_> {
     }
 
     /// Registers photographs as long as that succeeds, then adjusts all; `false` if the model broke.
-    fn grow(&mut self, taken: &[bool], failures: &mut [usize], progress: &mut dyn FnMut(Progress)) -> bool {
+    pub(super) fn grow(&mut self, taken: &[bool], failures: &mut [usize], progress: &mut dyn FnMut(Progress)) -> bool {
         let (mut photos_then, mut points_then) = (self.registered(), self.point_count());
         let mut settled = false;
         loop {
@@ -157,7 +157,8 @@ impl Working<'_> {
             changed += self.triangulate(&all);
         }
         for photo in 0..self.poses.len() {
-            if self.poses[photo].is_some() && self.used_in(photo) < self.options.min_inliers && self.registered() > 2 {
+            let lost = self.poses[photo].is_some() && self.used_in(photo) < self.options.min_inliers;
+            if lost && !self.held_poses[photo] && self.registered() > 2 {
                 self.deregister(photo);
             }
         }

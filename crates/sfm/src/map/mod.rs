@@ -8,6 +8,7 @@ mod agree;
 mod finish;
 mod focal;
 mod grow;
+mod metric;
 mod model;
 mod refine;
 mod seed;
@@ -20,8 +21,9 @@ mod verify;
 pub use agree::{agreement, contradictions, strengths};
 pub(crate) use finish::up;
 pub use focal::Source;
+pub use metric::{Metric, to_metres};
 pub use types::{
-    LeftOut, MapOptions, Model, ModelPoint, PairKind, PhotoInfo, Progress, Reason, Reconstruction, VerifiedPair,
+    Known, LeftOut, MapOptions, Model, ModelPoint, PairKind, PhotoInfo, Progress, Reason, Reconstruction, VerifiedPair,
 };
 pub use verify::{Cameras, verify};
 
@@ -56,6 +58,36 @@ pub fn reconstruct(
     let left_out = finish::left_out(photos, features, pairs, &verified, &taken, &tried, options);
     Reconstruction {
         models,
+        left_out,
+        pairs: verified,
+        cameras,
+    }
+}
+
+/// As [`reconstruct`], of one model that holds what is `known` as it is, in its world: photographs without a pose are registered into it.
+///
+/// # Panics
+/// As [`reconstruct`], and when `known` differs from `photos` in the number of photographs or groups.
+pub fn extend(
+    photos: &[PhotoInfo],
+    features: &[Features],
+    pairs: &[PairMatches],
+    known: &Known,
+    options: &MapOptions,
+    progress: &mut dyn FnMut(Progress),
+) -> Reconstruction {
+    assert_eq!(photos.len(), known.poses.len(), "a pose or none a photograph");
+    let (cameras, verified) = verify::verify_with(photos, features, pairs, &known.cameras, options, progress);
+    assert_eq!(cameras.len(), known.cameras.len(), "a camera or none a group");
+    let tracks = Tracks::new(features, &verified);
+    let mut working = model::Working::new(photos, &cameras, &tracks, options);
+    working.hold(known);
+    let mut tried = vec![0; photos.len()];
+    working.grow(&vec![false; photos.len()], &mut tried, progress);
+    let taken: Vec<bool> = working.poses.iter().map(Option::is_some).collect();
+    let left_out = finish::left_out(photos, features, pairs, &verified, &taken, &tried, options);
+    Reconstruction {
+        models: vec![finish::collected(&working, photos)],
         left_out,
         pairs: verified,
         cameras,
@@ -104,7 +136,7 @@ fn grown(input: &Input, pairs: &[VerifiedPair], progress: &mut dyn FnMut(Progres
         }
         models.push(model);
     }
-    let mut models: Vec<Model> = models.into_iter().map(|model| finish::finish(model, photos)).collect();
+    let mut models: Vec<Model> = models.into_iter().map(|model| finish::finish(&model, photos)).collect();
     // Stable: models of equal size stay in the order of their seeds.
     models.sort_by_key(|model| std::cmp::Reverse(model.registered()));
     Grown { models, taken, tried }

@@ -2,7 +2,7 @@
 
 use super::focal::Source;
 use super::tracks::Tracks;
-use super::types::{MapOptions, PhotoInfo};
+use super::types::{Known, MapOptions, PhotoInfo};
 use super::verify::Cameras;
 use crate::geometry::camera::DCamera;
 use crate::geometry::pose::DPose;
@@ -23,6 +23,9 @@ pub(super) struct Working<'a> {
     pub sources: Vec<Source>,
     /// `[groups]` focal lengths that are held because no value is better than another.
     pub focal_held: Vec<bool>,
+    /// `[photos]` and `[groups]` what was known before mapping: poses and cameras that stay as they are.
+    pub held_poses: Vec<bool>,
+    pub held_cameras: Vec<bool>,
     /// `[observations]` on the plane z = 1, undistorted by the present cameras; NaN where the lens is not invertible.
     pub plane: Vec<DVec2>,
     /// `[photos]` poses of registered photographs.
@@ -44,6 +47,8 @@ impl<'a> Working<'a> {
             first_focals: cameras.iter().map(|c| c.0.focal()).collect(),
             sources: cameras.iter().map(|c| c.1).collect(),
             focal_held: vec![false; cameras.len()],
+            held_poses: vec![false; photos.len()],
+            held_cameras: vec![false; cameras.len()],
             plane: Vec::new(),
             poses: vec![None; photos.len()],
             points: vec![None; tracks.len()],
@@ -51,6 +56,17 @@ impl<'a> Working<'a> {
         };
         model.undistort();
         model
+    }
+
+    /// Photographs and cameras that are known, with the points that they see.
+    pub fn hold(&mut self, known: &Known) {
+        self.poses.clone_from(&known.poses);
+        self.held_poses = known.poses.iter().map(Option::is_some).collect();
+        self.held_cameras = known.cameras.iter().map(Option::is_some).collect();
+        let all: Vec<usize> = (0..self.tracks.len()).collect();
+        self.triangulate(&all);
+        let points = self.with_points();
+        self.filter(&points);
     }
 
     /// Recomputes what depends on the cameras' intrinsics.

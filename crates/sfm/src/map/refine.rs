@@ -47,7 +47,7 @@ impl Working<'_> {
                 problem.camera_of.push(self.photos[photo].group as u32);
             }
         }
-        problem.held_poses = vec![false; photos.len()];
+        problem.held_poses = photos.iter().map(|photo| self.held_poses[*photo]).collect();
         for group in 0..self.cameras.len() {
             problem.cameras.push(AdjustedCamera {
                 camera: self.cameras[group],
@@ -114,7 +114,7 @@ impl Working<'_> {
             problem.camera_of.push(self.photos[photo].group as u32);
         };
         for neighbour in &local {
-            add(&mut problem, *neighbour, false);
+            add(&mut problem, *neighbour, self.held_poses[*neighbour]);
         }
         for other in 0..self.poses.len() {
             if !local.contains(&other) {
@@ -219,6 +219,9 @@ impl Working<'_> {
 
     /// What of a group's intrinsics is adjusted, by the number of its photographs.
     fn freedom(&self, group: usize, extent: Extent) -> Freedom {
+        if self.held_cameras[group] {
+            return Freedom::HELD;
+        }
         let count = (0..self.poses.len())
             .filter(|p| self.poses[*p].is_some() && self.photos[*p].group == group)
             .count();

@@ -21,6 +21,15 @@ pub struct PhotoInfo {
     pub up: Option<DVec3>,
 }
 
+/// What is known before mapping, and stays as it is.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Known {
+    /// `[photos]` poses.
+    pub poses: Vec<Option<DPose>>,
+    /// `[groups]` cameras.
+    pub cameras: Vec<Option<DCamera>>,
+}
+
 /// How to verify and map. The defaults are COLMAP's where it has the same parameter.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct MapOptions {
@@ -138,7 +147,8 @@ pub struct Reconstruction {
     pub cameras: Vec<(DCamera, Source)>,
 }
 
-/// Cameras, poses and points in one world: up is +Z, the origin is near the scene's middle, the cameras' distance is about 1.
+/// Cameras, poses and points in one world: that of what was known; else up is +Z, the origin is near the scene's middle, the cameras'
+/// distance is about 1.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Model {
     /// `[groups]` the camera of each group; `None` if none of its photographs is registered.

@@ -43,6 +43,18 @@ pub fn verify(
     options: &MapOptions,
     progress: &mut dyn FnMut(Progress),
 ) -> (Cameras, Vec<VerifiedPair>) {
+    verify_with(photos, features, pairs, &[], options, progress)
+}
+
+/// As [`verify`], with the cameras of some groups.
+pub(super) fn verify_with(
+    photos: &[PhotoInfo],
+    features: &[Features],
+    pairs: &[PairMatches],
+    cameras_known: &[Option<DCamera>],
+    options: &MapOptions,
+    progress: &mut dyn FnMut(Progress),
+) -> (Cameras, Vec<VerifiedPair>) {
     // With metadata for all, a few pairs suffice to check them.
     let known = photos.iter().all(|p| p.focal_prior_px.is_some());
     let mut voters: Vec<usize> = (0..pairs.len()).collect();
@@ -60,7 +72,12 @@ pub fn verify(
         })
         .collect();
     let found: Vec<&Uncalibrated> = uncalibrated.iter().flatten().collect();
-    let cameras = focal::cameras(photos, features, pairs, &found, options);
+    let mut cameras = focal::cameras(photos, features, pairs, &found, options);
+    for (camera, known) in cameras.iter_mut().zip(cameras_known) {
+        if let Some(known) = known {
+            *camera = (*known, Source::Prior);
+        }
+    }
     let verified: Vec<VerifiedPair> = pairs
         .par_iter()
         .zip(&uncalibrated)

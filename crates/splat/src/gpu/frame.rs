@@ -4,11 +4,11 @@ use crate::render::{FramePlanes, RenderOptions};
 use crate::shaders::Kernels;
 use crate::{Splats, ViewParams};
 use irradia_compute::DeviceError;
-use irradia_compute::gpu::{Array, GROUP, Gpu, Scan, Sort, Work, flags};
+use irradia_compute::gpu::{Array, GROUP, Gpu, PART, Readback, Scan, Sort, Work, flags};
 use std::sync::{Arc, OnceLock};
 
 /// Width and height of a tile, pixels.
-const TILE: u32 = 16;
+pub(super) const TILE: u32 = 16;
 /// Entries of a segment, between whose beginnings the state of pixels is kept.
 const SEGMENT: usize = 256;
 /// Words of a segment's state: five channels of each pixel of a tile.
@@ -42,7 +42,8 @@ pub struct GpuRenderer {
     pub(super) filter: Array,
     /// Number of splats, stride of their planes, SH degree.
     pub(super) shape: [usize; 3],
-    filters: bool,
+    /// Whether splats are convolved with `filter`.
+    pub(crate) filters: bool,
     pub(super) footprints: Array,
     pub(super) visible: Array,
     pub(super) touched: Array,
@@ -66,6 +67,12 @@ pub struct GpuRenderer {
     scan_params: [Array; 3],
     sort_depths: Sort,
     sort_tiles: Sort,
+    /// Visible splats, then entries, each in a part of its own.
+    counted: [Array; 2],
+    all_counted: Array,
+    /// Entries of tiles for which there is room.
+    room: usize,
+    readback: Readback,
     pub(super) last: Option<Last>,
     host: OnceLock<Vec<f32>>,
 }
@@ -77,9 +84,11 @@ pub(super) struct Last {
     pub options: RenderOptions,
     /// Whether the backward pass may follow.
     pub trains: bool,
-    /// Visible splats, and entries of tiles.
+    /// Entries of tiles for which there is room.
+    pub room: usize,
+    /// Visible splats and entries of tiles, once the host knows.
     pub found: [usize; 2],
-    /// Splats whose gradient was not finite in the backward pass before this frame.
+    /// Splats whose gradient was not finite in the backward pass before this frame, once the host knows.
     pub non_finite: usize,
 }
 
@@ -92,10 +101,14 @@ impl Last {
         [self.view.width, self.view.height].map(|size| size.div_ceil(TILE))
     }
 
+    pub fn tile_count(&self) -> usize {
+        let [x, y] = self.tiles();
+        x as usize * y as usize
+    }
+
     /// Segments at most.
     pub fn segments(&self) -> usize {
-        let [x, y] = self.tiles();
-        self.found[1] / SEGMENT + x as usize * y as usize
+        self.room / SEGMENT + self.tile_count()
     }
 }
 
@@ -106,6 +119,7 @@ impl GpuRenderer {
     /// When the device refuses one.
     pub fn new(gpu: Arc<Gpu>) -> Result<Self, DeviceError> {
         let array = |label| Array::zeros(&gpu, label, 0);
+        let all_counted = Array::zeros(&gpu, "counts", 2 * PART);
         let renderer = Self {
             kernels: Kernels::new(&gpu),
             view: Array::zeros(&gpu, "view", VIEW_WORDS),
@@ -134,6 +148,10 @@ impl GpuRenderer {
             tiles: array("tiles"),
             segment_counts: array("counts of segments"),
             scan: Scan::new(&gpu),
+            counted: [0, PART].map(|at| all_counted.part(at, 4)),
+            all_counted,
+            room: 0,
+            readback: Readback::new(&gpu, 4),
             scan_params: [(); 3].map(|()| Scan::params(&gpu)),
             sort_depths: Sort::new(&gpu, 32),
             sort_tiles: Sort::new(&gpu, 32),
@@ -152,13 +170,19 @@ impl GpuRenderer {
 
     /// Takes the splats of the frames to come, and the variances of their 3D smoothing filter, if any.
     pub fn upload(&mut self, splats: &Splats, filter: &[f32]) {
-        let (gpu, stride) = (&self.gpu, splats.stride());
-        self.shape = [splats.len(), stride, splats.sh_degree() as usize];
-        self.geometry.reserve(gpu, GEOMETRY * stride);
-        self.harmonics.reserve(gpu, splats.sh.as_slice().len());
-        write_geometry(gpu, &self.geometry, 0, splats);
-        self.harmonics.write(gpu, 0, splats.sh.as_slice());
+        self.harmonics.reserve(&self.gpu, splats.sh.as_slice().len());
+        self.harmonics.write(&self.gpu, 0, splats.sh.as_slice());
+        self.upload_geometry(splats, filter, splats.sh_degree() as usize);
         self.filters = !filter.is_empty();
+        self.last = None;
+    }
+
+    /// Takes everything but the harmonics, of which there is room for `degree`.
+    pub(super) fn upload_geometry(&mut self, splats: &Splats, filter: &[f32], degree: usize) {
+        let (gpu, stride) = (&self.gpu, splats.stride());
+        self.shape = [splats.len(), stride, degree];
+        self.geometry.reserve(gpu, GEOMETRY * stride);
+        write_geometry(gpu, &self.geometry, 0, splats);
         self.filter.reserve(gpu, filter.len());
         self.filter.write(gpu, 0, filter);
         self.footprints.reserve(gpu, 12 * stride);
@@ -173,36 +197,86 @@ impl GpuRenderer {
         ] {
             array.reserve(gpu, stride);
         }
-        self.last = None;
     }
 
     /// Renders the uploaded splats.
     pub fn render(&mut self, view: &ViewParams, options: &RenderOptions) {
-        self.draw(view, options, false);
+        self.draw_whole(view, options, false);
     }
 
     /// As [`Self::render`]; if it `trains`, the backward pass may follow.
-    ///
-    /// The number of entries is read back once, after projection: arrays are then as large as needed, and nothing is dropped.
+    pub(super) fn draw_whole(&mut self, view: &ViewParams, options: &RenderOptions, trains: bool) {
+        loop {
+            self.draw(view, options, trains);
+            if self.settle() {
+                break;
+            }
+        }
+    }
+
+    /// Waits until the last frame knows what it found. If tiles had more entries than there was room for, it makes room: `false`, the frame
+    /// is void, as is everything made from it since, and is to be repeated.
+    pub(crate) fn settle(&mut self) -> bool {
+        let Some(last) = self.last.as_mut().filter(|_| self.readback.is_pending()) else {
+            return true;
+        };
+        let mut found = [0u32; 4];
+        self.readback.take(&self.gpu, &mut found);
+        let [visible, entries, non_finite, _] = found.map(|n| n as usize);
+        last.found = [visible, entries];
+        last.non_finite = non_finite;
+        // An eighth more, since the next view may need it.
+        if entries + entries / 8 > self.room {
+            self.room = entries + entries / 4;
+        }
+        entries <= last.room
+    }
+
+    /// Submits a frame. How many splats are visible and how many entries their tiles have stays on the device: arrays have room for the
+    /// most so far, and what is dispatched suffices for that. [`Self::settle`] follows.
     pub(super) fn draw(&mut self, view: &ViewParams, options: &RenderOptions, trains: bool) {
         let gpu = self.gpu.clone();
         let [count, ..] = self.shape;
-        let groups = |items: usize| items.div_ceil(GROUP as usize);
         self.host = OnceLock::new();
-        let mut last = Last {
+        // What is next to nothing, to begin with.
+        self.room = self.room.max(count);
+        let last = Last {
             view: view.clone(),
             options: *options,
             trains,
+            room: self.room,
             found: [0; 2],
             non_finite: 0,
         };
-        self.view.write(&gpu, 0, &self.view_words(&last, 0));
+        let tiles = last.tile_count();
+        for array in [&mut self.tiles, &mut self.slots, &mut self.splat_of_slot] {
+            array.reserve(&gpu, last.room);
+        }
+        // Behind the tiles, what belongs to none.
+        self.ranges.reserve(&gpu, 2 * (tiles + 1));
+        for array in [&mut self.segment_counts, &mut self.first_segments, &mut self.reached] {
+            array.reserve(&gpu, tiles + 1);
+        }
+        if trains {
+            self.tile_of_segment.reserve(&gpu, last.segments());
+            self.states.reserve(&gpu, SEGMENT_STATE * last.segments());
+        }
+        self.planes.reserve(&gpu, FRAME_PLANES * last.pixels());
+        self.view.write(&gpu, 0, &self.view_words(&last));
 
         let mut work = Work::new(&gpu);
+        self.project(&mut work);
+        self.bin(&mut work, &last);
+        self.blend(&mut work, &last);
+        work.submit_reading(&self.found, &mut self.readback);
+        self.last = Some(last);
+    }
+
+    /// Splats to footprints, and how many tiles each touches.
+    pub(super) fn project(&self, work: &mut Work) {
         work.clear(&self.found, 2);
-        let kernels = &self.kernels;
         work.run(
-            &kernels.project,
+            &self.kernels.project,
             &[
                 &self.view,
                 &self.geometry,
@@ -213,10 +287,17 @@ impl GpuRenderer {
                 &self.touched,
                 &self.found,
             ],
-            groups(count),
+            groups(self.shape[0]),
         );
+    }
+
+    /// Footprints to the lists of all tiles, front to back, and to the segments of these lists.
+    pub(super) fn bin(&mut self, work: &mut Work, last: &Last) {
+        let [count, ..] = self.shape;
+        let tiles = last.tile_count();
         self.scan
-            .run(&mut work, &self.scan_params[0], &self.visible, &self.places, count);
+            .run(work, &self.scan_params[0], &self.visible, &self.places, count);
+        let kernels = &self.kernels;
         work.run(
             &kernels.compact,
             &[
@@ -229,43 +310,18 @@ impl GpuRenderer {
             ],
             groups(count),
         );
-        work.submit();
-        let mut found = [0u32; 3];
-        self.found.read(&gpu, 0, &mut found);
-        self.found.write(&gpu, 2, &[0u32]);
-        let [visible, entries, non_finite] = found.map(|n| n as usize);
-        last.found = [visible, entries];
-        last.non_finite = non_finite;
-
-        let [tiles_x, tiles_y] = last.tiles();
-        let tiles = tiles_x as usize * tiles_y as usize;
-        let pixels = last.pixels();
-        self.view.write(&gpu, 0, &self.view_words(&last, 0));
-        for array in [&mut self.tiles, &mut self.slots, &mut self.splat_of_slot] {
-            array.reserve(&gpu, entries);
-        }
-        // Behind the tiles, what belongs to none.
-        self.ranges.reserve(&gpu, 2 * (tiles + 1));
-        for array in [&mut self.segment_counts, &mut self.first_segments, &mut self.reached] {
-            array.reserve(&gpu, tiles + 1);
-        }
-        if trains {
-            self.tile_of_segment.reserve(&gpu, last.segments());
-            self.states.reserve(&gpu, SEGMENT_STATE * last.segments());
-        }
-        self.planes.reserve(&gpu, FRAME_PLANES * pixels);
-
-        let mut work = Work::new(&gpu);
+        work.run(&kernels.admit, &[&self.found, &self.view, &self.all_counted], 1);
+        let [visible, entries] = &self.counted;
         self.sort_depths
-            .run(&mut work, &self.depths, &self.order, visible, u32::BITS);
-        let kernels = &self.kernels;
+            .run(work, &self.depths, &self.order, visible, count, u32::BITS);
         work.run(
             &kernels.count,
             &[&self.view, &self.order, &self.touched, &self.counts],
-            groups(visible),
+            groups(count),
         );
+        // What lies beyond the visible splats is added to nothing.
         self.scan
-            .run(&mut work, &self.scan_params[1], &self.counts, &self.firsts, visible);
+            .run(work, &self.scan_params[1], &self.counts, &self.firsts, count);
         work.run(
             &kernels.emit,
             &[
@@ -278,15 +334,16 @@ impl GpuRenderer {
                 &self.slots,
                 &self.splat_of_slot,
             ],
-            groups(visible),
+            groups(count),
         );
         let bits = u32::BITS - (tiles as u32).leading_zeros();
-        self.sort_tiles.run(&mut work, &self.tiles, &self.slots, entries, bits);
+        self.sort_tiles
+            .run(work, &self.tiles, &self.slots, entries, last.room, bits);
         work.clear(&self.ranges, 2 * (tiles + 1));
         work.run(
             &kernels.ranges,
             &[&self.view, &self.tiles, &self.ranges],
-            groups(entries),
+            groups(last.room),
         );
         work.run(
             &kernels.segments,
@@ -294,14 +351,18 @@ impl GpuRenderer {
             groups(tiles + 1),
         );
         self.scan.run(
-            &mut work,
+            work,
             &self.scan_params[2],
             &self.segment_counts,
             &self.first_segments,
             tiles + 1,
         );
+    }
+
+    /// The lists of tiles to pixels.
+    pub(super) fn blend(&self, work: &mut Work, last: &Last) {
         work.run(
-            &kernels.blend,
+            &self.kernels.blend,
             &[
                 &self.view,
                 &self.ranges,
@@ -314,10 +375,14 @@ impl GpuRenderer {
                 &self.states,
                 &self.planes,
             ],
-            tiles,
+            last.tile_count(),
         );
-        work.submit();
-        self.last = Some(last);
+    }
+
+    /// What the backward pass needs beyond what the frame needed.
+    pub(super) fn add_flags(&self, last: &Last, more: u32) {
+        let at = VIEW_WORDS - 4;
+        self.view.write(&self.gpu, at, &[self.view_words(last)[at] | more]);
     }
 
     /// The last frame, which is read back on the first call.
@@ -337,6 +402,16 @@ impl GpuRenderer {
         }
     }
 
+    /// SH degree for which there is room.
+    pub(crate) fn sh_degree(&self) -> u32 {
+        self.shape[2] as u32
+    }
+
+    /// Pixels of the last frame.
+    pub fn pixels(&self) -> usize {
+        self.last.as_ref().map_or(0, Last::pixels)
+    }
+
     /// Splats that touched the last frame.
     pub fn visible(&self) -> usize {
         self.last.as_ref().map_or(0, |last| last.found[0])
@@ -352,8 +427,8 @@ impl GpuRenderer {
         self.intersections() as u64 * u64::from(TILE * TILE)
     }
 
-    /// The words of `View`, with further flags.
-    pub(super) fn view_words(&self, last: &Last, more: u32) -> [u32; VIEW_WORDS] {
+    /// The words of `View`, before anything is found.
+    fn view_words(&self, last: &Last) -> [u32; VIEW_WORDS] {
         let Last {
             view, options, trains, ..
         } = last;
@@ -389,11 +464,11 @@ impl GpuRenderer {
             stride as u32,
             options.sh_degree.min(degree as u32),
             drawn as u32,
-            last.found[0] as u32,
-            last.found[1] as u32,
             0,
             0,
-            flags(&bits) | more,
+            last.room as u32,
+            0,
+            flags(&bits),
             0,
             0,
             0,
@@ -408,6 +483,11 @@ impl GpuRenderer {
 
 /// Words of `View` in `view.wgsl`.
 const VIEW_WORDS: usize = 44;
+
+/// Workgroups for so many items.
+fn groups(items: usize) -> usize {
+    items.div_ceil(GROUP as usize)
+}
 
 /// Writes everything but the harmonics, plane by plane, from plane `first` on.
 pub(super) fn write_geometry(gpu: &Gpu, to: &Array, first: usize, splats: &Splats) {

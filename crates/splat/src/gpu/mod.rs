@@ -5,11 +5,14 @@
 //! differently from the CPU; what differs is rounding alone.
 
 mod frame;
+mod moves;
 mod training;
 
 pub use frame::GpuRenderer;
 pub use training::DeviceGradient;
 pub(crate) use training::GpuTraining;
 
+#[cfg(test)]
+mod bisect;
 #[cfg(test)]
 mod tests;

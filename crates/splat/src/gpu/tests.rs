@@ -1,6 +1,7 @@
 //! The GPU against its twin on the CPU.
 
 use super::{GpuRenderer, GpuTraining};
+use crate::densify::{classic, fast, mcmc, taming};
 use crate::engine::{Noise, Update};
 use crate::regularize::{Regularized, Regularizers};
 use crate::render::{Gather, OutputGradient};
@@ -15,7 +16,7 @@ use irradia_compute::gpu::{Gpu, Wanted};
 use irradia_scene::{Camera, Intrinsics, Pose, Rng};
 use std::sync::Arc;
 
-fn gpu() -> Option<Arc<Gpu>> {
+pub(super) fn gpu() -> Option<Arc<Gpu>> {
     irradia_testkit::gpu_or_skip(|| Gpu::open(&Wanted::Any))
 }
 
@@ -27,7 +28,7 @@ fn every_shader_is_valid() {
 }
 
 /// `n` splats of all sizes about the origin, some behind the camera, a few needles, and a camera with an awkward lens.
-fn scene(n: usize, degree: u32, seed: u64) -> (Splats, Camera) {
+pub(super) fn scene(n: usize, degree: u32, seed: u64) -> (Splats, Camera) {
     let mut rng = Rng::new(seed, 7);
     let mut splats = Splats::zeros(n, degree);
     for i in 0..n {
@@ -116,7 +117,7 @@ fn the_same_frame_has_the_same_bytes() {
 }
 
 /// What the loss of a frame might be.
-fn gradients(camera: &Camera, seed: u64) -> [Vec<f32>; 4] {
+pub(super) fn gradients(camera: &Camera, seed: u64) -> [Vec<f32>; 4] {
     let pixels = camera.intrinsics.width as usize * camera.intrinsics.height as usize;
     let mut rng = Rng::new(seed, 9);
     [3 * pixels, pixels, pixels, pixels].map(|n| (0..n).map(|_| rng.range(-1.0, 1.0) / pixels as f32).collect())
@@ -195,24 +196,22 @@ fn gradients_agree_with_the_cpu() {
     gpu.check().unwrap();
 }
 
-#[test]
-fn steps_agree_with_the_cpu_under_every_option_of_an_update() {
-    let Some(gpu) = gpu() else { return };
-    let rates = Rates {
-        means: 1e-3,
-        quats: 1e-3,
-        log_scales: 5e-3,
-        opacities: 2e-2,
-        sh_dc: 2e-3,
-        sh_rest: 1e-4,
-    };
-    let base = Update {
+/// Of every parameter, with the norms of screen gradients as statistics.
+pub(super) fn usual_update() -> Update {
+    Update {
         statistics: Some(Statistics::Gradient),
         regularizers: Regularizers::default(),
         regularized: Regularized::Visible,
         regularizer_unit: 1.7,
         trained_fraction: 1.0,
-        rates,
+        rates: Rates {
+            means: 1e-3,
+            quats: 1e-3,
+            log_scales: 5e-3,
+            opacities: 2e-2,
+            sh_dc: 2e-3,
+            sh_rest: 1e-4,
+        },
         sh_degree: 2,
         optimizer: Optimizer {
             step: AdamStep {
@@ -226,7 +225,13 @@ fn steps_agree_with_the_cpu_under_every_option_of_an_update() {
         },
         noise: None,
         condition_cap: None,
-    };
+    }
+}
+
+#[test]
+fn steps_agree_with_the_cpu_under_every_option_of_an_update() {
+    let Some(gpu) = gpu() else { return };
+    let base = usual_update();
     let weights = Regularizers {
         opacity: 0.01,
         opacity_square: 0.002,
@@ -353,4 +358,165 @@ fn noise_moves_faint_splats_by_the_given_amount_and_opaque_ones_not_at_all() {
     // Fade-out at an opacity of 1.2e-4: sigmoid(0.488) = 0.62. The mean of 6,000 squares is within 5 %.
     let deviation = (squares / (3.0 * f64::from(faint))).sqrt();
     assert!((deviation / 0.0062 - 1.0).abs() < 0.05, "{deviation}");
+}
+
+/// Every strategy, each on both ways: harmonics and moments stay on the device, or the whole state is read back, edited and uploaded.
+#[test]
+fn density_control_with_harmonics_on_the_device_gives_the_same_bits_as_the_whole_state_read_back() {
+    type Edit = fn(&mut SplatState);
+    let edits: [(&str, Edit); 8] = [
+        ("classic", |state| {
+            let options = classic::ClassicOptions {
+                gradient_threshold: 1e-7,
+                small: 0.05,
+                min_opacity: 0.05,
+                max_scale: Some(0.2),
+                max_splats: 5000,
+                revised_opacity: true,
+            };
+            let change = classic::densify(state, &options, &mut Rng::new(1, 1));
+            assert!(
+                change.cloned > 100 && change.split > 100 && change.pruned > 50,
+                "{change:?}"
+            );
+        }),
+        ("reset opacity", |state| classic::reset_opacity(state, 0.01)),
+        ("mcmc", |state| {
+            let options = mcmc::McmcOptions {
+                min_opacity: 0.05,
+                growth: 1.05,
+                max_splats: 9000,
+            };
+            let change = mcmc::densify(state, &options, &mut Rng::new(1, 1));
+            assert!(change.cloned > 100 && change.pruned > 100, "{change:?}");
+        }),
+        ("fast", |state| {
+            let options = fast::FastOptions {
+                target: 4500,
+                floor: 100,
+                min_opacity: 0.05,
+                min_weight: 0.001,
+                error_threshold: 1e-9,
+                min_extent: 0.5,
+            };
+            let change = fast::densify(state, &options);
+            assert!(change.split > 100 && change.pruned > 100, "{change:?}");
+        }),
+        ("taming", |state| {
+            let options = taming::TamingOptions {
+                target: 4500,
+                gradient_threshold: 1e-7,
+                small: 0.05,
+                min_opacity: 0.05,
+                max_scale: Some(0.2),
+                prunes: true,
+                weights: taming::ScoreWeights {
+                    gradient: 25.0,
+                    error: 10.0,
+                    weight: 50.0,
+                    opacity: 100.0,
+                    extent: 10.0,
+                    volume: 25.0,
+                },
+            };
+            let change = taming::densify(state, &options, &mut Rng::new(1, 1));
+            assert!(change.cloned > 50 && change.split > 50, "{change:?}");
+        }),
+        ("fewer", |state| {
+            state.gather(&(0..state.len() as u32).filter(|i| i % 3 > 0).collect::<Vec<_>>());
+        }),
+        ("filter", |state| {
+            let (_, camera) = scene(0, 0, 0);
+            crate::filter::update(state, &[ViewParams::new(&camera)]);
+        }),
+        ("nothing", |_| {}),
+    ];
+    let Some(gpu) = gpu() else { return };
+    let (splats, camera) = scene(4000, 2, 60);
+    let [v_color, .., error] = gradients(&camera, 6);
+    let update = Update {
+        statistics: Some(Statistics::Error),
+        ..usual_update()
+    };
+    let train = |engine: &mut Engine| {
+        for step in 1..=2 {
+            engine.render(camera.into(), &RenderOptions::default());
+            engine.backward(&OutputGradient {
+                gather: Gather::Error(&error),
+                ..OutputGradient::of_color(&v_color)
+            });
+            let mut update = update;
+            update.optimizer.step.step = step;
+            engine.update(&update);
+        }
+    };
+    let mut engine = Engine::new(SplatState::default());
+    engine.use_device(&Device::Gpu(gpu.clone())).unwrap();
+    engine.use_filter(true);
+    for (name, edit) in edits {
+        let [on_device, whole] = [true, false].map(|stays| {
+            *engine.state_mut() = SplatState::new(splats.clone());
+            train(&mut engine);
+            match stays {
+                true => engine.edit_density(edit),
+                false => edit(engine.state_mut()),
+            }
+            let edited = engine.state().clone();
+            assert!(stays || edited.moments[1].sh.as_slice().iter().any(|v| *v > 0.0) || edited.is_empty());
+            train(&mut engine);
+            [edited, engine.state().clone()]
+        });
+        assert!(on_device == whole, "{name}");
+    }
+    gpu.check().unwrap();
+}
+
+#[test]
+fn a_step_without_room_changes_nothing_and_its_repetition_is_that_of_a_step_that_waits() {
+    let Some(gpu) = gpu() else { return };
+    // Large splats, which touch many tiles each.
+    let (mut splats, camera) = scene(300, 1, 70);
+    splats
+        .log_scales
+        .as_mut_slice()
+        .iter_mut()
+        .for_each(|s| *s = s.max(-2.0));
+    let update = Update {
+        optimizer: Optimizer {
+            dense: true,
+            ..usual_update().optimizer
+        },
+        regularizers: Regularizers {
+            opacity: 0.01,
+            ..Regularizers::default()
+        },
+        noise: Some(Noise {
+            amount: 0.01,
+            seed: 1,
+            step: 1,
+        }),
+        ..usual_update()
+    };
+    let [v_color, ..] = gradients(&camera, 8);
+    let mut engines = [0, 1].map(|_| Engine::new(SplatState::new(splats.clone())));
+    for engine in &mut engines {
+        engine.use_device(&Device::Gpu(gpu.clone())).unwrap();
+    }
+    let [ahead, waits] = &mut engines;
+    let before = ahead.state().clone();
+    let step = |engine: &mut Engine, ahead: bool| {
+        match ahead {
+            true => engine.render_ahead(&camera, &RenderOptions::default()),
+            false => engine.render(camera.into(), &RenderOptions::default()),
+        }
+        engine.backward(&OutputGradient::of_color(&v_color));
+        engine.update(&update);
+        engine.settle()
+    };
+    assert!(!step(ahead, true), "there is no room for {}", ahead.intersections());
+    assert!(*ahead.state() == before, "a void step changes nothing");
+    assert!(step(ahead, true) && step(waits, false));
+    assert!(*ahead.state() != before && ahead.state() == waits.state());
+    assert_eq!(ahead.intersections(), waits.intersections());
+    gpu.check().unwrap();
 }

@@ -1,6 +1,7 @@
 //! Splats in training on the GPU: their state, the backward pass and the update.
 
-use super::frame::{FRAME_PLANES, GEOMETRY, GpuRenderer, flag, read_geometry, write_geometry};
+use super::frame::{FRAME_PLANES, GEOMETRY, GpuRenderer, Last, flag, read_geometry, write_geometry};
+use super::moves::Moves;
 use crate::engine::Update;
 use crate::regularize::{Regularized, size_limit};
 use crate::render::{CHUNK, CameraGradient, Gather, OutputGradient, RenderOptions, basis_at};
@@ -11,7 +12,7 @@ use irradia_scene::sh;
 use std::sync::Arc;
 
 /// Gradients of each splat, planes: geometry, colour, screen, gathered.
-const GRADIENTS: usize = GEOMETRY + 7;
+pub(super) const GRADIENTS: usize = GEOMETRY + 7;
 /// Sums of blending of each slot.
 const SUMS: usize = 12;
 /// Threads of a workgroup of `project_vjp.wgsl`, which needs many registers.
@@ -47,15 +48,18 @@ pub struct DeviceGradient {
 /// The twin of the CPU's state, renderer and gradients.
 pub(crate) struct GpuTraining {
     pub renderer: GpuRenderer,
-    moments_geometry: Array,
-    moments_harmonics: Array,
+    /// First moments, then second ones.
+    pub(super) moments_geometry: Array,
+    /// First and second moments: with the harmonics, the largest arrays of a state.
+    pub(super) moments_harmonics: [Array; 2],
     statistics: Array,
-    filter: Array,
     v_frame: Array,
-    sums: Array,
-    v_splats: Array,
+    pub(super) sums: Array,
+    pub(super) v_splats: Array,
     v_camera: Array,
+    v_camera_sums: Array,
     update: Array,
+    pub(super) moves: Moves,
     camera: Option<CameraGradient>,
     /// Whether the host's state was edited since it was uploaded.
     pub stale: bool,
@@ -66,39 +70,56 @@ impl GpuTraining {
         let array = |label| Array::zeros(&gpu, label, 0);
         Ok(Self {
             moments_geometry: array("moments of geometry"),
-            moments_harmonics: array("moments of harmonics"),
+            moments_harmonics: ["first moments of harmonics", "second moments of harmonics"].map(array),
             statistics: array("statistics"),
-            filter: array("filter variances"),
             v_frame: array("gradients of the frame"),
             sums: array("sums of blending"),
             v_splats: array("gradients of splats"),
             v_camera: array("gradients of the camera"),
+            v_camera_sums: array("sums of the camera's gradients"),
             update: Array::zeros(&gpu, "update", UPDATE_WORDS),
+            moves: Moves::new(&gpu),
             camera: None,
             stale: true,
             renderer: GpuRenderer::new(gpu)?,
         })
     }
 
+    /// Splats of `degree` at most, by the device's largest array: what a state needs, and what frames need with as many entries a splat as
+    /// the last one, or twice as many, since views differ.
+    pub fn most_splats(&self, degree: u32) -> usize {
+        let words = (self.renderer.gpu.info().largest_array / 4) as usize;
+        let by_state = words / (3 * sh::coefficients(degree)).max(2 * GEOMETRY);
+        let [count, ..] = self.renderer.shape;
+        let by_entries = match 2 * self.renderer.intersections() {
+            0 => usize::MAX,
+            entries => (words / SUMS).saturating_mul(count) / entries,
+        };
+        // Planes are padded.
+        by_state.saturating_sub(Planes::ALIGN).min(by_entries).max(1)
+    }
+
     /// Takes the whole state.
     pub fn upload(&mut self, state: &SplatState, filters: bool) {
-        let filter = if filters { state.filter.plane(0) } else { &[] };
-        self.renderer.upload(&state.splats, filter);
+        self.renderer.upload(&state.splats, state.filter.plane(0));
+        self.renderer.filters = filters;
         let gpu = &self.renderer.gpu;
-        let stride = state.splats.stride();
-        self.moments_geometry.reserve(gpu, 2 * GEOMETRY * stride);
-        let harmonics = state.splats.sh.as_slice().len();
-        self.moments_harmonics.reserve(gpu, 2 * harmonics);
+        self.moments_geometry.reserve(gpu, 2 * GEOMETRY * state.splats.stride());
         for (i, moment) in state.moments.iter().enumerate() {
             write_geometry(gpu, &self.moments_geometry, i * GEOMETRY, moment);
-            self.moments_harmonics.write(gpu, i * harmonics, moment.sh.as_slice());
+            let harmonics = &mut self.moments_harmonics[i];
+            harmonics.reserve(gpu, moment.sh.as_slice().len());
+            harmonics.write(gpu, 0, moment.sh.as_slice());
         }
+        self.upload_statistics(state);
+        self.stale = false;
+    }
+
+    pub(super) fn upload_statistics(&mut self, state: &SplatState) {
+        let gpu = &self.renderer.gpu;
         self.statistics.reserve(gpu, state.statistics.as_slice().len());
         self.statistics.write(gpu, 0, state.statistics.as_slice());
-        self.filter.reserve(gpu, stride);
-        self.filter.write(gpu, 0, state.filter.as_slice());
-        self.v_splats.reserve(gpu, GRADIENTS * stride);
-        self.stale = false;
+        self.v_splats.reserve(gpu, GRADIENTS * state.splats.stride());
     }
 
     /// The state as it is now.
@@ -109,20 +130,26 @@ impl GpuTraining {
         let mut state = SplatState {
             splats: zeros(),
             moments: [zeros(), zeros()],
-            statistics: Planes::zeros(SplatState::STATISTICS, count),
-            filter: Planes::zeros(1, count),
+            ..SplatState::default()
         };
-        read_geometry(gpu, &self.renderer.geometry, 0, &mut state.splats);
         self.renderer.harmonics.read(gpu, 0, state.splats.sh.as_mut_slice());
-        let harmonics = state.splats.sh.as_slice().len();
         for (i, moment) in state.moments.iter_mut().enumerate() {
             read_geometry(gpu, &self.moments_geometry, i * GEOMETRY, moment);
-            self.moments_harmonics
-                .read(gpu, i * harmonics, moment.sh.as_mut_slice());
+            self.moments_harmonics[i].read(gpu, 0, moment.sh.as_mut_slice());
         }
-        self.statistics.read(gpu, 0, state.statistics.as_mut_slice());
-        self.filter.read(gpu, 0, state.filter.as_mut_slice());
+        self.download_decisive(&mut state);
         state
+    }
+
+    /// Reads what density control decides by: geometry, statistics and filter.
+    pub(super) fn download_decisive(&self, state: &mut SplatState) {
+        let gpu = &self.renderer.gpu;
+        let count = self.renderer.shape[0];
+        read_geometry(gpu, &self.renderer.geometry, 0, &mut state.splats);
+        state.statistics = Planes::zeros(SplatState::STATISTICS, count);
+        self.statistics.read(gpu, 0, state.statistics.as_mut_slice());
+        state.filter = Planes::zeros(1, count);
+        self.renderer.filter.read(gpu, 0, state.filter.as_mut_slice());
     }
 
     pub fn len(&self) -> usize {
@@ -130,6 +157,11 @@ impl GpuTraining {
     }
 
     pub fn render(&mut self, view: &ViewParams, options: &RenderOptions) {
+        self.renderer.draw_whole(view, options, true);
+    }
+
+    /// As [`Self::render`], without waiting for it.
+    pub fn render_ahead(&mut self, view: &ViewParams, options: &RenderOptions) {
         self.renderer.draw(view, options, true);
     }
 
@@ -182,14 +214,23 @@ impl GpuTraining {
             (of.camera, flag::CAMERA),
         ];
         let more = flags(&bits);
-        let [visible, entries] = last.found;
+        let [count, ..] = renderer.shape;
         if of.camera {
-            self.v_camera.reserve(&gpu, CAMERA * visible);
+            self.v_camera.reserve(&gpu, CAMERA * count);
         }
-        renderer.view.write(&gpu, 0, &renderer.view_words(&last, more));
-        self.sums.reserve(&gpu, SUMS * entries);
+        renderer.add_flags(&last, more);
+        self.sums.reserve(&gpu, SUMS * last.room);
 
         let mut work = Work::new(&gpu);
+        self.blend_vjp(&mut work, &last);
+        self.project_vjp(&mut work);
+        work.submit();
+        self.camera = of.camera.then(|| self.sum_camera(&last));
+    }
+
+    /// Gradients of pixels to sums of each slot.
+    pub(super) fn blend_vjp(&self, work: &mut Work, last: &Last) {
+        let renderer = &self.renderer;
         work.run(
             &renderer.kernels.blend_vjp,
             &[
@@ -208,6 +249,12 @@ impl GpuTraining {
             ],
             last.segments(),
         );
+    }
+
+    /// Sums of slots to gradients of splats.
+    pub(super) fn project_vjp(&self, work: &mut Work) {
+        let renderer = &self.renderer;
+        work.clear(&renderer.found.part(2, 1), 1);
         work.run(
             &renderer.kernels.project_vjp,
             &[
@@ -225,19 +272,29 @@ impl GpuTraining {
                 &renderer.found,
                 &self.v_camera,
             ],
-            visible.div_ceil(VJP_GROUP),
+            renderer.shape[0].div_ceil(VJP_GROUP),
         );
-        work.submit();
-        self.camera = of.camera.then(|| self.sum_camera(&last.view, visible));
     }
 
-    /// Sums the camera's gradients in order, in double precision.
-    fn sum_camera(&self, view: &ViewParams, visible: usize) -> CameraGradient {
-        let of_splats: Vec<f32> = self.v_camera.to_vec(&self.renderer.gpu, CAMERA * visible);
-        let sums: [f64; CAMERA] = std::array::from_fn(|plane| {
-            let values = &of_splats[plane * visible..][..visible];
-            values.iter().map(|v| f64::from(*v)).sum()
-        });
+    /// Sums the camera's gradients: those of 256 splats on the device, then these in order, in double precision.
+    fn sum_camera(&mut self, last: &Last) -> CameraGradient {
+        let gpu = &self.renderer.gpu;
+        let groups = last.found[0].div_ceil(GROUP as usize);
+        self.v_camera_sums.reserve(gpu, CAMERA * groups);
+        let mut work = Work::new(gpu);
+        work.run(
+            &self.renderer.kernels.sum_camera,
+            &[&self.renderer.view, &self.v_camera, &self.v_camera_sums],
+            groups,
+        );
+        work.submit();
+        let mut sums = [0.0f64; CAMERA];
+        for of_group in self.v_camera_sums.to_vec::<[f32; CAMERA]>(gpu, CAMERA * groups) {
+            for (sum, value) in sums.iter_mut().zip(of_group) {
+                *sum += f64::from(value);
+            }
+        }
+        let view = &last.view;
         view.gradient(
             std::array::from_fn(|i| std::array::from_fn(|j| sums[3 * i + j])),
             std::array::from_fn(|i| sums[9 + i]),
@@ -292,7 +349,7 @@ impl GpuTraining {
     /// The twin of the CPU's update.
     pub fn update(&mut self, update: &Update) {
         let Some(last) = self.renderer.last.clone() else { return };
-        let words = self.update_words(update, last.found[0], [last.view.width, last.view.height]);
+        let words = self.update_words(update, [last.view.width, last.view.height]);
         let renderer = &self.renderer;
         let gpu = &renderer.gpu;
         self.update.write(gpu, 0, &words);
@@ -307,13 +364,15 @@ impl GpuTraining {
                 &renderer.geometry,
                 &self.v_splats,
                 &renderer.harmonics,
-                &self.moments_harmonics,
+                &self.moments_harmonics[0],
+                &self.moments_harmonics[1],
             ],
             groups,
         );
         work.run(
             &renderer.kernels.update_geometry,
             &[
+                &renderer.view,
                 &self.update,
                 &renderer.visible,
                 &renderer.footprints,
@@ -327,17 +386,13 @@ impl GpuTraining {
         work.submit();
     }
 
-    fn update_words(&self, update: &Update, visible: usize, size: [u32; 2]) -> [u32; UPDATE_WORDS] {
+    fn update_words(&self, update: &Update, size: [u32; 2]) -> [u32; UPDATE_WORDS] {
         let [count, stride, degree] = self.renderer.shape;
         let step = &update.optimizer.step;
         let corrections = step.corrections();
         let rate = |rate: f32| (f64::from(rate) / corrections[0]) as f32;
         let rates = &update.rates;
         let regularizers = &update.regularizers;
-        let counted = match update.regularized {
-            Regularized::Visible => visible,
-            Regularized::All => count,
-        };
         let is_regularized = !regularizers.is_zero();
         let all = is_regularized && update.regularized == Regularized::All;
         let limit = match update.trained_fraction < 1.0 {
@@ -368,7 +423,7 @@ impl GpuTraining {
                 (1.0 / corrections[1].sqrt()) as f32,
             ],
             regularizers
-                .per_splat(f64::from(update.regularizer_unit), 1.0 / counted.max(1) as f64)
+                .per_splat(f64::from(update.regularizer_unit), 1.0)
                 .map(|weight| weight as f32),
             [
                 0.5 * size[0] as f32,

@@ -598,6 +598,43 @@ impl Renderer {
     }
 }
 
+/// What other devices are compared with, stage by stage.
+#[cfg(all(test, feature = "gpu"))]
+impl Renderer {
+    /// Splat `i` on screen, if it is visible: the words of `footprints` in the shaders.
+    pub(crate) fn footprint_words(&self, i: usize) -> Option<[f32; 12]> {
+        let s = &self.footprints[i];
+        let ([x, y], [a, b, c], [red, green, blue]) = (s.xy, s.quadratic, s.color);
+        let words = [
+            x,
+            y,
+            a,
+            b,
+            c,
+            s.log2_opacity,
+            red,
+            green,
+            blue,
+            s.depth,
+            s.extent[0],
+            s.extent[1],
+        ];
+        (self.depth_keys[i] != u32::MAX).then_some(words)
+    }
+
+    /// The sums of blending of each splat over all tiles.
+    pub(crate) fn sums_by_splat(&self) -> Vec<[f64; SUMS]> {
+        let mut of_splats = vec![[0.0; SUMS]; self.footprints.len()];
+        let entries = (0..self.bins.tile_count()).flat_map(|tile| self.bins.tile(tile));
+        for (entry, sums) in entries.zip(&self.sums) {
+            for (to, sum) in of_splats[entry.splat as usize].iter_mut().zip(sums) {
+                *to += f64::from(*sum);
+            }
+        }
+        of_splats
+    }
+}
+
 /// Parts of a frame's projection for each thread: more balance better, and cost a count for every tile.
 const PARTS_PER_THREAD: usize = 4;
 

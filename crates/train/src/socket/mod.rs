@@ -101,6 +101,11 @@ impl Sockets {
         [poses, residual, exposure].into_iter().flatten().collect()
     }
 
+    /// Whether there are none: a step then is one of the splats alone.
+    pub fn are_empty(&self) -> bool {
+        self.poses.is_none() && self.residual.is_none() && self.exposure.is_none()
+    }
+
     /// The files to write beside the scene: name and bytes.
     pub fn files(&self) -> Vec<(String, Vec<u8>)> {
         let file = |occupant: &dyn Occupant| Some((format!("{}.safetensors", occupant.name()), occupant.export()?));

@@ -145,6 +145,17 @@ impl ModelFiles {
     }
 }
 
+/// Cameras and images of the model in `root`, of several the one with most images.
+///
+/// # Errors
+/// When there is no complete model, or its files are damaged.
+pub fn read_colmap_poses(root: &Path) -> Result<(Vec<ColmapCamera>, Vec<ColmapImage>), FormatError> {
+    let (files, _) =
+        largest_model(root)?.ok_or_else(|| FormatError::malformed(root, "contains no COLMAP model (sparse/0)"))?;
+    let cameras = files.read("cameras", binary::parse_cameras, text::parse_cameras)?;
+    Ok((cameras, files.images()?))
+}
+
 pub(super) fn read(root: &Path, downscale: f32) -> Result<Declared, FormatError> {
     let Some((files, several)) = largest_model(root)? else {
         return Err(FormatError::malformed(root, "contains no COLMAP model"));

@@ -6,7 +6,7 @@ struct Update {
     sh_rates: vec4f,
     // Decay of the moments, epsilon, inverse root of the second moment's bias correction.
     adam: vec4f,
-    // Weights of opacity, its square, standard deviations, covariance, as the formulas apply them to a splat.
+    // Weights of opacity, its square, standard deviations, covariance, as the formulas apply them to all splats that count.
     regularizers: vec4f,
     // Screen pixels to normalised device coordinates; size below which position and shape rest; noise.
     scales: vec4f,
@@ -26,17 +26,3 @@ const UPDATE_FREEZE: u32 = 16u;
 const UPDATE_GRADIENT: u32 = 32u;
 const UPDATE_ABSOLUTE: u32 = 64u;
 const UPDATE_ERROR: u32 = 128u;
-
-// First moments below this are zero.
-const FAINTEST_MOMENT: f32 = 1e-30;
-
-// Parameter, first and second moment after the gradient g.
-fn adam(g: f32, rate: f32, parameter: f32, first: f32, second: f32) -> vec3f {
-    var m = fma(first, update.adam.x, (1.0 - update.adam.x) * g);
-    let v = fma(second, update.adam.y, (1.0 - update.adam.y) * g * g);
-    let p = parameter - rate * m / fma(sqrt(v), update.adam.w, update.adam.z);
-    if abs(m) < FAINTEST_MOMENT {
-        m = 0.0;
-    }
-    return vec3f(p, m, v);
-}

@@ -1,18 +1,19 @@
 // Statistics of density control, regularisers, Adam, noise and the condition cap, in this order, on everything but colours.
-@group(0) @binding(0) var<uniform> update: Update;
-@group(0) @binding(1) var<storage, read> visible: array<u32>;
-@group(0) @binding(2) var<storage, read> footprints: array<vec4f>;
-@group(0) @binding(3) var<storage, read> v_splats: array<f32>;
-@group(0) @binding(4) var<storage, read_write> geometry: array<f32>;
+@group(0) @binding(0) var<uniform> view: View;
+@group(0) @binding(1) var<uniform> update: Update;
+@group(0) @binding(2) var<storage, read> visible: array<u32>;
+@group(0) @binding(3) var<storage, read> footprints: array<vec4f>;
+@group(0) @binding(4) var<storage, read> v_splats: array<f32>;
+@group(0) @binding(5) var<storage, read_write> geometry: array<f32>;
 // First moments, then second ones.
-@group(0) @binding(5) var<storage, read_write> moments: array<f32>;
+@group(0) @binding(6) var<storage, read_write> moments: array<f32>;
 // Planes: gradient, frames seen, extent, error, weight.
-@group(0) @binding(6) var<storage, read_write> statistics: array<f32>;
+@group(0) @binding(7) var<storage, read_write> statistics: array<f32>;
 
 @compute @workgroup_size(256)
 fn main(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups: vec3u, @builtin(local_invocation_index) thread: u32) {
     let i = group_index(group, groups) * 256u + thread;
-    if i >= update.splats.x {
+    if i >= update.splats.x || view.found.w != 0u {
         return;
     }
     let flags = update.flags.x;
@@ -66,7 +67,9 @@ fn optimize(i: u32, stride: u32, is_active: bool, is_dense: bool, shapes_all: bo
         let s = exp(log_scale);
         let squares = s * s;
         let o = 1.0 / (1.0 + exp(-geometry[10u * stride + i]));
-        let w = update.regularizers;
+        // The mean of all splats, or of the visible ones.
+        let count = select(view.found.x, update.splats.x, shapes_all);
+        let w = update.regularizers / f32(max(count, 1u));
         let v_scale = w.z * s + 4.0 * w.w * squares * squares;
         g[7] += v_scale.x;
         g[8] += v_scale.y;
@@ -95,7 +98,7 @@ fn optimize(i: u32, stride: u32, is_active: bool, is_dense: bool, shapes_all: bo
         if rate != 0.0 {
             let place = p * stride + i;
             let second = (GEOMETRY + p) * stride + i;
-            let next = adam(g[p], rate, geometry[place], moments[place], moments[second]);
+            let next = adam(g[p], rate, geometry[place], moments[place], moments[second], update.adam);
             geometry[place] = next.x;
             moments[place] = next.y;
             moments[second] = next.z;

@@ -13,7 +13,7 @@ struct View {
     size: vec4u,
     // Splats, stride of a plane, SH degree in use, splats drawn.
     splats: vec4u,
-    // Visible splats and entries of tiles, known after projection; unused.
+    // Visible splats and entries of tiles, known after projection; entries for which there is room, and whether there are more.
     found: vec4u,
     // Bits of FLAG_*.
     flags: vec4u,

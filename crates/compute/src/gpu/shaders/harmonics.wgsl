@@ -1,4 +1,4 @@
-// View-dependent colour: the twin of `render/sh.rs`.
+// The sixteen real harmonics of four bands, in the order and signs of `irradia_scene::sh`.
 const C0: f32 = 0.28209479177387814;
 const C1: f32 = 0.4886025119029199;
 const C2: array<f32, 5> = array(1.0925484305920792, -1.0925484305920792, 0.31539156525252005, -1.0925484305920792, 0.5462742152960396);
@@ -84,11 +84,4 @@ fn basis_vjp(degree: u32, d: vec3f, v: ptr<function, array<f32, 16>>) -> vec3f {
         );
     }
     return g;
-}
-
-// Unit direction from the camera to the mean, and the inverse of the distance.
-fn direction(mean: vec3f) -> vec4f {
-    let d = mean - view.center.xyz;
-    let inv = 1.0 / sqrt(max(dot(d, d), 1e-24));
-    return vec4f(d * inv, inv);
 }

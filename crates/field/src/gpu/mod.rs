@@ -1,0 +1,358 @@
+//! Fields on any GPU: hash grids marched through an occupancy grid, as Instant-NGP has them (Mueller et al. 2022).
+//!
+//! A thread marches a ray, with densities evaluated in registers, until the ray is opaque. The samples of all rays then lie side by side,
+//! plane by plane, and go through encoding, networks and compositing, and back. One number is read back on the way, that of the
+//! samples: it determines the sizes of arrays here and the number of rays of the next batch on the host, and nothing is dropped.
+//! The occupancy grid belongs to the host, which asks for densities and returns bits.
+
+mod layout;
+mod training;
+mod view;
+
+pub(crate) use layout::Layout;
+pub use training::GpuFieldTraining;
+pub use view::GpuFieldRenderer;
+
+use crate::config::{FieldConfig, Sampler};
+use crate::encoding::{DirectionEncoding, PositionEncoding};
+use crate::field::Field;
+use crate::net::Activation;
+use crate::sample::march::Steps;
+use crate::shaders::Kernels;
+use crate::space::{Outside, Ray};
+use irradia_compute::DeviceError;
+use irradia_compute::gpu::{Array, Gpu, Scan, Work};
+use std::sync::Arc;
+
+/// Whether a field of `config` has a form on GPUs.
+pub fn supports(config: &FieldConfig) -> bool {
+    let net = &config.net;
+    let color = net
+        .color
+        .is_some_and(|color| color.direction == DirectionEncoding::Harmonics);
+    matches!(config.sampler, Sampler::Occupancy(_))
+        && matches!(net.encoding, PositionEncoding::HashGrid(_))
+        && color
+        && config.appearance() == 0
+        && net.skip.is_none()
+        // The layers that a thread evaluates in registers.
+        && (1..=4).contains(&net.depth)
+        && net.width <= 128
+}
+
+/// Threads of a workgroup over rays, and over samples.
+const RAYS: usize = 64;
+const SAMPLES: usize = 256;
+/// Words of a ray, and where its distances are: `ray.wgsl`.
+const RAY: usize = 20;
+const NEAR: usize = 3;
+const FAR: usize = 7;
+/// Samples of a ray at most: in normalised device coordinates, rays of other cameras than those of the capture may be of any length.
+const MOST_SAMPLES: usize = 1 << 14;
+
+/// The forward pass of a field.
+pub(crate) struct GpuField {
+    pub gpu: Arc<Gpu>,
+    pub kernels: Kernels,
+    pub layout: Layout,
+    steps: Steps,
+    /// Most samples of a ray of the last march.
+    most: usize,
+    /// What `task.wgsl` says of the field.
+    task_of_field: TaskOfField,
+    pub table: Array,
+    /// Parameters of the networks, layer by layer.
+    pub nets: Array,
+    pub background: Array,
+    bricks: Array,
+    pub task: Array,
+    /// A `Layer` of `layer.wgsl` each.
+    pub layers: Vec<Array>,
+    pub rays: Array,
+    middles: Array,
+    counts: Array,
+    pub starts: Array,
+    /// `[4, stride]`: points of the unit cube, and middles.
+    pub points: Array,
+    /// Inputs and outputs of all layers, `[rows, stride]`.
+    pub rows: Array,
+    scan: Scan,
+    scan_params: Array,
+    /// Samples that a plane has room for.
+    pub stride: usize,
+}
+
+struct TaskOfField {
+    space: [u32; 4],
+    rows: [u32; 4],
+    march: [u32; 4],
+    levels: Vec<[u32; 4]>,
+}
+
+/// Rays of a batch, and weights of the losses.
+pub(crate) struct Batch {
+    /// [`RAY`] words each.
+    pub rays: Vec<[f32; RAY]>,
+    /// Of a ray, and of a known distance.
+    pub weights: [f32; 2],
+}
+
+impl GpuField {
+    /// Compiles the kernels for `field` and uploads it.
+    ///
+    /// # Errors
+    /// When the device refuses a kernel, or has too little memory.
+    ///
+    /// # Panics
+    /// When the field has no form here: see [`supports`].
+    pub fn new(gpu: Arc<Gpu>, field: &Field) -> Result<Self, DeviceError> {
+        assert!(supports(&field.config), "a field with a form on GPUs");
+        let Sampler::Occupancy(options) = field.config.sampler else {
+            unreachable!("just checked");
+        };
+        let (net, layout) = (&field.nets[0], Layout::new(&field.nets[0]));
+        let side = field.occupancy.as_ref().map_or(0, |grid| grid.side);
+        let activation = match net.shape.activation {
+            Activation::Exp => 0,
+            Activation::Softplus => 1,
+            Activation::Relu => 2,
+        };
+        let is_contracted = field.space.outside == Outside::Contracted;
+        let coefficients = field.background.len() / 3;
+        let floats = [options.steps.shortest, options.steps.cone, net.shape.density_bias, 0.0];
+        let task_of_field = TaskOfField {
+            space: [side as u32, u32::from(is_contracted), activation, coefficients as u32],
+            rows: [layout.density_row, layout.direction_row, layout.rgb_row, 0].map(|row| row as u32),
+            march: floats.map(f32::to_bits),
+            levels: net
+                .levels
+                .iter()
+                .map(|level| {
+                    let [first, entries] = [level.first, level.entries].map(|n| n as u32);
+                    [level.cells, first, entries, u32::from(level.dense)]
+                })
+                .collect(),
+        };
+        let array = |label| Array::zeros(&gpu, label, 0);
+        let parameters = &field.parameters[0];
+        let made = Self {
+            kernels: Kernels::new(&gpu, &layout.constants(net)),
+            steps: options.steps,
+            most: 0,
+            task_of_field,
+            table: Array::zeros(&gpu, "the hash table's entries", parameters.table.len()),
+            nets: Array::zeros(&gpu, "networks", layout.parameters),
+            background: Array::zeros(&gpu, "background", field.background.len()),
+            bricks: Array::zeros(&gpu, "occupied cells", 2 * (side / 4).pow(3)),
+            task: Array::zeros(&gpu, "task", TASK),
+            layers: layout.layers.iter().map(|_| Array::zeros(&gpu, "layer", 16)).collect(),
+            rays: array("rays"),
+            middles: array("samples of rays"),
+            counts: array("numbers of samples"),
+            starts: array("first samples"),
+            points: array("points"),
+            rows: array("activations"),
+            scan: Scan::new(&gpu),
+            scan_params: Scan::params(&gpu),
+            stride: 0,
+            layout,
+            gpu,
+        };
+        made.upload(field);
+        made.gpu.check()?;
+        Ok(made)
+    }
+
+    /// Uploads the parameters and the occupancy grid of `field`, of the same shape.
+    fn upload(&self, field: &Field) {
+        let (gpu, parameters) = (&*self.gpu, &field.parameters[0]);
+        self.table.write(gpu, 0, &parameters.table);
+        self.nets.write(gpu, 0, &parameters.density);
+        self.nets.write(gpu, parameters.density.len(), &parameters.color);
+        self.background.write(gpu, 0, &field.background);
+        self.upload_occupancy(field);
+    }
+
+    /// Uploads the occupied cells.
+    pub fn upload_occupancy(&self, field: &Field) {
+        if let Some(grid) = &field.occupancy {
+            self.bricks.write(&self.gpu, 0, grid.bricks());
+        }
+    }
+
+    /// Marches along the rays of `batch`; returns the number of samples.
+    pub fn march(&mut self, batch: &Batch) -> usize {
+        let gpu = self.gpu.clone();
+        let rays = batch.rays.len();
+        self.rays.reserve(&gpu, RAY * rays);
+        self.rays.write(&gpu, 0, batch.rays.as_flattened());
+        self.most = self.most_samples(batch);
+        self.middles.reserve(&gpu, self.most * rays);
+        self.counts.reserve(&gpu, rays + 1);
+        self.starts.reserve(&gpu, rays + 1);
+        self.write_task(rays, 0, batch.weights);
+        let mut work = Work::new(&gpu);
+        // The count after the last ray's is 0, and its start the total.
+        work.clear(&self.counts, rays + 1);
+        let arrays = [
+            &self.task,
+            &self.rays,
+            &self.bricks,
+            &self.table,
+            &self.nets,
+            &self.middles,
+            &self.counts,
+        ];
+        work.run(&self.kernels.march, &arrays, rays.div_ceil(RAYS));
+        self.scan
+            .run(&mut work, &self.scan_params, &self.counts, &self.starts, rays + 1);
+        work.submit();
+        let mut total = [0u32];
+        self.starts.read(&gpu, rays, &mut total);
+        total[0] as usize
+    }
+
+    /// Most steps of a ray of `batch`.
+    pub fn most_samples(&self, batch: &Batch) -> usize {
+        let Steps { shortest, cone } = self.steps;
+        let spans = batch.rays.iter().map(|words| (words[NEAR], words[FAR]));
+        let most = spans.fold(0.0f32, |most, (near, far)| {
+            // Even steps up to here, then steps that grow with distance.
+            let even = if cone > 0.0 { (shortest / cone).max(near) } else { far };
+            let growing = if even < far {
+                (far / even).ln() / cone.ln_1p()
+            } else {
+                0.0
+            };
+            most.max((even.min(far) - near) / shortest + growing)
+        });
+        (most.ceil() as usize + 2).min(MOST_SAMPLES)
+    }
+
+    /// Makes room for the `samples` of the last march, that of `batch`.
+    pub fn prepare(&mut self, batch: &Batch, samples: usize) {
+        self.make_room(samples);
+        self.write_task(batch.rays.len(), samples, batch.weights);
+        self.write_layers(samples);
+    }
+
+    /// Makes room for `samples`.
+    fn make_room(&mut self, samples: usize) {
+        if samples > self.stride {
+            self.stride = (samples + samples / 4).next_multiple_of(64);
+            self.points.reserve(&self.gpu, 4 * self.stride);
+            self.rows.reserve(&self.gpu, self.layout.rows * self.stride);
+        }
+    }
+
+    /// Evaluates the samples of the last march.
+    pub fn evaluate(&self, work: &mut Work, rays: usize, samples: usize) {
+        let arrays = [
+            &self.task,
+            &self.rays,
+            &self.middles,
+            &self.starts,
+            &self.points,
+            &self.rows,
+        ];
+        work.run(&self.kernels.gather, &arrays, rays.div_ceil(RAYS));
+        self.encode(work, samples);
+        for layer in 0..self.layers.len() {
+            self.forward(work, layer, samples);
+        }
+    }
+
+    fn encode(&self, work: &mut Work, samples: usize) {
+        let groups = samples.div_ceil(SAMPLES) * self.levels();
+        let arrays = [&self.task, &self.points, &self.table, &self.rows];
+        work.run(&self.kernels.encode, &arrays, groups);
+    }
+
+    fn forward(&self, work: &mut Work, layer: usize, samples: usize) {
+        let groups = samples.div_ceil(SAMPLES) * (self.layout.layers[layer].padded / 8);
+        let arrays = [&self.layers[layer], &self.nets, &self.rows];
+        work.run(&self.kernels.dense, &arrays, groups);
+    }
+
+    /// Densities at points of the unit cube.
+    pub fn densities(&mut self, field: &Field, points: &[[f32; 3]]) -> Vec<f32> {
+        let gpu = self.gpu.clone();
+        let shape = &field.nets[0].shape;
+        let mut densities = Vec::with_capacity(points.len());
+        self.make_room(points.len().min(QUERIED));
+        for points in points.chunks(QUERIED) {
+            let samples = points.len();
+            for c in 0..3 {
+                let plane: Vec<f32> = points.iter().map(|point| point[c]).collect();
+                self.points.write(&gpu, c * self.stride, &plane);
+            }
+            self.write_task(0, samples, [0.0; 2]);
+            self.write_layers(samples);
+            let mut work = Work::new(&gpu);
+            self.encode(&mut work, samples);
+            for layer in 0..self.layout.densities {
+                self.forward(&mut work, layer, samples);
+            }
+            work.submit();
+            let begin = densities.len();
+            densities.resize(begin + samples, 0.0);
+            let row = self.layout.density_row * self.stride;
+            self.rows.read(&gpu, row, &mut densities[begin..]);
+        }
+        densities
+            .iter()
+            .map(|x| shape.activation.of(x + shape.density_bias))
+            .collect()
+    }
+
+    fn write_task(&self, rays: usize, samples: usize, weights: [f32; 2]) {
+        let of = &self.task_of_field;
+        let sizes = [rays, samples, self.stride, self.most].map(|n| n as u32);
+        let loss = [weights[0], weights[1], 0.0, 0.0].map(f32::to_bits);
+        let mut words = vec![sizes, of.space, of.rows, of.march, loss];
+        words.extend_from_slice(&of.levels);
+        self.task.write(&self.gpu, 0, &words);
+    }
+
+    fn write_layers(&self, samples: usize) {
+        for (array, layer) in self.layers.iter().zip(&self.layout.layers) {
+            array.write(&self.gpu, 0, &layer.words(samples, self.stride, self.layout.parameters));
+        }
+    }
+
+    /// The words of a ray: `goal` is what it shows or how its distances are measured, `behind` the background and whether a learnt one
+    /// takes precedence.
+    pub fn ray(ray: &Ray, offset: f32, goal: [f32; 4], behind: [f32; 4]) -> [f32; RAY] {
+        let mut words = [0.0; RAY];
+        let parts = [(&ray.origin, ray.near), (&ray.direction, ray.far), (&ray.view, offset)];
+        for (to, (vector, number)) in words.chunks_exact_mut(4).zip(parts) {
+            to[..3].copy_from_slice(vector);
+            to[3] = number;
+        }
+        words[12..16].copy_from_slice(&goal);
+        words[16..].copy_from_slice(&behind);
+        words
+    }
+
+    pub fn levels(&self) -> usize {
+        self.task_of_field.levels.len()
+    }
+
+    /// Rays of `batch` whose samples fit into one array before they are counted.
+    pub fn most_rays(&self, batch: &Batch) -> usize {
+        (self.gpu.info().largest_array / 4) as usize / self.most_samples(batch)
+    }
+
+    /// Samples whose activations fit into one array.
+    pub fn most_at_once(&self) -> usize {
+        (self.gpu.info().largest_array / 4) as usize / self.layout.rows * 4 / 5
+    }
+}
+
+/// Words of `Task` in `task.wgsl`.
+const TASK: usize = 4 * (5 + 32);
+/// Points of one evaluation of densities.
+const QUERIED: usize = 1 << 16;
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,24 @@
+// Features of points, a thread a sample and level. Twin: `encoding::hash_grid::encode_level`.
+@group(0) @binding(0) var<uniform> task: Task;
+@group(0) @binding(1) var<storage, read> points: array<f32>;
+@group(0) @binding(2) var<storage, read> table: array<f32>;
+@group(0) @binding(3) var<storage, read_write> rows: array<f32>;
+
+@compute @workgroup_size(256)
+fn main(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups: vec3u, @builtin(local_invocation_index) at: u32) {
+    let index = group_index(group, groups);
+    let s = index / LEVELS * 256u + at;
+    let level = index % LEVELS;
+    if s >= task.sizes.y {
+        return;
+    }
+    let stride = task.sizes.z;
+    var c = corners(task.levels[level], vec3f(points[s], points[stride + s], points[2u * stride + s]));
+    for (var f = 0u; f < FEATURES; f++) {
+        var x = 0.0;
+        for (var k = 0u; k < 8u; k++) {
+            x += table[c.entry[k] * FEATURES + f] * c.weight[k];
+        }
+        rows[(level * FEATURES + f) * stride + s] = x;
+    }
+}

@@ -1,0 +1,23 @@
+// Adds up the chunks' gradients in their order, and takes a step of Adam, a thread a parameter of the networks.
+@group(0) @binding(0) var<uniform> update: Update;
+@group(0) @binding(1) var<storage, read> sums: array<f32>;
+@group(0) @binding(2) var<storage, read_write> parameters: array<f32>;
+// Both moments, [2, parameters].
+@group(0) @binding(3) var<storage, read_write> moments: array<f32>;
+
+@compute @workgroup_size(64)
+fn main(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups: vec3u, @builtin(local_invocation_index) at: u32) {
+    let i = group_index(group, groups) * 64u + at;
+    let count = update.sizes.x;
+    if i >= count {
+        return;
+    }
+    var gradient = 0.0;
+    for (var chunk = 0u; chunk < update.sizes.y; chunk++) {
+        gradient += sums[chunk * count + i];
+    }
+    let stepped = adam(gradient, update.rate.x, parameters[i], moments[i], moments[count + i], update.rule);
+    parameters[i] = stepped.x;
+    moments[i] = stepped.y;
+    moments[count + i] = stepped.z;
+}

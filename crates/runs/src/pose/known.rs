@@ -1,0 +1,142 @@
+//! The dataset to which photographs are added.
+
+use super::is_film;
+use crate::RunError;
+use glam::{DQuat, DVec3};
+use irradia_formats::{ColmapCamera, ColmapImage, PhotoFolder, read_colmap_poses, read_photo_folder};
+use irradia_sfm::geometry::camera::DCamera;
+use irradia_sfm::geometry::pose::DPose;
+use irradia_sfm::map::{Known, PhotoInfo};
+use std::collections::HashMap;
+use std::path::{Path, PathBuf};
+
+/// Cameras and poses of a dataset in COLMAP's format.
+pub(super) struct KnownPoses {
+    data: PathBuf,
+    cameras: HashMap<u32, ColmapCamera>,
+    images: HashMap<String, ColmapImage>,
+}
+
+impl KnownPoses {
+    /// Reads the dataset in `data`.
+    pub fn read(data: &Path) -> Result<Self, RunError> {
+        let (cameras, images) = read_colmap_poses(data)?;
+        Ok(Self {
+            data: data.to_owned(),
+            cameras: cameras.into_iter().map(|camera| (camera.id, camera)).collect(),
+            images: images.into_iter().map(|image| (image.name.clone(), image)).collect(),
+        })
+    }
+
+    /// The dataset's photographs and those of `more`, by name.
+    pub fn with(&self, more: &Path) -> Result<PhotoFolder, RunError> {
+        if is_film(more) {
+            return Err(RunError::Refused(format!(
+                "{}: frames of a film are not added to a dataset: save them as photographs in a folder first",
+                more.display()
+            )));
+        }
+        let mut folder = read_photo_folder(&self.data.join("images"))?;
+        let present = |name: &&String| folder.photos.iter().any(|photo| photo.name == **name);
+        if let Some(name) = self.images.keys().filter(|name| !present(name)).min() {
+            return Err(RunError::Refused(format!(
+                "{} has a pose for {name}, which is not in its folder images",
+                self.data.display()
+            )));
+        }
+        let more = read_photo_folder(more)?;
+        let before = folder.photos.len();
+        folder.left_out.extend(more.left_out);
+        for photo in more.photos {
+            let reason = |other: &&irradia_formats::PhotoEntry| other.hash == photo.hash || other.name == photo.name;
+            match folder.photos.iter().find(reason) {
+                None => folder.photos.push(photo),
+                Some(other) if other.hash == photo.hash => {
+                    folder
+                        .left_out
+                        .push((photo.name, format!("in the dataset already, as {}", other.name)));
+                }
+                Some(_) => {
+                    let reason = "another photograph of the dataset has this name: rename it".to_owned();
+                    folder.left_out.push((photo.name, reason));
+                }
+            }
+        }
+        if folder.photos.len() == before {
+            return Err(RunError::Refused(format!(
+                "there is no photograph to add that {} does not have",
+                self.data.display()
+            )));
+        }
+        folder.photos.sort_by(|a, b| a.name.cmp(&b.name));
+        Ok(folder)
+    }
+
+    /// What is known of `photos`, whose groups become those of the dataset's cameras: new photographs join the camera of those that have
+    /// the same metadata.
+    pub fn of(&self, photos: &mut [PhotoInfo]) -> Result<Known, RunError> {
+        let of_photo: Vec<Option<&ColmapImage>> = photos.iter().map(|photo| self.images.get(&photo.name)).collect();
+        let mut camera_of_group: HashMap<usize, u32> = HashMap::new();
+        for (photo, image) in photos.iter().zip(&of_photo) {
+            if let Some(image) = image {
+                camera_of_group.entry(photo.group).or_insert(image.camera_id);
+            }
+        }
+        // The dataset's cameras by id, then groups of new photographs.
+        #[derive(PartialEq)]
+        enum Group {
+            Camera(u32),
+            New(usize),
+        }
+        let mut groups: Vec<Group> = Vec::new();
+        for (photo, image) in photos.iter_mut().zip(&of_photo) {
+            let camera = image.map(|image| image.camera_id);
+            let group = match camera.or_else(|| camera_of_group.get(&photo.group).copied()) {
+                Some(id) => Group::Camera(id),
+                None => Group::New(photo.group),
+            };
+            photo.group = groups.iter().position(|known| *known == group).unwrap_or_else(|| {
+                groups.push(group);
+                groups.len() - 1
+            });
+        }
+        let camera = |group: &Group| match group {
+            Group::Camera(id) => self.camera(*id).map(Some),
+            Group::New(_) => Ok(None),
+        };
+        Ok(Known {
+            poses: of_photo.iter().map(|image| image.map(pose)).collect(),
+            cameras: groups.iter().map(camera).collect::<Result<_, _>>()?,
+        })
+    }
+
+    fn camera(&self, id: u32) -> Result<DCamera, RunError> {
+        let refused = |what: String| RunError::Refused(format!("{}: {what}", self.data.display()));
+        let camera = self
+            .cameras
+            .get(&id)
+            .ok_or_else(|| refused(format!("camera {id} is missing")))?;
+        let parameters = match (camera.model.as_str(), &camera.params[..]) {
+            ("SIMPLE_PINHOLE", &[f, cx, cy]) => [f, f, cx, cy, 0.0, 0.0, 0.0, 0.0],
+            ("PINHOLE", &[fx, fy, cx, cy]) => [fx, fy, cx, cy, 0.0, 0.0, 0.0, 0.0],
+            ("SIMPLE_RADIAL", &[f, cx, cy, k1]) => [f, f, cx, cy, k1, 0.0, 0.0, 0.0],
+            ("RADIAL", &[f, cx, cy, k1, k2]) => [f, f, cx, cy, k1, k2, 0.0, 0.0],
+            ("OPENCV", &[fx, fy, cx, cy, k1, k2, p1, p2]) => [fx, fy, cx, cy, k1, k2, p1, p2],
+            (model, _) => {
+                return Err(refused(format!(
+                    "photographs cannot be added to cameras of the model {model}, only to pinhole cameras, RADIAL and OPENCV"
+                )));
+            }
+        };
+        Ok(DCamera {
+            width: camera.width as u32,
+            height: camera.height as u32,
+            parameters,
+        })
+    }
+}
+
+fn pose(image: &ColmapImage) -> DPose {
+    let [w, x, y, z] = image.rotation;
+    DPose::from_camera_from_world(DQuat::from_xyzw(x, y, z, w).normalize(), DVec3::from(image.translation))
+}

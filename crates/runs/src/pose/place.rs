@@ -1,0 +1,78 @@
+//! Metres from what the photographs' metadata say of their places.
+
+use super::stages::Work;
+use super::{PoseProgress, ScaleReport};
+use glam::DVec3;
+use irradia_formats::PhotoFolder;
+use irradia_sfm::map::{Model, to_metres};
+
+/// Equatorial radius of the earth and the square of its eccentricity (WGS 84), m.
+const RADIUS_M: f64 = 6_378_137.0;
+const ECCENTRICITY_SQUARED: f64 = 6.694_379_990_14e-3;
+
+/// Brings `model` to metres if enough photographs tell their place, and tells what is known of its scale.
+pub(super) fn scale(
+    folder: &PhotoFolder,
+    work: &Work,
+    model: &mut Model,
+    progress: &(dyn Fn(PoseProgress) + Sync),
+) -> Option<ScaleReport> {
+    let gps: Vec<Option<[f64; 3]>> = work.photos().iter().map(|i| folder.photos[*i].tags.gps).collect();
+    match to_metres(model, &local(&gps)) {
+        Ok(metric) => Some(ScaleReport {
+            photos: metric.photos,
+            with_place: metric.of,
+            residual_m: metric.residual_m,
+            scale_error: metric.scale_error,
+        }),
+        Err(Some(error)) => {
+            progress(PoseProgress::Warned(format!(
+                "the places of the photographs leave the scale open by {:.0} %: the unit of the poses is arbitrary",
+                100.0 * error.min(10.0)
+            )));
+            None
+        }
+        Err(None) => None,
+    }
+}
+
+/// East, north and up, m, of latitudes, longitudes and altitudes, about their mean: on the plane that touches the earth there.
+fn local(gps: &[Option<[f64; 3]>]) -> Vec<Option<DVec3>> {
+    let known: Vec<&[f64; 3]> = gps.iter().flatten().collect();
+    let mean = |k: usize| known.iter().map(|place| place[k]).sum::<f64>() / known.len().max(1) as f64;
+    let [latitude, longitude, altitude] = [0, 1, 2].map(mean);
+    let (sin, cos) = latitude.to_radians().sin_cos();
+    // Radii of curvature along the parallel and along the meridian.
+    let flattened = 1.0 - ECCENTRICITY_SQUARED * sin * sin;
+    let east = RADIUS_M / flattened.sqrt() * cos;
+    let north = RADIUS_M * (1.0 - ECCENTRICITY_SQUARED) / flattened.powf(1.5);
+    let place = |[lat, lon, up]: [f64; 3]| {
+        // Across the date line.
+        let around = (lon - longitude + 540.0).rem_euclid(360.0) - 180.0;
+        DVec3::new(
+            east * around.to_radians(),
+            north * (lat - latitude).to_radians(),
+            up - altitude,
+        )
+    };
+    gps.iter().map(|known| known.map(place)).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn degrees_become_metres() {
+        // A degree along the meridian at 45 degrees north is 111.13 km, along the parallel 78.85 km.
+        let places = local(&[Some([44.5, 7.5, 100.0]), None, Some([45.5, 8.5, 300.0])]);
+        let [Some(a), None, Some(b)] = places[..] else {
+            panic!("{places:?}");
+        };
+        let d = b - a;
+        assert!(
+            (d.x - 78_847.0).abs() < 10.0 && (d.y - 111_132.0).abs() < 10.0 && d.z == 200.0,
+            "{d}"
+        );
+    }
+}

@@ -1,0 +1,198 @@
+//! Metres from the places that the photographs' metadata tell.
+
+use super::types::Model;
+use crate::geometry::align::Alignment;
+use glam::{DQuat, DVec2, DVec3};
+
+/// Photographs with a place below which there is no scale.
+const LEAST_PHOTOS: usize = 5;
+/// Relative standard deviation of the scale above which it is not used.
+const COARSEST: f64 = 0.1;
+/// Distances, in medians of the distances of all photographs, up to which a photograph agrees with a fit.
+const AGREES: f64 = 3.0;
+/// Photographs of which all pairs are tried.
+const MOST_TRIED: usize = 150;
+/// Smallest error of a place that is assumed, m: metadata are rounded.
+const LEAST_ERROR_M: f64 = 0.1;
+
+/// The scale of a model, and how well it is known.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Metric {
+    /// Photographs whose places agree.
+    pub photos: usize,
+    /// Photographs with a place.
+    pub of: usize,
+    /// Root mean square of the horizontal distances between places and the model, m.
+    pub residual_m: f64,
+    /// Relative standard deviation of the scale.
+    pub scale_error: f64,
+}
+
+/// Brings an upright `model` to metres, with +X east and +Y north, by the `places` of its photographs `[photos]`: east, north and up of
+/// any origin, m. Its origin and up stay. Heights are not used, since satellites tell them poorly.
+///
+/// # Errors
+/// When too few photographs have a place (`None`), or the scale is known too poorly: its relative standard deviation.
+pub fn to_metres(model: &mut Model, places: &[Option<DVec3>]) -> Result<Metric, Option<f64>> {
+    let pairs: Vec<(DVec2, DVec2)> = model
+        .poses
+        .iter()
+        .zip(places)
+        .filter_map(|(pose, place)| Some((pose.as_ref()?.position.truncate(), place.as_ref()?.truncate())))
+        .collect();
+    if pairs.len() < LEAST_PHOTOS {
+        return Err(None);
+    }
+    let (turn, metric) = fit(&pairs).ok_or(Some(f64::INFINITY))?;
+    if !(metric.scale_error <= COARSEST) {
+        return Err(Some(metric.scale_error));
+    }
+    let alignment = Alignment {
+        scale: turn.length(),
+        rotation: DQuat::from_rotation_z(turn.y.atan2(turn.x)),
+        translation: DVec3::ZERO,
+    };
+    for pose in model.poses.iter_mut().flatten() {
+        *pose = alignment.pose(pose);
+    }
+    for point in &mut model.points {
+        point.position = alignment.point(point.position);
+    }
+    Ok(metric)
+}
+
+/// Scale and turn, as a complex number, from pairs (model, metres): the fit of two photographs with the least median distance of all,
+/// then least squares over those that agree with it.
+fn fit(pairs: &[(DVec2, DVec2)]) -> Option<(DVec2, Metric)> {
+    let mut best: Option<(f64, [DVec2; 2])> = None;
+    let tried: Vec<_> = pairs.iter().step_by(pairs.len().div_ceil(MOST_TRIED)).collect();
+    for (i, a) in tried.iter().enumerate() {
+        for b in &tried[i + 1..] {
+            let Some(fit) = least_squares(&[**a, **b]) else {
+                continue;
+            };
+            let mut distances: Vec<f64> = pairs.iter().map(|pair| distance(&fit, pair)).collect();
+            let middle = distances.len() / 2;
+            let median = *distances.select_nth_unstable_by(middle, f64::total_cmp).1;
+            if best.is_none_or(|(least, _)| median < least) {
+                best = Some((median, fit));
+            }
+        }
+    }
+    let (median, first) = best?;
+    let limit = AGREES * median.max(LEAST_ERROR_M);
+    let agreeing: Vec<(DVec2, DVec2)> = pairs
+        .iter()
+        .copied()
+        .filter(|pair| distance(&first, pair) <= limit)
+        .collect();
+    let fit = least_squares(&agreeing)?;
+    let n = agreeing.len() as f64;
+    let squares: f64 = agreeing.iter().map(|pair| distance(&fit, pair).powi(2)).sum();
+    let mean = agreeing.iter().map(|pair| pair.1).sum::<DVec2>() / n;
+    let spread: f64 = agreeing.iter().map(|pair| (pair.1 - mean).length_squared()).sum();
+    // Two coordinates a photograph, four numbers fitted.
+    let variance = squares / (2.0 * n - 4.0).max(1.0) + LEAST_ERROR_M * LEAST_ERROR_M;
+    let metric = Metric {
+        photos: agreeing.len(),
+        of: pairs.len(),
+        residual_m: (squares / n).sqrt(),
+        scale_error: (variance / spread).sqrt(),
+    };
+    (2 * agreeing.len() > pairs.len()).then_some((fit[0], metric))
+}
+
+fn product(a: DVec2, b: DVec2) -> DVec2 {
+    DVec2::new(a.x * b.x - a.y * b.y, a.x * b.y + a.y * b.x)
+}
+
+fn distance(fit: &[DVec2; 2], (from, to): &(DVec2, DVec2)) -> f64 {
+    (product(fit[0], *from) + fit[1] - *to).length()
+}
+
+/// `[turn, shift]` of `to = turn from + shift` in complex numbers; `None` for equal points.
+fn least_squares(pairs: &[(DVec2, DVec2)]) -> Option<[DVec2; 2]> {
+    let n = pairs.len() as f64;
+    let from_mean = pairs.iter().map(|p| p.0).sum::<DVec2>() / n;
+    let to_mean = pairs.iter().map(|p| p.1).sum::<DVec2>() / n;
+    let (mut cross, mut square) = (DVec2::ZERO, 0.0);
+    for (from, to) in pairs {
+        let from = *from - from_mean;
+        cross += product(DVec2::new(from.x, -from.y), *to - to_mean);
+        square += from.length_squared();
+    }
+    let turn = cross / square;
+    (turn.is_finite() && turn.length() > 0.0).then(|| [turn, to_mean - product(turn, from_mean)])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geometry::pose::DPose;
+    use crate::map::ModelPoint;
+    use irradia_scene::Rng;
+
+    /// `count` cameras on a circle of radius 1, and their places where a unit is 20 m and +X is 30 degrees north of east.
+    fn capture(count: usize, noise_m: f64) -> (Model, Vec<Option<DVec3>>) {
+        let mut rng = Rng::new(4, 4);
+        let turn = DQuat::from_rotation_z(30f64.to_radians());
+        let mut model = Model::default();
+        let mut places = Vec::new();
+        for i in 0..count {
+            let angle = 6.0 * i as f64 / count as f64;
+            let position = DVec3::new(angle.cos(), angle.sin(), 0.3);
+            let mut noise = || noise_m * f64::from(rng.normal());
+            places.push(Some(
+                20.0 * (turn * position) + DVec3::new(500.0 + noise(), -90.0 + noise(), 7.0 * noise()),
+            ));
+            model.poses.push(Some(DPose {
+                rotation: DQuat::from_rotation_x(0.2),
+                position,
+            }));
+        }
+        model.points.push(ModelPoint {
+            position: DVec3::new(1.0, 0.0, 0.5),
+            track: Vec::new(),
+            error: 0.0,
+        });
+        (model, places)
+    }
+
+    #[test]
+    fn places_give_scale_and_heading_in_spite_of_noise_and_wrong_ones() {
+        let (mut model, mut places) = capture(40, 1.0);
+        for place in places.iter_mut().step_by(5) {
+            *place = place.map(|place| place + DVec3::new(150.0, -300.0, 0.0));
+        }
+        places[1] = None;
+        let metric = to_metres(&mut model, &places).expect("a scale");
+        assert!((28..=31).contains(&metric.photos) && metric.of == 39, "{metric:?}");
+        assert!((0.5..2.0).contains(&metric.residual_m), "{metric:?}");
+        let point = model.points[0].position;
+        let expected = 20.0 * DVec3::new(30f64.to_radians().cos(), 30f64.to_radians().sin(), 0.5);
+        let off = (point - expected).length() / expected.length();
+        assert!(
+            off < 3.0 * metric.scale_error && metric.scale_error < 0.02,
+            "{off} {metric:?}"
+        );
+        let position = model.poses[3].expect("posed").position;
+        assert!(
+            (position.length() / 20.0 / 1.09f64.sqrt() - 1.0).abs() < 0.03,
+            "{position}"
+        );
+    }
+
+    #[test]
+    fn coarse_few_and_equal_places_change_nothing() {
+        let (mut model, places) = capture(30, 30.0);
+        let before = model.clone();
+        let error = to_metres(&mut model, &places)
+            .expect_err("too coarse")
+            .expect("an error");
+        assert!(error > 0.1, "{error}");
+        assert_eq!(to_metres(&mut model, &places[..3]), Err(None));
+        let nowhere = vec![Some(DVec3::ZERO); 30];
+        assert!(matches!(to_metres(&mut model, &nowhere), Err(Some(error)) if error > 0.1));
+        assert_eq!(model, before);
+    }
+}

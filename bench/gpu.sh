@@ -22,20 +22,23 @@ irradia=target/release/irradia
 } >"$rows"
 
 # Time to 27 dB on fox at full size, and to the same PSNR with `fast` on both devices.
-printf '\n| scene | device | steps | held-out PSNR dB | seconds of training |\n|---|---|---:|---:|---:|\n' >>"$rows"
+printf '\n| scene | recipe | device | steps | held-out PSNR dB | seconds of training |\n|---|---|---|---:|---:|---:|\n' >>"$rows"
 run() { # run SCENE DEVICE OPTION..
     local scene="$1" device="$2" out="$scratch/$1-$2"
     shift 2
     timeout 60 "$irradia" train "$data/$scene" --device "$device" --out "$out" --overwrite "$@" >/dev/null 2>&1 || return 0
     awk -v scene="$scene" -v device="$device" -F'[:,]' '
-        /^  "steps"/ { steps = $2 } /^  "psnr"/ { psnr = $2 } /^  "training_seconds"/ { seconds = $2 }
-        END { printf "| %s | %s |%d | %.2f | %.1f |\n", scene, device, steps, psnr, seconds }' "$out/report.json" >>"$rows"
+        /^  "recipe"/ { gsub(/[ "]/, "", $2); recipe = $2 } /^  "steps"/ { steps = $2 } /^  "psnr"/ { psnr = $2 } /^  "training_seconds"/ { seconds = $2 }
+        END { printf "| %s | %s | %s |%d | %.2f | %.1f |\n", scene, recipe, device, steps, psnr, seconds }' "$out/report.json" >>"$rows"
 }
 if [ -d "$data/fox" ]; then
     run fox gpu --full-size --until-psnr 27
     run fox cpu --full-size --until-psnr 27
     for scene in chair fern lund_door maryRose; do
         run "$scene" gpu --steps 1500
+    done
+    for device in gpu cpu; do
+        run chair "$device" --recipe hashgrid --steps 1000
     done
 fi
 

@@ -1,4 +1,4 @@
-use crate::Selection;
+use crate::{Photographs, Selection};
 use glam::{DVec3, Vec3};
 use irradia_scene::{Camera, GaussianCloud};
 use rayon::prelude::*;
@@ -17,6 +17,8 @@ pub struct Draft {
     pub locked: Selection,
     /// Splats that the last edit was made of.
     pub last: Selection,
+    /// What the cameras took, as long as the splats that are left are as trained.
+    pub photographs: Option<Photographs>,
 }
 
 impl Draft {
@@ -33,6 +35,7 @@ impl Draft {
             hidden: Selection::none(n),
             locked: Selection::none(n),
             last: Selection::none(n),
+            photographs: None,
         }
     }
 

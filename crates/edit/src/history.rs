@@ -1,6 +1,6 @@
 use crate::draft::{append, gather, scatter, truncate};
 use crate::plan::{Change, Plan};
-use crate::{Applied, Draft, Edit, EditError, EditList, Open, Provenance, Selection};
+use crate::{Applied, Draft, Edit, EditError, EditList, Open, Photographs, Provenance, Selection};
 use irradia_scene::{Camera, GaussianCloud, Similarity};
 
 /// A scene with the edits made on it, which can be undone step by step. Only what an edit changed or removed is kept for that.
@@ -108,6 +108,7 @@ struct Undo {
     hidden: Selection,
     locked: Selection,
     last: Selection,
+    photographs: Option<Photographs>,
 }
 
 impl Undo {
@@ -137,6 +138,7 @@ impl Undo {
             hidden: draft.hidden.clone(),
             locked: draft.locked.clone(),
             last: draft.last.clone(),
+            photographs: draft.photographs.clone(),
         }
     }
 
@@ -180,6 +182,7 @@ impl Undo {
         draft.hidden = self.hidden;
         draft.locked = self.locked;
         draft.last = self.last;
+        draft.photographs = self.photographs;
         if let Some(cameras) = self.cameras {
             draft.cameras = cameras;
         }

@@ -109,6 +109,16 @@ pub(crate) enum Change {
     Nothing,
 }
 
+impl Change {
+    /// Whether what is left of the scene does not look as in its photographs.
+    fn leaves_photographs_behind(&self) -> bool {
+        matches!(
+            self,
+            Self::Transform(..) | Self::Recolor(..) | Self::Fade(..) | Self::Append(..)
+        )
+    }
+}
+
 impl Plan {
     pub fn new(draft: &Draft, edit: &Edit, open: Open) -> Result<Self, EditError> {
         edit.check()?;
@@ -238,6 +248,9 @@ impl Plan {
         let (mut moved, mut split) = (None, None);
         let selected = self.selection.count();
         draft.last = self.selection;
+        if self.change.leaves_photographs_behind() {
+            draft.photographs = None;
+        }
         match self.change {
             Change::Remove(selection) => provenance = remove(draft, selection),
             Change::Split(selection, name) => {

@@ -27,6 +27,7 @@ impl FieldEngine {
     ///
     /// # Errors
     /// When the device refuses the kernels.
+    #[cfg_attr(not(feature = "gpu"), allow(unused_variables))]
     pub fn new(state: FieldState, device: &Device) -> Result<Self, DeviceError> {
         Ok(Self {
             #[cfg(feature = "gpu")]

@@ -2,6 +2,7 @@
 
 use crate::folder::{cameras_beside, cameras_moved};
 use crate::lock::FolderLock;
+use crate::photographs::photographs_of;
 use crate::scene_file::is_field;
 use crate::{RunError, RunFolder, SCENE, Scene, scene_of, write_image};
 use irradia_edit::{Applied, Draft, Edit, EditList, Provenance, Transform, apply};
@@ -53,9 +54,12 @@ impl Editing {
         }
         let file = read_splat_file(&path)?;
         let cameras = cameras_beside(&path, &file.cloud.world_from_dataset).unwrap_or_default();
+        let notes = file.warnings();
+        let mut draft = Draft::new(file.cloud, cameras);
+        draft.photographs = photographs_of(&path);
         Ok(Self {
-            notes: file.warnings(),
-            draft: Draft::new(file.cloud, cameras),
+            notes,
+            draft,
             path,
             list: EditList::default(),
             made: Vec::new(),

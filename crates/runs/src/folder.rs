@@ -433,6 +433,13 @@ pub(crate) fn cameras_beside(scene: &Path, world_from_dataset: &Similarity) -> O
     Some(records.iter().map(camera).collect())
 }
 
+/// The names of the views of [`cameras_beside`].
+pub(crate) fn camera_names_beside(scene: &Path) -> Option<Vec<String>> {
+    let text = fs::read_to_string(scene.with_file_name("cameras.json")).ok()?;
+    let records: Vec<CameraRecord> = serde_json::from_str(&text).ok()?;
+    Some(records.into_iter().map(|record| record.name).collect())
+}
+
 /// The content of `cameras.json` beside the file `scene`, if there is one, after a move of the whole scene in the dataset's coordinates.
 pub(crate) fn cameras_moved(scene: &Path, moved: &Transform) -> Option<Vec<u8>> {
     let text = fs::read(scene.with_file_name("cameras.json")).ok()?;

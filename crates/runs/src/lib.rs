@@ -54,6 +54,7 @@ mod levels;
 mod lock;
 mod orbit;
 mod path;
+mod photographs;
 mod pose;
 mod protocol;
 mod provenance;
@@ -81,9 +82,10 @@ pub use journal::logged_errors;
 pub use levels::{LEVELS, Level, level_file, read_levels, write_levels};
 pub use orbit::Outlook;
 pub use path::{CameraPath, Film, PathKey};
+pub use photographs::photographs_of;
 pub use pose::{
-    CameraReport, DoctorInput, DoctorReport, Finding, LeftOutPhoto, PoseInput, PoseProgress, PoseReport, ScaleReport,
-    StageReport, doctor, is_film, pose,
+    CameraReport, DoctorInput, DoctorReport, Finding, LeftOutPhoto, Mapper, PoseInput, PoseProgress, PoseReport,
+    ScaleReport, StageReport, doctor, is_film, pose,
 };
 pub use protocol::Protocol;
 pub use provenance::{data_fingerprint, program_fingerprint};

@@ -149,7 +149,7 @@ pub(crate) fn residual_beside(scene: &Path) -> Result<Option<Field>, RunError> {
 }
 
 /// Background and antialiasing of the run that contains `scene`; otherwise the defaults.
-fn render_knobs_beside(scene: &Path) -> RenderKnobs {
+pub(crate) fn render_knobs_beside(scene: &Path) -> RenderKnobs {
     let fallback = RenderKnobs {
         background: [0.0; 3],
         antialias: false,

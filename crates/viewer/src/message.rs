@@ -2,7 +2,7 @@
 //! little endian), the header, a JPEG.
 
 use glam::{Quat, Vec3};
-use irradia_edit::{Edit, EditError, Operation, SelectStep};
+use irradia_edit::{Edit, EditError, EditList, Operation, SelectStep};
 use irradia_scene::{Camera, Intrinsics, Pose};
 use serde::{Deserialize, Serialize};
 
@@ -204,6 +204,11 @@ pub enum EditRequest {
         /// What is done.
         edit: Operation,
     },
+    /// Make the edits of a list.
+    Replay {
+        /// `edits.toml`.
+        list: String,
+    },
     /// Undo the last selection or edit.
     Undo,
     /// Make it again.
@@ -254,6 +259,15 @@ impl EditRequest {
                 edit: Operation::Merge { .. },
                 ..
             } => Err(EditError::Selection("a page merges no files".to_owned())),
+            Self::Replay { list } => {
+                let merges = |edit: &Edit| matches!(edit.op, Operation::Merge { .. });
+                match EditList::parse(list)?.edits.iter().any(merges) {
+                    true => Err(EditError::Selection(
+                        "a page merges no files: make these edits with irradia edit --edits".to_owned(),
+                    )),
+                    false => Ok(()),
+                }
+            }
             Self::Edit { whole, edit, .. } => {
                 let edit = Edit {
                     op: edit.clone(),

@@ -2,9 +2,9 @@
 
 use crate::{cameras, make};
 use glam::{Quat, Vec3};
-use irradia_edit::{Draft, floater_scores};
-use irradia_scene::{GaussianCloud, Rng, sh};
-use irradia_splat::logit;
+use irradia_edit::{Draft, Photographs, Taken, floater_scores};
+use irradia_scene::{GaussianCloud, Photo, Rng, sh};
+use irradia_splat::{RenderOptions, Renderer, Splats, ViewParams, logit};
 
 const KINDS: [&str; 5] = ["isolated", "needle", "huge", "unseen", "in front"];
 /// Floaters of a kind.
@@ -154,4 +154,71 @@ fn without_cameras_geometry_finds_what_it_can() {
     // What is far from everything; not what only a view shows to be in front, or large for a camera.
     let unseen = found(n + 3 * EACH..n + 4 * EACH);
     assert!(unseen >= 90, "{unseen}");
+}
+
+/// What the cameras of `draft` see of it.
+fn photographs(draft: &Draft) -> Photographs {
+    let splats = Splats::from_cloud(&draft.cloud);
+    let mut renderer = Renderer::new();
+    let mut photo = |(number, camera)| {
+        renderer.render(&splats, &ViewParams::new(camera), &RenderOptions::default());
+        let (pixels, color) = (renderer.alpha().len(), renderer.color());
+        let byte = |at: usize| (255.0 * color[at % 3 * pixels + at / 3].clamp(0.0, 1.0)).round() as u8;
+        let taken = Photo {
+            width: camera.intrinsics.width,
+            height: camera.intrinsics.height,
+            channels: 3,
+            data: (0..3 * pixels).map(byte).collect(),
+            mask: None,
+        };
+        (number, taken)
+    };
+    let photos = draft.cameras.iter().enumerate().map(&mut photo).collect();
+    Photographs::new(move || {
+        Some(Taken {
+            photos,
+            background: [0.0; 3],
+        })
+    })
+}
+
+/// By its shape alone a part of a plain wall is a veil.
+#[test]
+fn photographs_tell_a_wall_from_a_veil() {
+    let mut clean = scene(1.0);
+    let wall = clean.len();
+    let flat = [4.0, 4.0, 0.02];
+    push(
+        &mut clean.cloud,
+        Vec3::new(0.0, 0.0, 5.8),
+        flat,
+        Quat::IDENTITY,
+        0.6,
+        0.9,
+    );
+    let clean = Draft::new(clean.cloud, clean.cameras);
+    let mut planted = plant(&clean, 1.0);
+    let veils = wall + 1 + 2 * EACH..wall + 1 + 3 * EACH;
+    let is_found = |draft: &Draft| {
+        let scores: Vec<f32> = floater_scores(draft).iter().map(|score| score.score()).collect();
+        let found = scores[veils.clone()].iter().filter(|score| **score >= 1.0).count();
+        (
+            scores[wall] >= 1.0,
+            found,
+            scores[..wall].iter().filter(|score| **score >= 1.0).count(),
+        )
+    };
+    let (wall_is_found, ..) = is_found(&planted);
+    assert!(wall_is_found, "by its size alone");
+    planted.photographs = Some(photographs(&clean));
+    let (wall_is_found, found, lost) = is_found(&planted);
+    assert!(
+        !wall_is_found && found >= 95 && lost * 100 <= wall,
+        "{wall_is_found} {found} {lost}"
+    );
+    // What looks different from its photographs is not judged by them; deleting leaves the rest as it was.
+    crate::make(&mut planted, "delete sphere center=0,0,0 radius=0.1");
+    assert!(planted.photographs.is_some());
+    crate::make(&mut planted, "recolor exposure=1");
+    assert!(planted.photographs.is_none());
 }

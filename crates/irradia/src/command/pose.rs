@@ -7,7 +7,7 @@ use anyhow::Result;
 use clap::builder::RangedU64ValueParser;
 use indicatif::{ProgressBar, ProgressStyle};
 use irradia_runs::formats::{DatasetFormat, has_photos};
-use irradia_runs::{Finding, PoseInput, PoseProgress, PoseReport, TrainInput, is_film, pose};
+use irradia_runs::{Finding, Mapper, PoseInput, PoseProgress, PoseReport, TrainInput, is_film, pose};
 use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
@@ -30,6 +30,9 @@ pub struct Args {
     /// Adds the photographs to this dataset, in COLMAP's format, whose poses and cameras stay as they are
     #[arg(long, value_name = "DATA", conflicts_with = "out")]
     pub into: Option<PathBuf>,
+    /// Who finds the poses: irradia, or colmap, if it is installed
+    #[arg(long, value_name = "WHO", default_value = "irradia", value_enum)]
+    pub poses: Poses,
     /// Maximum number of features of a photograph; 4096 when absent
     #[arg(long, value_name = "N", value_parser = RangedU64ValueParser::<usize>::new().range(1..=65_536))]
     pub max_features: Option<usize>,
@@ -38,12 +41,29 @@ pub struct Args {
     pub threads: Option<usize>,
 }
 
+/// Who finds poses.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+pub enum Poses {
+    Irradia,
+    Colmap,
+}
+
+impl From<Poses> for Mapper {
+    fn from(poses: Poses) -> Self {
+        match poses {
+            Poses::Irradia => Mapper::Irradia,
+            Poses::Colmap => Mapper::Colmap,
+        }
+    }
+}
+
 pub fn run(args: &Args) -> Result<()> {
     use_threads(args.threads)?;
     let data = args.into.as_ref().or(args.out.as_ref());
     let data = data.expect("clap requires one of them");
     let mut input = PoseInput::new(&args.photos, data);
     input.into = args.into.is_some();
+    input.mapper = args.poses.into();
     input.max_features = args.max_features.unwrap_or(input.max_features);
     let report = pose_with_progress(&input)?;
     say(summary(&report))?;
@@ -59,7 +79,7 @@ pub fn is_unposed(data: &Path) -> bool {
 }
 
 /// Poses the photographs of `input` into the folder `posed` of its run, and makes that its dataset.
-pub fn pose_first(input: &mut TrainInput, anyway: bool) -> Result<()> {
+pub fn pose_first(input: &mut TrainInput, poses: Poses, anyway: bool) -> Result<()> {
     let posed = input.out.join("posed");
     let data = std::mem::replace(&mut input.data, posed.clone());
     note(format_args!(
@@ -67,7 +87,11 @@ pub fn pose_first(input: &mut TrainInput, anyway: bool) -> Result<()> {
         data.display(),
         posed.display()
     ));
-    let report = pose_with_progress(&PoseInput::new(data, &posed))?;
+    let request = PoseInput {
+        mapper: poses.into(),
+        ..PoseInput::new(data, &posed)
+    };
+    let report = pose_with_progress(&request)?;
     note(summary(&report));
     if report.fraction() < ENOUGH && !anyway {
         let reasons: Vec<&str> = report
@@ -77,11 +101,14 @@ pub fn pose_first(input: &mut TrainInput, anyway: bool) -> Result<()> {
             .map(|f| f.sentence.as_str())
             .collect();
         let first = reasons.first().map_or(String::new(), |first| format!(" {first};"));
+        let doctor = posed.join("doctor.html");
+        let see = match doctor.exists() {
+            true => format!(" see {};", doctor.display()),
+            false => String::new(),
+        };
         return Err(Usage(format!(
-            "only {} of {} photographs have poses:{first} see {}; add photographs between them and the others, or train --anyway",
-            report.registered,
-            report.photos,
-            posed.join("doctor.html").display()
+            "only {} of {} photographs have poses:{first}{see} add photographs between them and the others, or train --anyway",
+            report.registered, report.photos,
         ))
         .into());
     }

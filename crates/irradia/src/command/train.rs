@@ -1,7 +1,7 @@
 //! `irradia train`
 
 use super::lpips::{self, lpips_path, unseen_lpips_path};
-use super::pose::{is_unposed, pose_first};
+use super::pose::{Poses, is_unposed, pose_first};
 use super::progress::{Progress, size_in_words};
 use super::view::ListenArgs;
 use super::{DataArgs, by_option, thread_count, use_threads, warn};
@@ -30,6 +30,9 @@ pub struct Args {
     /// Begin with the splats of this scene, a file or a run's folder, in the coordinates of the photographs, instead of points
     #[arg(long, value_name = "SCENE", conflicts_with = "resume")]
     pub from: Option<PathBuf>,
+    /// Who finds the poses of photographs that have none: irradia, or colmap, if it is installed
+    #[arg(long, value_name = "WHO", default_value = "irradia", value_enum)]
+    pub poses: Poses,
     /// Train although fewer than 80 % of the photographs could be posed
     #[arg(long)]
     pub anyway: bool,
@@ -143,7 +146,7 @@ pub fn run(args: &Args) -> Result<()> {
                 // Posing takes a while: mistakes are reported first.
                 input.clone().check().map_err(by_option)?;
                 RunFolder::check_free(&input.out, input.overwrite)?;
-                pose_first(&mut input, args.anyway)?;
+                pose_first(&mut input, args.poses, args.anyway)?;
             }
             begin(input, args.viewer())
         }

@@ -8,6 +8,7 @@
 //! features.bin     features and matches, which are reused as long as photographs do not change
 //! ```
 
+mod colmap;
 mod doctor;
 mod film;
 mod known;
@@ -48,6 +49,10 @@ pub struct PoseInput {
     pub out: PathBuf,
     /// Whether the photographs are added to the dataset in `out`, in COLMAP's format, whose poses and cameras stay as they are.
     pub into: bool,
+    /// Who finds the poses.
+    pub mapper: Mapper,
+    /// The program that [`Mapper::Colmap`] runs.
+    pub colmap: String,
     /// The most features of a photograph, at least 1.
     pub max_features: usize,
     /// How to verify and map.
@@ -61,10 +66,22 @@ impl PoseInput {
             photos: photos.into(),
             out: out.into(),
             into: false,
+            mapper: Mapper::default(),
+            colmap: "colmap".to_owned(),
             max_features: Sift::default().max_features,
             mapping: MapOptions::default(),
         }
     }
+}
+
+/// Who finds poses.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Mapper {
+    /// This program.
+    #[default]
+    Irradia,
+    /// COLMAP, which must be installed; photographs that it leaves out have no other reason.
+    Colmap,
 }
 
 /// What [`pose`] is doing.
@@ -84,7 +101,7 @@ pub enum PoseProgress {
 }
 
 /// What became of the photographs; `pose.json`.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct PoseReport {
     /// Pictures found.
     pub photos: usize,
@@ -163,7 +180,7 @@ pub struct ScaleReport {
 /// Time of a stage.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct StageReport {
-    /// `photographs`, `frames`, `features`, `matches`, `poses`, `doctor` or `writing`.
+    /// `photographs`, `frames`, `features`, `matches`, `poses`, `doctor`, `writing` or `colmap`.
     pub name: &'static str,
     /// Wall time.
     pub seconds: f64,
@@ -201,6 +218,21 @@ pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Resu
     };
     check_enough(&input.photos, &folder)?;
     clock.end("photographs");
+    if input.mapper == Mapper::Colmap {
+        if input.into {
+            return Err(RunError::setting(
+                "mapper",
+                "colmap",
+                "adds nothing to a dataset: leave --into or --poses colmap out",
+            ));
+        }
+        let mut report = colmap::run(input, &folder, progress)?;
+        clock.end("colmap");
+        report.stages = clock.stages;
+        report.seconds = started.elapsed().as_secs_f64();
+        write_atomic(&out.join(REPORT), |file| file.write_all(&to_json(&report)))?;
+        return Ok(report);
+    }
 
     let mut work = Work::new(input.max_features, Some(out), &folder, progress);
     work.find_features()?;

@@ -4,7 +4,8 @@ use super::stages::Work;
 use super::{CameraReport, LeftOutPhoto, PoseReport};
 use crate::RunError;
 use irradia_formats::{
-    ColmapCamera, ColmapImage, ColmapModel, ColmapPoint, PhotoFolder, PosedImage, TrackedPoint, write_colmap,
+    ColmapCamera, ColmapImage, ColmapModel, ColmapPoint, PhotoEntry, PhotoFolder, PosedImage, TrackedPoint,
+    write_colmap,
 };
 use irradia_sfm::geometry::camera::DCamera;
 use irradia_sfm::map::{Model, PhotoInfo, Reconstruction};
@@ -23,14 +24,7 @@ pub(super) fn write(
     fs::create_dir_all(&images).map_err(RunError::io("create", &images))?;
     for (photo, i) in work.photos().iter().enumerate() {
         if found.models.iter().any(|model| model.poses[photo].is_some()) {
-            let entry = &folder.photos[*i];
-            link(&entry.path, &images.join(&entry.name))?;
-            if let Some(mask) = &entry.mask {
-                let masks = out.join("masks");
-                fs::create_dir_all(&masks).map_err(RunError::io("create", &masks))?;
-                let extension = mask.extension().unwrap_or_default().to_string_lossy();
-                link(mask, &masks.join(format!("{}.{extension}", entry.name)))?;
-            }
+            link_photo(out, &folder.photos[*i])?;
         }
     }
     let sparse = out.join("sparse");
@@ -48,6 +42,18 @@ pub(super) fn write(
         fs::remove_dir_all(&sparse).map_err(RunError::io("clear", &sparse))?;
     }
     fs::rename(&written, &sparse).map_err(RunError::io("rename", &written))
+}
+
+/// Brings a photograph and its mask into the folders `images`, which exists, and `masks` of the dataset.
+pub(super) fn link_photo(out: &Path, photo: &PhotoEntry) -> Result<(), RunError> {
+    link(&photo.path, &out.join("images").join(&photo.name))?;
+    if let Some(mask) = &photo.mask {
+        let masks = out.join("masks");
+        fs::create_dir_all(&masks).map_err(RunError::io("create", &masks))?;
+        let extension = mask.extension().unwrap_or_default().to_string_lossy();
+        link(mask, &masks.join(format!("{}.{extension}", photo.name)))?;
+    }
+    Ok(())
 }
 
 /// Makes `to` the file `from`: a hard link where the file system allows it, else a copy.

@@ -3,7 +3,7 @@
 use irradia_runs::formats::{DatasetFormat, DatasetOptions, read_dataset, read_image, write_png};
 use irradia_runs::scene::Camera;
 use irradia_runs::synth::{Capture, Part, SynthOptions};
-use irradia_runs::{DoctorInput, Finding, PoseInput, PoseProgress, PoseReport, RunError, doctor, pose};
+use irradia_runs::{DoctorInput, Finding, Mapper, PoseInput, PoseProgress, PoseReport, RunError, doctor, pose};
 use irradia_testkit::shared;
 use std::fs;
 use std::path::Path;
@@ -269,4 +269,64 @@ fn photographs_are_added_to_a_dataset_whose_poses_stay() {
     nowhere.into = true;
     let error = quietly(&nowhere).unwrap_err().to_string();
     assert!(error.contains("no COLMAP model"), "{error}");
+}
+
+#[cfg(unix)]
+#[test]
+fn colmap_is_driven_with_the_options_that_it_knows() {
+    use std::os::unix::fs::PermissionsExt;
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    fs::create_dir(at("photos")).unwrap();
+    photographs(&at("photos"));
+    // What it would have made.
+    quietly(&PoseInput::new(at("photos"), at("ours"))).unwrap();
+    let colmap = |option: &str| {
+        let script = format!(
+            "#!/bin/sh\nif [ \"$2\" = -h ]; then echo '  --{option} arg (=1)'; exit; fi\necho \"$@\" >> {log}\n\
+             if [ \"$1\" = mapper ]; then cp -r {ours}/0 \"$7\"; fi\n",
+            log = at("log").display(),
+            ours = at("ours").join("sparse").display(),
+        );
+        fs::write(at("colmap"), script).unwrap();
+        fs::set_permissions(at("colmap"), fs::Permissions::from_mode(0o755)).unwrap();
+    };
+    let mut input = PoseInput::new(at("photos"), at("theirs"));
+    input.mapper = Mapper::Colmap;
+    input.colmap = at("none").display().to_string();
+    let error = quietly(&input).unwrap_err().to_string();
+    assert!(error.contains("install COLMAP"), "{error}");
+    input.colmap = at("colmap").display().to_string();
+    // Old and new names of the same option.
+    for option in ["SiftExtraction.use_gpu", "FeatureExtraction.use_gpu"] {
+        colmap(option);
+        let report = quietly(&input).unwrap();
+        assert!(report.registered >= 30 && report.points > 500, "{report:?}");
+        let log = fs::read_to_string(at("log")).unwrap();
+        let steps: Vec<&str> = log.lines().rev().take(3).collect();
+        assert!(
+            steps[2].starts_with("feature_extractor") && steps[2].contains(&format!("--{option} 0")),
+            "{log}"
+        );
+        assert!(
+            !steps[2].contains("single_camera"),
+            "an option that it does not know: {log}"
+        );
+        assert!(
+            steps[1].starts_with("exhaustive_matcher") && steps[0].starts_with("mapper"),
+            "{log}"
+        );
+    }
+    let dataset = read_dataset(&at("theirs"), &DatasetOptions::default()).unwrap();
+    assert!(dataset.views.len() >= 30);
+    fs::write(
+        at("colmap"),
+        "#!/bin/sh\n[ \"$2\" = -h ] && exit\n[ $1 = help ] && exit\necho first >&2\necho 'out of luck' >&2\nexit 3\n",
+    )
+    .unwrap();
+    let error = quietly(&input).unwrap_err().to_string();
+    assert!(
+        error.contains("feature_extractor failed") && error.ends_with("out of luck"),
+        "{error}"
+    );
 }

@@ -49,6 +49,55 @@ async function drag(page, points, modifiers = []) {
 
 const LASSO = [[0.35, 0.3], [0.65, 0.3], [0.68, 0.6], [0.5, 0.7], [0.33, 0.6], [0.35, 0.32]];
 
+test("what is beside a line or beyond a plane is selected, and a list of edits is opened", async () => {
+  const scene = copy("cut");
+  const server = await serve("view", scene, "--port", "0");
+  const { page, problems } = await open(browser, server.address);
+  await set(page, { drawing: "served", axes: false });
+  await page.getByRole("tab", { name: "Edit" }).click();
+  await sharp(page);
+  await page.getByRole("button", { name: "Cut" }).click();
+  // Drawn upwards through the middle, then downwards: the two halves.
+  await drag(page, [[0.5, 0.8], [0.5, 0.2]]);
+  await edited(page, (e) => e.at === 1);
+  const [left, all] = await get(page, "editing").then((e) => [e.selected, e.of]);
+  await drag(page, [[0.5, 0.2], [0.5, 0.8]], ["Shift"]);
+  await edited(page, (e) => e.at === 2);
+  assert.ok(left > 0 && left < all, `${left} of ${all}`);
+  assert.equal((await get(page, "editing")).selected, all, "both together");
+  await page.getByLabel("Select by a measure").selectOption("farther");
+  await edited(page, (e) => e.at === 3);
+  const far = (await get(page, "editing")).selected;
+  assert.ok(far > 0, `${far}`);
+
+  await page.getByLabel("edits.toml", { exact: true }).setInputFiles({
+    name: "edits.toml", mimeType: "text/plain", buffer: Buffer.from(`version = 1
+[[edits]]
+op = "delete"
+[[edits.select]]
+shape = "half-space"
+point = [0, 0, 0]
+normal = [1, 0, 0]
+[[edits]]
+op = "scale"
+factor = 2
+`),
+  });
+  await edited(page, (e) => e.at === 5 && e.of < 1e9);
+  const { of } = await get(page, "editing");
+  assert.ok(of > 0 && of < all, `${of} of ${all} are left`);
+  const replayed = join(scratch, "cut.ply");
+  const said = run("edit", join(scene, "scene.ply"), "-o", replayed, "delete half-space point=0,0,0 normal=1,0,0", "scale factor=2");
+  if (said) assert.match(said, new RegExp(`: ${of} splats`));
+  await page.getByRole("button", { name: "Undo" }).click();
+  await page.getByRole("button", { name: "Undo" }).click();
+  await edited(page, (e) => e.at === 3 && e.of === all);
+  await page.getByLabel("edits.toml", { exact: true }).setInputFiles({ name: "edits.toml", mimeType: "text/plain", buffer: Buffer.from("nonsense") });
+  await until(page, async () => document.body.innerText.includes("TOML") || document.body.innerText.includes("list"));
+  assert.deepEqual(problems, []);
+  await server.stop();
+});
+
 test("a lasso, a brush and a deletion; undo, save and download agree with the program", async () => {
   const scene = copy("edited");
   const server = await serve("view", scene, "--port", "0");

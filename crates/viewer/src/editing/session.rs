@@ -228,25 +228,42 @@ impl Session {
             if !whole && session.selected.is_empty() {
                 return Err(EditError::Selection("nothing is selected".to_owned()));
             }
-            if let Operation::Split { name } = &mut op {
-                let parts = session
-                    .edits()
-                    .filter(|edit| matches!(edit.op, Operation::Split { .. }));
-                *name = format!("part-{}", parts.count() + 1);
-            }
-            let edit = Edit {
-                op,
-                select: (!whole).then(|| session.steps.clone()),
-            };
-            let mut draft = (*session.draft).clone();
-            let applied = apply(&mut draft, &edit, &open_nothing)?;
-            let text = edit_text(&applied.edit.op, applied.selected, session.draft.len(), draft.len());
-            session.push(gesture, text, Deed::Edit(applied.edit, applied.moved));
-            session.set_draft(Arc::new(draft));
-            session.steps = session.steps_at(session.at);
-            session.selected = Arc::new(select(&session.draft, &session.steps)?);
-            Ok(())
+            let select = (!whole).then(|| session.steps.clone());
+            session.make(gesture, Edit { op, select })
         })
+    }
+
+    /// Makes the edits of a list, in the dataset's coordinates; each is an entry.
+    ///
+    /// # Errors
+    /// When one is not possible; those before it have been made.
+    pub fn replay(&mut self, list: &EditList) -> Result<(), EditError> {
+        for (i, edit) in list.edits.iter().enumerate() {
+            let made = self
+                .has_room(edit.select.as_deref().unwrap_or_default())
+                .and_then(|()| self.make(0, edit.clone()));
+            made.map_err(|reason| EditError::InList {
+                number: i + 1,
+                reason: Box::new(reason),
+            })?;
+        }
+        Ok(())
+    }
+
+    /// Makes an edit and adds it to the list.
+    fn make(&mut self, gesture: u64, mut edit: Edit) -> Result<(), EditError> {
+        if let Operation::Split { name } = &mut edit.op {
+            let parts = self.edits().filter(|edit| matches!(edit.op, Operation::Split { .. }));
+            *name = format!("part-{}", parts.count() + 1);
+        }
+        let mut draft = (*self.draft).clone();
+        let applied = apply(&mut draft, &edit, &open_nothing)?;
+        let text = edit_text(&applied.edit.op, applied.selected, self.draft.len(), draft.len());
+        self.push(gesture, text, Deed::Edit(applied.edit, applied.moved));
+        self.set_draft(Arc::new(draft));
+        self.steps = self.steps_at(self.at);
+        self.selected = Arc::new(select(&self.draft, &self.steps)?);
+        Ok(())
     }
 
     fn has_room(&self, steps: &[SelectStep]) -> Result<(), EditError> {
@@ -589,6 +606,30 @@ mod tests {
         }
         session.select(9, true, ball(0.0, 0.5)).expect("a ball");
         assert_eq!(session.entries().len(), 1, "what was undone is forgotten");
+    }
+
+    #[test]
+    fn a_list_that_is_opened_gives_the_scene_of_which_it_was_written() {
+        let mut session = session(8);
+        session.select(1, true, ball(2.0, 1.2)).expect("a ball");
+        session.edit(2, false, Operation::Delete {}).expect("deleted");
+        let scale = Operation::Scale {
+            factor: 2.0,
+            about: None,
+        };
+        session.edit(3, true, scale).expect("scaled");
+        let list = session.list();
+        let mut opened = super::tests::session(8);
+        opened.replay(&list).expect("the same edits");
+        assert_eq!(opened.draft(), session.draft());
+        assert_eq!((opened.at(), opened.list()), (2, list.clone()), "an entry each");
+        opened.go(0).expect("undone");
+        assert_eq!(opened.draft(), opened.original());
+        // One that fails tells which; those before it are made.
+        let mut broken = list.clone();
+        broken.edits.push("upright".parse().expect("an edit"));
+        let error = opened.replay(&broken).expect_err("no cameras").to_string();
+        assert!(error.contains('3') && opened.at() == 2, "{error}");
     }
 
     #[test]

@@ -5,9 +5,9 @@ use super::session::Session;
 use super::{Editing, EditingError};
 use crate::message::EditRequest;
 use crate::subject::Subject;
-use irradia_edit::{Draft, Selection, Transform};
-use irradia_runs::Scene;
+use irradia_edit::{Draft, EditList, Selection, Transform};
 use irradia_runs::formats::read_splats;
+use irradia_runs::{Scene, photographs_of};
 use irradia_splat::{RenderOptions, Splats};
 use serde_json::{Value, json};
 use std::sync::Arc;
@@ -69,7 +69,9 @@ impl Bench {
         let edition = subject.edition();
         let scene = edition.as_ref().map(|edition| edition.scene());
         let cameras = scene.and_then(|scene| scene.cameras.as_deref()).unwrap_or_default();
-        let session = Session::new(Draft::new(cloud, cameras.to_vec()));
+        let mut draft = Draft::new(cloud, cameras.to_vec());
+        draft.photographs = photographs_of(&editing.source);
+        let session = Session::new(draft);
         let drawn = scene.and_then(|scene| scene.model.splats()).map(Splats::len);
         Ok(Self {
             options: scene.map_or_else(RenderOptions::default, |scene| scene.options),
@@ -99,6 +101,7 @@ impl Bench {
             } => session.select(gesture, replace, steps)?,
             EditRequest::Deselect => session.deselect(),
             EditRequest::Edit { gesture, whole, edit } => session.edit(gesture, whole, edit)?,
+            EditRequest::Replay { list } => session.replay(&EditList::parse(&list)?)?,
             EditRequest::Undo => session.go(session.at().saturating_sub(1))?,
             EditRequest::Redo => session.go(session.at() + 1)?,
             EditRequest::Go { at } => session.go(at)?,

@@ -58,6 +58,17 @@ function drawRegion(draw, pixel, pointer) {
   draw.context.lineWidth = pixel;
 }
 
+/** A tick to the left of a line, where it selects. @param {CanvasRenderingContext2D} context @param {number[]} a @param {number[]} b @param {number} pixel */
+function side(context, a, b, pixel) {
+  const [x, y] = [b[0] - a[0], b[1] - a[1]];
+  const reach = (14 * pixel) / Math.max(Math.hypot(x, y), 1);
+  const [u, v] = [(a[0] + b[0]) / 2, (a[1] + b[1]) / 2];
+  context.beginPath();
+  context.moveTo(u, v);
+  context.lineTo(u + reach * y, v - reach * x);
+  context.stroke();
+}
+
 /** @param {Draw} draw @param {Vec3[]} points */
 function polyline(draw, points) {
   for (let i = 1; i < points.length; i += 1) line(draw, points[i - 1], points[i]);
@@ -169,6 +180,7 @@ function drawTool({ context }, pixel, { tools }) {
   context.globalAlpha = 1;
   context.stroke();
   context.lineWidth = pixel;
+  if (drawn.tool === "cut" && b) side(context, a, b, pixel);
   if (drawn.tool !== "polygon") return;
   for (const [x, y] of points) context.fillRect(x - 2.5 * pixel, y - 2.5 * pixel, 5 * pixel, 5 * pixel);
 }

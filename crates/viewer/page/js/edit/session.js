@@ -71,6 +71,11 @@ class Session {
     this.send({ do: "edit", gesture, whole, edit: op });
   }
 
+  /** @param {string} list an `edits.toml` */
+  replay(list) {
+    this.send({ do: "replay", list });
+  }
+
   undo() {
     this.send({ do: "undo" });
   }

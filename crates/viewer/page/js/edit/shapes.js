@@ -1,5 +1,7 @@
 // Shapes of selections as crate `edit` names them, in the coordinates of the page: the server converts them to the dataset's.
 
+import { cross, normalize, rotate } from "../math.js";
+
 /** @typedef {import("../camera.js").Camera} Camera */
 /** @typedef {import("../camera.js").Intrinsics} Intrinsics */
 /** @typedef {import("../math.js").Vec3} Vec3 */
@@ -38,6 +40,15 @@ export function region({ kind, center, half, rotation }) {
 
 /** @param {Vec3} center @param {number} radius */
 export const ball = (center, radius) => ({ shape: "sphere", center, radius });
+
+/** What lies beyond a plane, on the side to which `normal` points. @param {Vec3} point @param {Vec3} normal */
+export const halfSpace = (point, normal) => ({ shape: "half-space", point, normal });
+
+/** What is on the left of a line in the picture, drawn from `a` to `b`. @param {Camera} camera @param {Intrinsics} k @param {Point} a @param {Point} b */
+export function beside(camera, k, a, b) {
+  const [from, to] = [a, b].map(([x, y]) => /** @type {Vec3} */ ([(x - k.cx) / k.fx, (y - k.cy) / k.fy, 1]));
+  return halfSpace(camera.position, normalize(rotate(camera.rotation, cross(to, from))));
+}
 
 /** Colours within `apart` of one, channel by channel. @param {readonly number[]} color @param {number} apart */
 export const colors = (color, apart) => ({ shape: "color", low: color.map((v) => v - apart), high: color.map((v) => v + apart) });

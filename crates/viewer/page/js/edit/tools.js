@@ -1,7 +1,7 @@
 // Selection tools on the stage: what is drawn with the pointer becomes a step of the selection when it is let go.
 
 import { state } from "../state.js";
-import { ball, brush, polygon } from "./shapes.js";
+import { ball, beside, brush, polygon } from "./shapes.js";
 import { session } from "./session.js";
 
 /** @typedef {import("../camera.js").Camera} Camera */
@@ -15,6 +15,7 @@ export const TOOLS = /** @type {const} */ ([
   ["lasso", "Lasso", "lasso", "Drag around what you want"],
   ["polygon", "Polygon", "polygon", "Click corners; Enter, a double click or the first corner closes it"],
   ["brush", "Brush", "brush", "Paint over what you want"],
+  ["cut", "Cut", "cut", "Drag a line: all that is on its left, near and far"],
   ["box", "Box", "box", "Click a surface to place the box, then pull its handles"],
   ["sphere", "Sphere", "sphere", "Click a surface to place the ball, then pull its handles"],
   ["color", "By colour", "dropper", "Click a splat of the colour"],
@@ -27,7 +28,9 @@ const NAMES = TOOLS.map(([name]) => name);
 /** @param {string} tool @returns {tool is Tool} */
 export const isEditTool = (tool) => NAMES.includes(tool);
 /** Tools that draw a line of points. */
-const LINES = ["rectangle", "lasso", "brush"];
+const LINES = ["rectangle", "lasso", "brush", "cut"];
+/** Of these the two that are its ends or corners. */
+const TWO = ["rectangle", "cut"];
 /** Distance between points of a line, CSS pixels. */
 const STEP = 2;
 /** Distance at which the first corner of a polygon is met again, CSS pixels. */
@@ -91,7 +94,7 @@ export class Tools extends EventTarget {
       if (this.drawn) this.drawn.points.push(at);
       else this.drawn = { tool, points: [at], camera, k, mode };
     } else if (LINES.includes(tool)) {
-      this.drawn = { tool, points: tool === "rectangle" ? [at, at] : [at], camera, k, mode };
+      this.drawn = { tool, points: TWO.includes(tool) ? [at, at] : [at], camera, k, mode };
     }
     this.changed();
   }
@@ -100,7 +103,7 @@ export class Tools extends EventTarget {
   move(at) {
     this.at = at;
     const drawn = this.drawn;
-    if (drawn && drawn.tool === "rectangle") drawn.points[1] = at;
+    if (drawn && TWO.includes(drawn.tool)) drawn.points[1] = at;
     else if (drawn && LINES.includes(drawn.tool)) {
       const last = drawn.points[drawn.points.length - 1];
       if (Math.hypot(at[0] - last[0], at[1] - last[1]) >= STEP * this.stage.pixel) drawn.points.push(at);
@@ -124,6 +127,7 @@ export class Tools extends EventTarget {
     const visible = state.get("visibleOnly");
     if (tool === "brush") return session.select([brush(camera, k, points, state.get("brush") * this.stage.pixel, visible)], mode);
     const [a, b] = points;
+    if (tool === "cut" && Math.hypot(b[0] - a[0], b[1] - a[1]) > CLOSE * this.stage.pixel) return session.select([beside(camera, k, a, b)], mode);
     const outline = /** @type {Point[]} */ (tool === "rectangle" ? [a, [b[0], a[1]], b, [a[0], b[1]]] : points);
     if (area(outline) > 9) session.select([polygon(camera, k, outline, visible)], mode);
     // A click beside everything: nothing is selected, as in other editors.

@@ -1,11 +1,12 @@
 // The panel of editing: tools and measures that select, what is done with the selection, the list of what was done, files.
 
 import { choose, el, press, row, section, segments } from "../dom.js";
+import { ahead, forward } from "../camera.js";
 import { distanceText } from "../overlay.js";
 import { icon } from "../icons.js";
 import { length, subtract } from "../math.js";
 import { TOOLS, isEditTool } from "../edit/tools.js";
-import { colors } from "../edit/shapes.js";
+import { colors, halfSpace } from "../edit/shapes.js";
 import { session } from "../edit/session.js";
 import { state } from "../state.js";
 
@@ -20,6 +21,7 @@ const MEASURES = [
   ["opacity", "Opacity below", 0.01, 1, 0.1, 0.01, (at) => [{ shape: "opacity", max: at }], (at) => at.toFixed(2)],
   ["size", "Larger than", -3, 0, -1, 0.02, (at) => [{ shape: "size", min: radius() * 10 ** at }], (at) => distanceText(radius() * 10 ** at)],
   ["small", "Smaller than", -5, -1, -3, 0.02, (at) => [{ shape: "size", max: radius() * 10 ** at }], (at) => distanceText(radius() * 10 ** at)],
+  ["farther", "Farther than", -2, 1, 0, 0.01, (at) => [beyond(radius() * 10 ** at)], (at) => distanceText(radius() * 10 ** at)],
   ["needles", "Needles longer than", 0, 3, 1, 0.02, (at) => [{ shape: "elongation", min: 10 ** at }], (at) => `${(10 ** at).toFixed(1)} : 1`],
   ["clusters", "Islands of at most", 0, 5, 2, 0.1, (at) => [{ shape: "clusters", max: Math.round(10 ** at) }], (at) => `${Math.round(10 ** at)}`],
 ];
@@ -30,6 +32,8 @@ const COLORS = [
 ];
 
 const radius = () => state.get("scene")?.radius ?? 1;
+/** What this view has behind a plane at a distance. @param {number} distance */
+const beyond = (distance) => halfSpace(ahead(state.get("camera"), distance), forward(state.get("camera")));
 const count = (/** @type {number} */ value) => value.toLocaleString("en");
 
 class EditPanel extends HTMLElement {
@@ -68,8 +72,15 @@ class EditPanel extends HTMLElement {
       press(before, Boolean(editing?.before));
       save.disabled = !editing?.at;
     });
+    const file = el("input", { type: "file", accept: ".toml", hidden: true, "aria-label": "edits.toml" });
+    file.onchange = async () => {
+      const [chosen] = file.files ?? [];
+      if (chosen) session.replay(await chosen.text());
+      file.value = "";
+    };
+    const open = button("Open edits", "Makes the edits of an edits.toml", () => file.click());
     return el("div", { className: "edit-bar" }, el("div", { className: "row" }, undo, redo, before, el("span", { className: "grow" }), save),
-      el("div", { className: "row" }, format, download));
+      el("div", { className: "row" }, format, download, el("span", { className: "grow" }), open, file));
   }
 
   selecting() {

@@ -1,0 +1,214 @@
+//! Poses by COLMAP, where it is asked for: whichever version is on the path, whose options are taken from its own help.
+
+use super::{LeftOutPhoto, PoseInput, PoseProgress, PoseReport, is_film, output};
+use crate::RunError;
+use irradia_formats::{PhotoFolder, read_colmap_poses};
+use std::fs;
+use std::path::Path;
+use std::process::{Command, Stdio};
+
+/// Photographs up to which COLMAP matches all pairs; beyond, those that follow one another.
+const EXHAUSTIVE: usize = 300;
+
+/// Runs COLMAP's features, matching and mapper on the photographs of `folder`, and leaves its models in `sparse` of the dataset.
+pub(super) fn run(
+    input: &PoseInput,
+    folder: &PhotoFolder,
+    progress: &(dyn Fn(PoseProgress) + Sync),
+) -> Result<PoseReport, RunError> {
+    let colmap = Colmap::find(&input.colmap)?;
+    let out = &input.out;
+    let images = out.join("images");
+    fs::create_dir_all(&images).map_err(RunError::io("create", &images))?;
+    for photo in &folder.photos {
+        output::link_photo(out, photo)?;
+    }
+    let (database, written) = (out.join("colmap.db"), out.join("sparse.new"));
+    // COLMAP would add to those of an earlier call.
+    for old in [&database, &written] {
+        if old.is_dir() {
+            fs::remove_dir_all(old).map_err(RunError::io("clear", old))?;
+        } else if old.exists() {
+            fs::remove_file(old).map_err(RunError::io("clear", old))?;
+        }
+    }
+    fs::create_dir_all(&written).map_err(RunError::io("create", &written))?;
+    let stage = |name| progress(PoseProgress::Stage { name, of: 0 });
+
+    stage("features");
+    let mut extract = colmap.command("feature_extractor")?;
+    extract.path("database_path", &database).path("image_path", &images);
+    let one_camera = folder.groups().iter().all(|group| *group == 0);
+    extract.option(&["ImageReader.single_camera"], if one_camera { "1" } else { "0" });
+    extract.option(
+        &["FeatureExtraction.use_gpu", "SiftExtraction.use_gpu"],
+        colmap.use_gpu(),
+    );
+    let features = input.max_features.to_string();
+    extract.option(
+        &["SiftExtraction.max_num_features", "FeatureExtraction.max_num_features"],
+        &features,
+    );
+    if folder.photos.iter().any(|photo| photo.mask.is_some()) {
+        let masks = out.join("masks");
+        extract.option(&["ImageReader.mask_path"], &masks.to_string_lossy());
+    }
+    extract.run()?;
+
+    stage("matches");
+    let in_order = is_film(&input.photos) || folder.photos.len() > EXHAUSTIVE;
+    let mut matching = colmap.command(if in_order {
+        "sequential_matcher"
+    } else {
+        "exhaustive_matcher"
+    })?;
+    matching.path("database_path", &database);
+    matching.option(&["FeatureMatching.use_gpu", "SiftMatching.use_gpu"], colmap.use_gpu());
+    matching.run()?;
+
+    stage("poses");
+    let mut mapper = colmap.command("mapper")?;
+    mapper.path("database_path", &database).path("image_path", &images);
+    mapper.path("output_path", &written).run()?;
+    if !written.join("0").is_dir() {
+        return Err(RunError::Refused(format!(
+            "{}: COLMAP found no model; irradia doctor says what is wrong with the photographs",
+            input.photos.display()
+        )));
+    }
+    let sparse = out.join("sparse");
+    if sparse.exists() {
+        fs::remove_dir_all(&sparse).map_err(RunError::io("clear", &sparse))?;
+    }
+    fs::rename(&written, &sparse).map_err(RunError::io("rename", &written))?;
+    report(out, folder)
+}
+
+/// What became of the photographs, as far as COLMAP's files tell.
+fn report(out: &Path, folder: &PhotoFolder) -> Result<PoseReport, RunError> {
+    let (_, images) = read_colmap_poses(out)?;
+    let mut points: Vec<u64> = images.iter().flat_map(|image| image.points.iter().copied()).collect();
+    points.sort_unstable();
+    points.dedup();
+    let reason = "COLMAP left it out of its largest model".to_owned();
+    let absent = folder
+        .photos
+        .iter()
+        .filter(|photo| !images.iter().any(|image| image.name == photo.name));
+    let absent = absent.map(|photo| (photo.name.clone(), reason.clone()));
+    let mut left_out: Vec<LeftOutPhoto> = folder
+        .left_out
+        .iter()
+        .cloned()
+        .chain(absent)
+        .map(|(name, reason)| LeftOutPhoto { name, reason })
+        .collect();
+    left_out.sort_by(|a, b| a.name.cmp(&b.name));
+    Ok(PoseReport {
+        photos: folder.photos.len() + folder.left_out.len(),
+        registered: images.len(),
+        left_out,
+        models: vec![images.len()],
+        points: points.len(),
+        ..PoseReport::default()
+    })
+}
+
+/// A COLMAP that answers.
+struct Colmap {
+    program: String,
+    /// Whether it was built with CUDA.
+    has_cuda: bool,
+}
+
+impl Colmap {
+    fn find(program: &str) -> Result<Self, RunError> {
+        let answer = Command::new(program).arg("help").stdin(Stdio::null()).output();
+        let answer = answer.map_err(|error| {
+            RunError::Refused(format!(
+                "{program} cannot be run ({error}): install COLMAP, or leave --poses colmap out"
+            ))
+        })?;
+        Ok(Self {
+            program: program.to_owned(),
+            has_cuda: String::from_utf8_lossy(&answer.stdout).contains("with CUDA"),
+        })
+    }
+
+    /// Without CUDA, its GPU path needs a display.
+    fn use_gpu(&self) -> &'static str {
+        if self.has_cuda { "1" } else { "0" }
+    }
+
+    /// One of its commands, with the options that its help names.
+    fn command(&self, name: &'static str) -> Result<Step, RunError> {
+        let help = Command::new(&self.program)
+            .args([name, "-h"])
+            .stdin(Stdio::null())
+            .output();
+        let help =
+            help.map_err(|error| RunError::Refused(format!("{} {name} cannot be run: {error}", self.program)))?;
+        let mut command = Command::new(&self.program);
+        command.arg(name).stdin(Stdio::null());
+        // No version opens a window for these, but Qt asks for one.
+        command.env("QT_QPA_PLATFORM", "offscreen");
+        Ok(Step {
+            name,
+            known: format!(
+                "{}{}",
+                String::from_utf8_lossy(&help.stdout),
+                String::from_utf8_lossy(&help.stderr)
+            ),
+            command,
+        })
+    }
+}
+
+/// A command of COLMAP's with its options.
+struct Step {
+    name: &'static str,
+    /// Its help.
+    known: String,
+    command: Command,
+}
+
+impl Step {
+    fn path(&mut self, option: &str, path: &Path) -> &mut Self {
+        self.command.arg(format!("--{option}")).arg(path);
+        self
+    }
+
+    /// Sets the first of `names`, which versions differ in, that this version knows; none if it knows none.
+    fn option(&mut self, names: &[&str], value: &str) {
+        let is_known = |name: &&&str| {
+            self.known
+                .split_whitespace()
+                .any(|word| word.strip_prefix("--") == Some(**name))
+        };
+        if let Some(name) = names.iter().find(is_known) {
+            self.command.arg(format!("--{name}")).arg(value);
+        }
+    }
+
+    fn run(&mut self) -> Result<(), RunError> {
+        let name = self.name;
+        let output = self
+            .command
+            .output()
+            .map_err(|error| RunError::Refused(format!("colmap {name} cannot be run: {error}")))?;
+        if output.status.success() {
+            return Ok(());
+        }
+        let said = String::from_utf8_lossy(&output.stderr);
+        let last = said
+            .lines()
+            .rev()
+            .find(|line| !line.trim().is_empty())
+            .unwrap_or("it said nothing");
+        Err(RunError::Refused(format!(
+            "colmap {name} failed ({}): {}",
+            output.status,
+            last.trim()
+        )))
+    }
+}

@@ -44,7 +44,7 @@ pub fn to_metres(model: &mut Model, places: &[Option<DVec3>]) -> Result<Metric, 
         return Err(None);
     }
     let (turn, metric) = fit(&pairs).ok_or(Some(f64::INFINITY))?;
-    if !(metric.scale_error <= COARSEST) {
+    if metric.scale_error.is_nan() || metric.scale_error > COARSEST {
         return Err(Some(metric.scale_error));
     }
     let alignment = Alignment {

@@ -121,9 +121,11 @@ impl Engine {
     }
 
     /// Whether the state is on a GPU.
-    #[cfg(feature = "gpu")]
     pub fn is_on_gpu(&self) -> bool {
-        self.gpu.is_some()
+        #[cfg(feature = "gpu")]
+        return self.gpu.is_some();
+        #[cfg(not(feature = "gpu"))]
+        false
     }
 
     /// What has gone wrong on the device: the state and everything made from it are then unspecified.

@@ -139,6 +139,7 @@ pub fn run(
     }
     trainer.read_back()?;
     events.extend(fewer_than_at_first(trainer));
+    events.extend(read_for_losses(trainer));
     let stopped = if requests.stop { "stopped" } else { "recipe complete" };
     let reason = reason.unwrap_or(stopped).to_owned();
     events.push(Event::Finished {
@@ -165,6 +166,18 @@ fn fewer_than_at_first(trainer: &Trainer) -> Option<Event> {
         }
     } else {
         Event::Decided { message: left }
+    })
+}
+
+/// How many steps had losses that only the CPU computes, though the splats are on a GPU.
+fn read_for_losses(trainer: &Trainer) -> Option<Event> {
+    let (steps, device) = (trainer.read_for_losses, &trainer.options.device);
+    (steps > 0).then(|| Event::Warned {
+        message: format!(
+            "the losses of {steps} steps were computed on the CPU, from frames read back from {device}: recipe {} has some that the GPU \
+             lacks (docs/gpu.md)",
+            trainer.recipe.name
+        ),
     })
 }
 

@@ -160,6 +160,8 @@ pub struct Trainer {
     pub(crate) depths: HashMap<(usize, u32, u32), Arc<[KnownDepth]>>,
     objective: Objective,
     device_loss: DeviceLoss,
+    /// Steps of this process whose frames were read back from a GPU for their losses.
+    pub(crate) read_for_losses: u64,
     free_space: FreeSpace,
 }
 
@@ -245,6 +247,7 @@ impl Trainer {
             depths: HashMap::new(),
             objective: Objective::new(options.lpips.clone()),
             device_loss: DeviceLoss::new(&options.device)?,
+            read_for_losses: 0,
             free_space: FreeSpace::new(&dataset, recipe.free_space),
             engine,
             field: None,
@@ -436,6 +439,7 @@ impl Trainer {
         if let Some(loss) = on_device.flatten() {
             return loss;
         }
+        self.read_for_losses += u64::from(self.engine.is_on_gpu());
         let frame = FramePlanes {
             color: self.sockets.frame_color(&self.engine),
             ..self.engine.frame()

@@ -29,7 +29,10 @@ fn a_run_on_the_gpu_ends_as_on_the_cpu() {
             run.train(&mut []).expect("trains");
             let report = run.finish().expect("finishes").report;
             // Its losses of smoothness and of coarse images are the CPU's, and the report says so.
-            let told = report.warnings.iter().any(|line| line.contains("read back from the GPU"));
+            let told = report
+                .warnings
+                .iter()
+                .any(|line| line.contains("read back from the GPU"));
             assert_eq!(told, device == "gpu" && recipe == "curriculum", "{:?}", report.warnings);
             report.psnr
         });
@@ -46,7 +49,11 @@ fn a_hash_grid_on_the_gpu_ends_as_on_the_cpu() {
     }
     let folder = folder();
     let psnr = ["cpu", "gpu"].map(|device| {
-        let small = ["field.samples=4096", "field.sampler.side=32", "field.net.encoding.log2_table=12"];
+        let small = [
+            "field.samples=4096",
+            "field.sampler.side=32",
+            "field.net.encoding.log2_table=12",
+        ];
         let request = TrainInput {
             device: device.to_owned(),
             recipe: "hashgrid".to_owned(),

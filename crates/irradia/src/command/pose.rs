@@ -178,12 +178,16 @@ fn summary(report: &PoseReport) -> String {
             100.0 * scale.scale_error
         )
     });
+    // COLMAP's is not asked for.
+    let error = match report.mean_error_px {
+        0.0 => String::new(),
+        pixels => format!(", mean error {pixels:.2} px"),
+    };
     format!(
-        "{} of {} photographs posed, {} points, mean error {:.2} px{unit}; {}; {:.1} s in all",
+        "{} of {} photographs posed, {} points{error}{unit}; {}; {:.1} s in all",
         report.registered,
         report.photos,
         report.points,
-        report.mean_error_px,
         stages.join(", "),
         report.seconds
     )

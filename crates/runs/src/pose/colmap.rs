@@ -69,13 +69,16 @@ pub(super) fn run(
     stage("poses");
     let mut mapper = colmap.command("mapper")?;
     mapper.path("database_path", &database).path("image_path", &images);
-    mapper.path("output_path", &written).run()?;
+    let mapped = mapper.path("output_path", &written).run();
     if !written.join("0").is_dir() {
+        // Some versions fail then, others do not.
+        let why = mapped.err().map_or(String::new(), |error| format!(" ({error})"));
         return Err(RunError::Refused(format!(
-            "{}: COLMAP found no model; irradia doctor says what is wrong with the photographs",
+            "{}: COLMAP found no model{why}; try without --poses colmap, or see irradia doctor",
             input.photos.display()
         )));
     }
+    mapped?;
     let sparse = out.join("sparse");
     if sparse.exists() {
         fs::remove_dir_all(&sparse).map_err(RunError::io("clear", &sparse))?;

@@ -113,7 +113,7 @@ pub struct PoseReport {
     pub models: Vec<usize>,
     /// Points of the largest model.
     pub points: usize,
-    /// Its mean reprojection error, px.
+    /// Its mean reprojection error, px; 0 if COLMAP found it.
     pub mean_error_px: f64,
     /// How its unit, a metre, was found; `None` if the unit is arbitrary.
     pub scale: Option<ScaleReport>,

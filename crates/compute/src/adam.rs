@@ -22,6 +22,19 @@ impl AdamStep {
     pub fn corrections(&self) -> [f64; 2] {
         [self.beta1, self.beta2].map(|beta| 1.0 - f64::from(beta).powf(self.step as f64))
     }
+
+    /// The `rule` of `adam.wgsl`: decay of the moments, epsilon, inverse root of the second correction.
+    #[cfg(feature = "gpu")]
+    pub fn device_rule(&self) -> [f32; 4] {
+        let [_, second] = self.corrections();
+        [self.beta1, self.beta2, self.epsilon, (1.0 / second.sqrt()) as f32]
+    }
+
+    /// The learning rate `rate` as `adam.wgsl` takes it, divided by the first correction.
+    #[cfg(feature = "gpu")]
+    pub fn device_rate(&self, rate: f32) -> f32 {
+        (f64::from(rate) / self.corrections()[0]) as f32
+    }
 }
 
 /// Items whose activity is counted together.

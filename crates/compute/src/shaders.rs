@@ -24,6 +24,39 @@ impl Shader {
     }
 }
 
+/// Declares kernels by name, each with the parts before its own text, `gpu/shaders/NAME.wgsl` beside the file that declares: `SHADERS` has
+/// the source of each, and `Kernels`, with the feature `gpu`, all of them compiled.
+#[macro_export]
+macro_rules! kernels {
+    ($($(#[$doc:meta])* $name:ident: [$($part:expr),* $(,)?],)*) => {
+        /// Every kernel's source, in the order of [`Kernels`], without constants.
+        pub const SHADERS: &[$crate::shaders::Shader] = &[$($crate::shaders::Shader {
+            name: stringify!($name),
+            parts: &[$($part,)* include_str!(concat!("gpu/shaders/", stringify!($name), ".wgsl"))],
+        },)*];
+
+        /// The kernels, compiled.
+        #[cfg(feature = "gpu")]
+        #[derive(Debug)]
+        pub(crate) struct Kernels {
+            $($(#[$doc])* pub $name: $crate::gpu::Kernel,)*
+        }
+
+        #[cfg(feature = "gpu")]
+        impl Kernels {
+            /// With the text `constants` before each shader's.
+            pub fn new(gpu: &$crate::gpu::Gpu, constants: &str) -> Self {
+                let mut shaders = SHADERS.iter();
+                let mut next = || {
+                    let shader = shaders.next().expect("a shader for each kernel");
+                    $crate::gpu::Kernel::with_constants(gpu, shader, constants)
+                };
+                Self { $($name: next(),)* }
+            }
+        }
+    };
+}
+
 /// Exclusive prefix sums: sums of blocks, the sums before each block, the sums before each word.
 pub const SCAN: [Shader; 3] = [
     Shader {

@@ -12,5 +12,7 @@ pub mod geometry;
 mod keypoints;
 pub mod map;
 pub mod matching;
+mod median;
 
 pub use keypoints::{DESCRIPTOR_BYTES, Features, Keypoint, PairMatches};
+pub(crate) use median::median;

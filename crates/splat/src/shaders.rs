@@ -1,7 +1,5 @@
 //! The kernels, put together from their parts: their text for whoever runs WGSL, such as a browser, and compiled for the GPU.
 
-#[cfg(feature = "gpu")]
-use irradia_compute::gpu::{Gpu, Kernel};
 use irradia_compute::shaders::{ADAM, GRID, HARMONICS, SCAN, SORT, Shader};
 
 const VIEW: &str = include_str!("gpu/shaders/view.wgsl");
@@ -12,31 +10,7 @@ const TILES: &str = include_str!("gpu/shaders/tiles.wgsl");
 const FRAGMENT: &str = include_str!("gpu/shaders/fragment.wgsl");
 const UPDATE: &str = include_str!("gpu/shaders/update.wgsl");
 
-macro_rules! kernels {
-    ($($(#[$doc:meta])* $name:ident: [$($part:expr),*],)*) => {
-        /// The stages of a frame and of a training step, compiled.
-        #[cfg(feature = "gpu")]
-        #[derive(Debug)]
-        pub(crate) struct Kernels {
-            $($(#[$doc])* pub $name: Kernel,)*
-        }
-
-        #[cfg(feature = "gpu")]
-        impl Kernels {
-            pub fn new(gpu: &Gpu) -> Self {
-                Self { $($name: Kernel::new(gpu, &shader(stringify!($name))),)* }
-            }
-        }
-
-        /// Every kernel's source.
-        pub const SHADERS: &[Shader] = &[$(Shader {
-            name: stringify!($name),
-            parts: &[$($part,)* include_str!(concat!("gpu/shaders/", stringify!($name), ".wgsl"))],
-        },)*];
-    };
-}
-
-kernels! {
+irradia_compute::kernels! {
     /// Twin: `render::project::project` and `render::touch`.
     project: [GRID, VIEW, GEOMETRY, LOAD, HARMONICS, DIRECTION, TILES],
     /// Visible splats and their depths, ascending.
@@ -120,10 +94,4 @@ const FRAME: [&str; 7] = ["project", "compact", "count", "emit", "ranges", "segm
 pub fn of_a_frame() -> impl Iterator<Item = &'static Shader> {
     let own = SHADERS.iter().filter(|shader| FRAME.contains(&shader.name));
     own.chain(&SCAN).chain(&SORT)
-}
-
-#[cfg(feature = "gpu")]
-fn shader(name: &str) -> Shader {
-    let found = SHADERS.iter().find(|shader| shader.name == name);
-    *found.expect("every kernel is in the table")
 }

@@ -22,6 +22,7 @@ use crate::shaders::Kernels;
 use crate::space::{Outside, Ray};
 use irradia_compute::DeviceError;
 use irradia_compute::gpu::{Array, Gpu, Scan, Work};
+use irradia_compute::simd::{Lanes, Portable, Simd};
 use std::sync::Arc;
 
 /// Whether a field of `config` has a form on GPUs.
@@ -274,6 +275,19 @@ impl GpuField {
         work.run(&self.kernels.dense, &arrays, groups);
     }
 
+    /// What compositing reads, in the order of its bindings, and then what it writes.
+    pub fn composited<'a>(&'a self, written: &[&'a Array]) -> Vec<&'a Array> {
+        let read = [
+            &self.task,
+            &self.rays,
+            &self.starts,
+            &self.points,
+            &self.rows,
+            &self.background,
+        ];
+        [&read[..], written].concat()
+    }
+
     /// Densities at points of the unit cube.
     pub fn densities(&mut self, field: &Field, points: &[[f32; 3]]) -> Vec<f32> {
         let gpu = self.gpu.clone();
@@ -299,10 +313,15 @@ impl GpuField {
             let row = self.layout.density_row * self.stride;
             self.rows.read(&gpu, row, &mut densities[begin..]);
         }
+        let mut lanes = [0.0; Portable::LANES];
+        for x in &mut densities {
+            let [density, _] = shape
+                .activation
+                .with_slope(Portable, Portable.set(*x + shape.density_bias));
+            density.store(&mut lanes);
+            *x = lanes[0];
+        }
         densities
-            .iter()
-            .map(|x| shape.activation.of(x + shape.density_bias))
-            .collect()
     }
 
     fn write_task(&self, rays: usize, samples: usize, weights: [f32; 2]) {

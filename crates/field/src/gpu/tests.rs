@@ -150,7 +150,7 @@ fn difference(got: &[f32], expected: &[f32]) -> f32 {
 fn every_shader_is_valid() {
     let layout = Layout::new(&crate::net::Net::new(config().net));
     let constants = layout.constants(&crate::net::Net::new(config().net));
-    for shader in crate::shaders::all() {
+    for shader in crate::shaders::SHADERS {
         irradia_testkit::validate_shader(shader.name, &format!("{constants}{}", shader.source()));
     }
 }

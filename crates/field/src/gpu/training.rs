@@ -51,12 +51,10 @@ impl Trained {
     }
 
     fn write(&self, gpu: &Gpu, rate: f32, step: &AdamStep, count: usize) {
-        let [first, second] = step.corrections();
-        let rule = [step.beta1, step.beta2, step.epsilon, (1.0 / second.sqrt()) as f32];
-        let rate = [(f64::from(rate) / first) as f32, 0.0, 0.0, 0.0];
+        let rate = [step.device_rate(rate), 0.0, 0.0, 0.0];
         let sizes = [self.len as u32, count as u32, 0, 0];
-        self.update
-            .write(gpu, 0, &[rule.map(f32::to_bits), rate.map(f32::to_bits), sizes]);
+        let floats = [step.device_rule(), rate].map(|quad| quad.map(f32::to_bits));
+        self.update.write(gpu, 0, &[floats[0], floats[1], sizes]);
     }
 
     /// Both moments.
@@ -114,16 +112,7 @@ impl GpuFieldTraining {
         self.losses.reserve(&gpu, 5 * rays);
         let mut work = Work::new(&gpu);
         field.evaluate(&mut work, rays, samples);
-        let arrays = [
-            &field.task,
-            &field.rays,
-            &field.starts,
-            &field.points,
-            &field.rows,
-            &field.background,
-            &self.v_rows,
-            &self.losses,
-        ];
+        let arrays = field.composited(&[&self.v_rows, &self.losses]);
         work.run(&field.kernels.composite, &arrays, rays.div_ceil(RAYS));
         work.run(&field.kernels.totals, &[&field.task, &self.losses, &self.totals], 1);
         self.propagate(&mut work, samples);

@@ -95,15 +95,7 @@ impl GpuFieldRenderer {
         self.pixels.reserve(&gpu, 6 * rays);
         let mut work = Work::new(&gpu);
         field.evaluate(&mut work, rays, samples);
-        let arrays = [
-            &field.task,
-            &field.rays,
-            &field.starts,
-            &field.points,
-            &field.rows,
-            &field.background,
-            &self.pixels,
-        ];
+        let arrays = field.composited(&[&self.pixels]);
         work.run(&field.kernels.pixels, &arrays, rays.div_ceil(RAYS));
         work.submit();
         self.pixels.to_vec(&gpu, 6 * rays)

@@ -28,13 +28,21 @@ pub enum Activation {
 }
 
 impl Activation {
-    /// The density.
-    #[cfg(feature = "gpu")]
-    pub(crate) fn of(self, x: f32) -> f32 {
+    /// The density and its derivative.
+    #[inline(always)]
+    pub(crate) fn with_slope<S: Simd>(self, simd: S, x: S::F) -> [S::F; 2] {
+        let (zero, one) = (simd.splat(0.0), simd.splat(1.0));
         match self {
-            Activation::Exp => x.min(10.0).exp(),
-            Activation::Softplus => x.max(0.0) + (-x.abs()).exp().ln_1p(),
-            Activation::Relu => x.max(0.0),
+            Activation::Exp => {
+                let y = x.min(simd.splat(10.0)).exp();
+                [y, y]
+            }
+            Activation::Softplus => {
+                let e = (-x.abs()).exp();
+                let slope = one / (one + e);
+                [x.max(zero) + (one + e).map(ln), slope.select(zero.le(x), one - slope)]
+            }
+            Activation::Relu => [x.max(zero), one.masked(zero.lt(x))],
         }
     }
 }
@@ -239,23 +247,10 @@ impl Net {
         block.slope.resize(panels * PANEL, Default::default());
         let rows = self.density.outputs();
         let bias = simd.splat(f64::from(self.shape.density_bias));
-        let (zero, one) = (simd.splat(0.0), simd.splat(1.0));
         for p in 0..panels {
             for s in (0..PANEL).step_by(S::LANES) {
                 let x = simd.load(&block.density_tape.output()[p * rows * PANEL + s..]) + bias;
-                let (density, slope) = match self.shape.activation {
-                    Activation::Exp => {
-                        let cap = simd.splat(10.0);
-                        let y = x.min(cap).exp();
-                        (y, y)
-                    }
-                    Activation::Softplus => {
-                        let e = (-x.abs()).exp();
-                        let slope = one / (one + e);
-                        (x.max(zero) + (one + e).map(ln), slope.select(zero.le(x), one - slope))
-                    }
-                    Activation::Relu => (x.max(zero), one.masked(zero.lt(x))),
-                };
+                let [density, slope] = self.shape.activation.with_slope(simd, x);
                 density.store(&mut block.density[p * PANEL + s..]);
                 slope.store(&mut block.slope[p * PANEL + s..]);
             }

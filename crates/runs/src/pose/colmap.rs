@@ -23,16 +23,11 @@ pub(super) fn run(
     for photo in &folder.photos {
         output::link_photo(out, photo)?;
     }
-    let (database, written) = (out.join("colmap.db"), out.join("sparse.new"));
-    // COLMAP would add to those of an earlier call.
-    for old in [&database, &written] {
-        if old.is_dir() {
-            fs::remove_dir_all(old).map_err(RunError::io("clear", old))?;
-        } else if old.exists() {
-            fs::remove_file(old).map_err(RunError::io("clear", old))?;
-        }
+    let (database, written) = (out.join("colmap.db"), output::begin_models(out)?);
+    if database.exists() {
+        // COLMAP would add to that of an earlier call.
+        fs::remove_file(&database).map_err(RunError::io("clear", &database))?;
     }
-    fs::create_dir_all(&written).map_err(RunError::io("create", &written))?;
     let stage = |name| progress(PoseProgress::Stage { name, of: 0 });
 
     stage("features");
@@ -79,11 +74,7 @@ pub(super) fn run(
         )));
     }
     mapped?;
-    let sparse = out.join("sparse");
-    if sparse.exists() {
-        fs::remove_dir_all(&sparse).map_err(RunError::io("clear", &sparse))?;
-    }
-    fs::rename(&written, &sparse).map_err(RunError::io("rename", &written))?;
+    output::end_models(out, &written)?;
     report(out, folder)
 }
 

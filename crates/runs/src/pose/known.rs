@@ -116,18 +116,12 @@ impl KnownPoses {
             .cameras
             .get(&id)
             .ok_or_else(|| refused(format!("camera {id} is missing")))?;
-        let parameters = match (camera.model.as_str(), &camera.params[..]) {
-            ("SIMPLE_PINHOLE", &[f, cx, cy]) => [f, f, cx, cy, 0.0, 0.0, 0.0, 0.0],
-            ("PINHOLE", &[fx, fy, cx, cy]) => [fx, fy, cx, cy, 0.0, 0.0, 0.0, 0.0],
-            ("SIMPLE_RADIAL", &[f, cx, cy, k1]) => [f, f, cx, cy, k1, 0.0, 0.0, 0.0],
-            ("RADIAL", &[f, cx, cy, k1, k2]) => [f, f, cx, cy, k1, k2, 0.0, 0.0],
-            ("OPENCV", &[fx, fy, cx, cy, k1, k2, p1, p2]) => [fx, fy, cx, cy, k1, k2, p1, p2],
-            (model, _) => {
-                return Err(refused(format!(
-                    "photographs cannot be added to cameras of the model {model}, only to pinhole cameras, RADIAL and OPENCV"
-                )));
-            }
-        };
+        let parameters = camera.opencv().ok_or_else(|| {
+            refused(format!(
+                "photographs cannot be added to cameras of the model {}, only to pinhole cameras, RADIAL and OPENCV",
+                camera.model
+            ))
+        })?;
         Ok(DCamera {
             width: camera.width as u32,
             height: camera.height as u32,

@@ -10,7 +10,7 @@ use irradia_formats::{
 use irradia_sfm::geometry::camera::DCamera;
 use irradia_sfm::map::{Model, PhotoInfo, Reconstruction};
 use std::fs;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// Writes `images` and `sparse`.
 pub(super) fn write(
@@ -27,21 +27,32 @@ pub(super) fn write(
             link_photo(out, &folder.photos[*i])?;
         }
     }
-    let sparse = out.join("sparse");
-    // Beside the models of an earlier call, which may have been more and remain until these are complete.
-    let written = out.join("sparse.new");
-    if written.exists() {
-        fs::remove_dir_all(&written).map_err(RunError::io("clear", &written))?;
-    }
+    let written = begin_models(out)?;
     for (number, model) in found.models.iter().enumerate() {
         let to = written.join(number.to_string());
         fs::create_dir_all(&to).map_err(RunError::io("create", &to))?;
         write_colmap(&to, &colmap_model(work, infos, model))?;
     }
+    end_models(out, &written)
+}
+
+/// An empty folder for models, beside those of an earlier call, which may have been more and remain until these are complete.
+pub(super) fn begin_models(out: &Path) -> Result<PathBuf, RunError> {
+    let written = out.join("sparse.new");
+    if written.exists() {
+        fs::remove_dir_all(&written).map_err(RunError::io("clear", &written))?;
+    }
+    fs::create_dir_all(&written).map_err(RunError::io("create", &written))?;
+    Ok(written)
+}
+
+/// Puts the complete models of [`begin_models`] into their place.
+pub(super) fn end_models(out: &Path, written: &Path) -> Result<(), RunError> {
+    let sparse = out.join("sparse");
     if sparse.exists() {
         fs::remove_dir_all(&sparse).map_err(RunError::io("clear", &sparse))?;
     }
-    fs::rename(&written, &sparse).map_err(RunError::io("rename", &written))
+    fs::rename(written, &sparse).map_err(RunError::io("rename", written))
 }
 
 /// Brings a photograph and its mask into the folders `images`, which exists, and `masks` of the dataset.

@@ -1,9 +1,10 @@
 //! Focal lengths: several settings, zooms that no metadata tell, and such as cannot be known.
 
-use super::{Diagnosis, Evidence, median};
+use super::{Diagnosis, Evidence};
 use crate::geometry::ransac::Limits;
 use crate::geometry::resection::Resection;
 use crate::map::{Model, PairKind, Source};
+use crate::median;
 use glam::{DVec2, DVec3};
 use rayon::prelude::*;
 use std::collections::{BTreeSet, HashMap};

@@ -1,6 +1,7 @@
 //! Blur, exposure and texture of single photographs, relative to those that show the same.
 
-use super::{Diagnosis, Evidence, Graph, median};
+use super::{Diagnosis, Evidence, Graph};
+use crate::median;
 
 /// How many times less sharp than its neighbours a photograph is at which it is blurred: up to 2.6 in sharp close-ups of plain
 /// surfaces, 2.9 and more where a hand shook.

@@ -214,12 +214,6 @@ fn left_out(evidence: &Evidence, known: &[Diagnosis]) -> Vec<Diagnosis> {
         .collect()
 }
 
-/// The median; `None` of nothing.
-fn median(mut values: Vec<f64>) -> Option<f64> {
-    let middle = values.len() / 2;
-    (!values.is_empty()).then(|| *values.select_nth_unstable_by(middle, f64::total_cmp).1)
-}
-
 /// The pair's kind is a turn on the spot.
 fn turns_only(pair: &VerifiedPair) -> bool {
     pair.kind == PairKind::Rotation

@@ -1,11 +1,12 @@
 //! What the motion between photographs tells: none, turns only, something that stands still, something that moves by itself.
 
-use super::{Diagnosis, Evidence, Graph, median, turns_only};
+use super::{Diagnosis, Evidence, Graph, turns_only};
 use crate::geometry::correspondences::{Correspondences, sampson_squared};
 use crate::geometry::fundamental::{Fundamental, eight_points};
 use crate::geometry::homography::Homography;
 use crate::geometry::ransac::{Limits, estimate};
 use crate::map::{PairKind, VerifiedPair};
+use crate::median;
 use crate::{Keypoint, PairMatches};
 use glam::{DMat3, DVec2};
 use rayon::prelude::*;

@@ -4,7 +4,7 @@ use super::model::Working;
 use super::types::{LeftOut, MapOptions, Model, ModelPoint, PairKind, PhotoInfo, Reason, VerifiedPair};
 use crate::geometry::align::Alignment;
 use crate::geometry::linear::symmetric_eigen;
-use crate::{Features, PairMatches};
+use crate::{Features, PairMatches, median};
 use glam::{DQuat, DVec3};
 
 /// The model in a world of its own.
@@ -61,13 +61,7 @@ fn upright(model: &Model, photos: &[PhotoInfo]) -> Alignment {
     let cameras = photos.iter().zip(&model.poses);
     let up = up(cameras.filter_map(|(photo, pose)| Some((pose.as_ref()?.rotation, photo.up))));
     let rotation = DQuat::from_rotation_arc(up, DVec3::Z);
-    let middle = |mut values: Vec<f64>| {
-        if values.is_empty() {
-            return 0.0;
-        }
-        let half = values.len() / 2;
-        *values.select_nth_unstable_by(half, f64::total_cmp).1
-    };
+    let middle = |values| median(values).unwrap_or(0.0);
     let center =
         DVec3::from_array([0, 1, 2].map(|axis| middle(model.points.iter().map(|p| p.position[axis]).collect())));
     let distance = middle(

@@ -2,6 +2,7 @@
 
 use super::types::Model;
 use crate::geometry::align::Alignment;
+use crate::median;
 use glam::{DQuat, DVec2, DVec3};
 
 /// Photographs with a place below which there is no scale.
@@ -71,9 +72,7 @@ fn fit(pairs: &[(DVec2, DVec2)]) -> Option<(DVec2, Metric)> {
             let Some(fit) = least_squares(&[**a, **b]) else {
                 continue;
             };
-            let mut distances: Vec<f64> = pairs.iter().map(|pair| distance(&fit, pair)).collect();
-            let middle = distances.len() / 2;
-            let median = *distances.select_nth_unstable_by(middle, f64::total_cmp).1;
+            let median = median(pairs.iter().map(|pair| distance(&fit, pair)).collect())?;
             if best.is_none_or(|(least, _)| median < least) {
                 best = Some((median, fit));
             }

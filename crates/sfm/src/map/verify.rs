@@ -8,7 +8,7 @@ use crate::geometry::essential::{Essential, Motion, closest_essential, cross_mat
 use crate::geometry::fundamental::Fundamental;
 use crate::geometry::homography::{Homography, rotation_between};
 use crate::geometry::ransac::{Estimate, Limits, estimate};
-use crate::{Features, PairMatches};
+use crate::{Features, PairMatches, median};
 use glam::{DMat3, DVec2, DVec3};
 use rayon::prelude::*;
 
@@ -297,14 +297,9 @@ fn kind(points: &[[DVec2; 2]], threshold: f64, pair: &PairMatches) -> PairKind {
 
 /// The median angle between both rays of the points in front of both cameras.
 fn median_angle(motion: &Motion, points: &[[DVec2; 2]]) -> f64 {
-    let mut angles: Vec<f64> = points
+    let angles = points
         .iter()
         .filter(|p| motion.depths(**p).iter().all(|z| *z > 0.0))
-        .map(|[a, b]| (motion.rotation * a.extend(1.0)).angle_between(b.extend(1.0)))
-        .collect();
-    if angles.is_empty() {
-        return 0.0;
-    }
-    let middle = angles.len() / 2;
-    *angles.select_nth_unstable_by(middle, f64::total_cmp).1
+        .map(|[a, b]| (motion.rotation * a.extend(1.0)).angle_between(b.extend(1.0)));
+    median(angles.collect()).unwrap_or(0.0)
 }

@@ -121,7 +121,7 @@ impl GpuRenderer {
         let array = |label| Array::zeros(&gpu, label, 0);
         let all_counted = Array::zeros(&gpu, "counts", 2 * PART);
         let renderer = Self {
-            kernels: Kernels::new(&gpu),
+            kernels: Kernels::new(&gpu, ""),
             view: Array::zeros(&gpu, "view", VIEW_WORDS),
             geometry: array("geometry"),
             harmonics: array("harmonics"),

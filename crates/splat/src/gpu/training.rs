@@ -389,8 +389,7 @@ impl GpuTraining {
     fn update_words(&self, update: &Update, size: [u32; 2]) -> [u32; UPDATE_WORDS] {
         let [count, stride, degree] = self.renderer.shape;
         let step = &update.optimizer.step;
-        let corrections = step.corrections();
-        let rate = |rate: f32| (f64::from(rate) / corrections[0]) as f32;
+        let rate = |rate| step.device_rate(rate);
         let rates = &update.rates;
         let regularizers = &update.regularizers;
         let is_regularized = !regularizers.is_zero();
@@ -416,12 +415,7 @@ impl GpuTraining {
         let floats = [
             [rates.means, rates.quats, rates.log_scales, rates.opacities].map(rate),
             [rate(rates.sh_dc), rate(rates.sh_rest), 0.0, 0.0],
-            [
-                step.beta1,
-                step.beta2,
-                step.epsilon,
-                (1.0 / corrections[1].sqrt()) as f32,
-            ],
+            step.device_rule(),
             regularizers
                 .per_splat(f64::from(update.regularizer_unit), 1.0)
                 .map(|weight| weight as f32),

@@ -34,7 +34,7 @@ fn main(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups: ve
     var error = 0.0;
     for (var s = first; s < end; s++) {
         let sample = sample_at(s);
-        let next = transmittance * exp(-sample.density.x * sample.length);
+        let next = transmittance * sample.through;
         let weight = transmittance - next;
         color += weight * sample.color;
         // The mean over the weights, without the transmitted part of the ray.
@@ -60,12 +60,12 @@ fn main(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups: ve
     transmittance = 1.0;
     for (var s = first; s < end; s++) {
         let sample = sample_at(s);
-        let next = transmittance * exp(-sample.density.x * sample.length);
+        let next = transmittance * sample.through;
         let weight = transmittance - next;
         let beyond = select(0.0, spread(sample.middle) - goal, known);
         let v_weight = dot(v_color, sample.color - behind) + v_error * beyond;
         later -= v_weight * weight;
-        v_rows[task.rows.x * stride + s] = (v_weight * next - later) * sample.length * sample.density.y;
+        v_rows[task.rows.x * stride + s] = (v_weight * next - later) * sample.length * sample.slope;
         let v_output = weight * v_color * sample.color * (1.0 - sample.color);
         for (var c = 0u; c < 3u; c++) {
             v_rows[(task.rows.z + c) * stride + s] = v_output[c];

@@ -6,19 +6,16 @@
 
 @compute @workgroup_size(256)
 fn main(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups: vec3u, @builtin(local_invocation_index) at: u32) {
-    let index = group_index(group, groups);
-    let s = index / LEVELS * 256u + at;
-    let level = index % LEVELS;
-    if s >= task.sizes.y {
+    let own = place(group_index(group, groups), at);
+    if own.sample >= task.sizes.y {
         return;
     }
-    let stride = task.sizes.z;
-    var c = corners(task.levels[level], vec3f(points[s], points[stride + s], points[2u * stride + s]));
+    var c = corners_at(own);
     for (var f = 0u; f < FEATURES; f++) {
         var x = 0.0;
         for (var k = 0u; k < 8u; k++) {
             x += table[c.entry[k] * FEATURES + f] * c.weight[k];
         }
-        rows[(level * FEATURES + f) * stride + s] = x;
+        rows[feature_at(own, f)] = x;
     }
 }

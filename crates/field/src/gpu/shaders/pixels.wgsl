@@ -30,7 +30,7 @@ fn main(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups: ve
     var median = 0.0;
     for (var s = starts[r]; s < starts[r + 1u]; s++) {
         let sample = sample_at(s);
-        let next = transmittance * exp(-sample.density.x * sample.length);
+        let next = transmittance * sample.through;
         let weight = transmittance - next;
         let distance = world_distance(ray, sample.middle);
         color += weight * sample.color;

@@ -7,3 +7,12 @@ struct Update {
     // Parameters; chunks of samples, or rays; unused.
     sizes: vec4u,
 }
+
+// A step of Adam on parameter i; both moments lie one behind the other.
+fn take_step(i: u32, gradient: f32) {
+    let second = update.sizes.x + i;
+    let stepped = adam(gradient, update.rate.x, parameters[i], moments[i], moments[second], update.rule);
+    parameters[i] = stepped.x;
+    moments[i] = stepped.y;
+    moments[second] = stepped.z;
+}

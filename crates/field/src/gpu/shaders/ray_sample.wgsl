@@ -1,10 +1,11 @@
 // A sample as compositing reads it.
 struct Sample {
     middle: f32,
-    // Length of its interval, field units.
+    // Length of its interval, field units, and its transmittance.
     length: f32,
-    // Density and its derivative by the network's output.
-    density: vec2f,
+    through: f32,
+    // Derivative of the density by the network's output.
+    slope: f32,
     color: vec3f,
 }
 
@@ -16,7 +17,9 @@ fn sample_at(s: u32) -> Sample {
         rows[(task.rows.z + 1u) * stride + s],
         rows[(task.rows.z + 2u) * stride + s],
     );
-    return Sample(middle, step_around(middle), density_of(rows[task.rows.x * stride + s]), sigmoid(output));
+    let length = step_around(middle);
+    let density = density_of(rows[task.rows.x * stride + s]);
+    return Sample(middle, length, exp(-density.x * length), density.y, sigmoid(output));
 }
 
 // Of -|x|, which does not overflow, mirrored.

@@ -30,16 +30,13 @@ fn add(at: u32, value: f32) {
 
 @compute @workgroup_size(256)
 fn main(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups: vec3u, @builtin(local_invocation_index) at: u32) {
-    let index = group_index(group, groups);
-    let s = index / LEVELS * 256u + at;
-    let level = index % LEVELS;
-    if s >= task.sizes.y {
+    let own = place(group_index(group, groups), at);
+    if own.sample >= task.sizes.y {
         return;
     }
-    let stride = task.sizes.z;
-    var c = corners(task.levels[level], vec3f(points[s], points[stride + s], points[2u * stride + s]));
+    var c = corners_at(own);
     for (var f = 0u; f < FEATURES; f++) {
-        let v = v_rows[(level * FEATURES + f) * stride + s];
+        let v = v_rows[feature_at(own, f)];
         if v == 0.0 {
             continue;
         }

@@ -11,7 +11,6 @@ var<workgroup> sums: array<f32, 64>;
 @compute @workgroup_size(64)
 fn main(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) at: u32) {
     let i = group.x;
-    let count = update.sizes.x;
     let rays_in_all = update.sizes.y;
     var own = 0.0;
     for (var r = at; r < rays_in_all; r += 64u) {
@@ -25,10 +24,7 @@ fn main(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) at
             sums[at] += sums[at + half];
         }
     }
-    if at == 0u && i < count {
-        let stepped = adam(sums[0], update.rate.x, parameters[i], moments[i], moments[count + i], update.rule);
-        parameters[i] = stepped.x;
-        moments[i] = stepped.y;
-        moments[count + i] = stepped.z;
+    if at == 0u && i < update.sizes.x {
+        take_step(i, sums[0]);
     }
 }

@@ -16,8 +16,5 @@ fn main(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups: ve
     for (var chunk = 0u; chunk < update.sizes.y; chunk++) {
         gradient += sums[chunk * count + i];
     }
-    let stepped = adam(gradient, update.rate.x, parameters[i], moments[i], moments[count + i], update.rule);
-    parameters[i] = stepped.x;
-    moments[i] = stepped.y;
-    moments[count + i] = stepped.z;
+    take_step(i, gradient);
 }

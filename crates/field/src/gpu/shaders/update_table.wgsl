@@ -9,8 +9,7 @@
 @compute @workgroup_size(256)
 fn main(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups: vec3u, @builtin(local_invocation_index) at: u32) {
     let i = group_index(group, groups) * 256u + at;
-    let count = update.sizes.x;
-    if i >= count {
+    if i >= update.sizes.x {
         return;
     }
     var sum = sums[i];
@@ -24,8 +23,5 @@ fn main(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups: ve
     }
     let size = f32(sum.y) * exp2(-18.0) + f32(sum.x) * exp2(-50.0);
     let gradient = select(size, -size, is_negative);
-    let stepped = adam(gradient, update.rate.x, parameters[i], moments[i], moments[count + i], update.rule);
-    parameters[i] = stepped.x;
-    moments[i] = stepped.y;
-    moments[count + i] = stepped.z;
+    take_step(i, gradient);
 }

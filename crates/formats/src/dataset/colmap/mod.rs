@@ -254,9 +254,13 @@ fn gather(points: Vec<ColmapPoint>) -> (DeclaredPoints, HashMap<u64, u32>) {
     (cloud, index_of)
 }
 
-fn declared_camera(camera: &ColmapCamera) -> Result<DeclaredCamera, Malformed> {
+/// Focal lengths and principal point, px, and the lens.
+///
+/// # Errors
+/// When the model is not supported, or has another number of parameters.
+fn intrinsics(camera: &ColmapCamera) -> Result<([f64; 2], [f64; 2], Lens), Malformed> {
     let opencv = |k: [f64; 6], p: [f64; 2]| Lens::Opencv { k, p };
-    let (focal, center, lens) = match (camera.model.as_str(), &camera.params[..]) {
+    Ok(match (camera.model.as_str(), &camera.params[..]) {
         ("SIMPLE_PINHOLE", &[f, cx, cy]) => ([f, f], [cx, cy], Lens::Pinhole),
         ("PINHOLE", &[fx, fy, cx, cy]) => ([fx, fy], [cx, cy], Lens::Pinhole),
         ("SIMPLE_RADIAL", &[f, cx, cy, k1]) => ([f, f], [cx, cy], opencv([k1, 0.0, 0.0, 0.0, 0.0, 0.0], [0.0; 2])),
@@ -289,7 +293,27 @@ fn declared_camera(camera: &ColmapCamera) -> Result<DeclaredCamera, Malformed> {
                 ),
             }));
         }
-    };
+    })
+}
+
+impl ColmapCamera {
+    /// `fx, fy, cx, cy, k1, k2, p1, p2` of OpenCV's lens; `None` for other lenses.
+    pub fn opencv(&self) -> Option<[f64; 8]> {
+        let ([fx, fy], [cx, cy], lens) = intrinsics(self).ok()?;
+        let [k1, k2, p1, p2] = match lens {
+            Lens::Pinhole => [0.0; 4],
+            Lens::Opencv {
+                k: [k1, k2, 0.0, 0.0, 0.0, 0.0],
+                p: [p1, p2],
+            } => [k1, k2, p1, p2],
+            _ => return None,
+        };
+        Some([fx, fy, cx, cy, k1, k2, p1, p2])
+    }
+}
+
+fn declared_camera(camera: &ColmapCamera) -> Result<DeclaredCamera, Malformed> {
+    let (focal, center, lens) = intrinsics(camera)?;
     if camera.width == 0 || camera.height == 0 {
         return Err(Malformed(format!(
             "camera {} has a size of {}x{} pixels",

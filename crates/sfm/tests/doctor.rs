@@ -28,10 +28,12 @@ fn examine(world: &World, appearances: &[Appearance], colors: &[Vec<[u8; 3]>]) -
         pairs: &pairs,
         cameras: &cameras,
         model: found.models.first(),
+        zooms: &found.zooms,
         left_out: &found.left_out,
     };
     let alone = Evidence {
         model: None,
+        zooms: &[],
         left_out: &[],
         ..evidence
     };
@@ -224,6 +226,24 @@ fn little_texture_and_few_partners_are_named() {
 }
 
 #[test]
+fn a_zoom_that_no_metadata_tell_is_named_and_mapped_with_its_own_focal_length() {
+    let world = ring(24, 2500, 0..0).zoomed(15, 1.5);
+    let [mapped, alone] = plainly(&world);
+    assert_eq!(alone, []);
+    let [Diagnosis::Zoom { photos, ratio }] = &mapped[..] else {
+        panic!("{mapped:?}");
+    };
+    assert_eq!(*photos, (15..24).collect::<Vec<_>>());
+    assert!((ratio - 1.5).abs() < 0.01, "{ratio}");
+    let found = world.map();
+    let model = &found.models[0];
+    assert!(world.auc(model, 1.0) > 97.0, "{}", world.auc(model, 1.0));
+    let focal = |group: usize| model.cameras[group].as_ref().expect("used").focal();
+    assert!((focal(0) / 870.0 - 1.0).abs() < 0.01, "{}", focal(0));
+    assert!((focal(1) / 1305.0 - 1.0).abs() < 0.01, "{}", focal(1));
+}
+
+#[test]
 fn nothing_and_one_photograph_have_nothing_wrong() {
     let world = World::default();
     assert_eq!(plainly(&world), [Vec::new(), Vec::new()]);
@@ -236,4 +256,33 @@ fn nothing_and_one_photograph_have_nothing_wrong() {
             .all(|kind| [Kind::LeftOut, Kind::FewFeatures].contains(kind)),
         "{found:?}"
     );
+}
+
+#[test]
+fn something_that_moves_is_named_and_nothing_else() {
+    let mut world = ring(24, 1500, 0..0);
+    // A flat thing of 40 features, each time elsewhere in the picture.
+    let mut rng = irradia_scene::Rng::new(8, 8);
+    let thing: Vec<[f32; 2]> = (0..40).map(|_| [0; 2].map(|_| rng.range(0.0, 180.0))).collect();
+    let mut first = Vec::new();
+    for features in &mut world.features {
+        first.push(features.keypoints.len() as u32);
+        let corner = [rng.range(0.0, 800.0), rng.range(0.0, 550.0)];
+        features.keypoints.extend(thing.iter().map(|at| irradia_sfm::Keypoint {
+            x: corner[0] + at[0],
+            y: corner[1] + at[1],
+            scale: 2.0,
+            angle: 0.0,
+        }));
+    }
+    for pair in &mut world.pairs {
+        let [a, b] = pair.photos.map(|p| first[p as usize]);
+        pair.matches.extend((0..thing.len() as u32).map(|i| [a + i, b + i]));
+    }
+    for found in plainly(&world) {
+        assert!(
+            matches!(&found[..], [Diagnosis::Moving { pairs: [found, of], .. }] if 2 * found > *of),
+            "{found:?}"
+        );
+    }
 }

@@ -6,7 +6,9 @@ use glam::{DQuat, DVec3};
 use irradia_scene::Rng;
 use irradia_sfm::Features;
 use irradia_sfm::geometry::pose::DPose;
-use irradia_sfm::map::{Known, MapOptions, Model, PairKind, Reason, Reconstruction, agreement, extend, reconstruct};
+use irradia_sfm::map::{
+    Distance, Known, MapOptions, Model, PairKind, Reason, Reconstruction, agreement, extend, reconstruct, to_distances,
+};
 use world::{World, around};
 
 #[test]
@@ -257,4 +259,53 @@ fn a_label_that_occurs_twice_does_not_fold_the_ring() {
         of_opposite.len() > 8 && of_opposite.iter().all(|a| *a < 0.6),
         "{of_opposite:?}"
     );
+}
+
+#[test]
+fn known_distances_bring_a_model_to_metres_with_an_error_that_holds() {
+    let world = World::new(around(16, 1.0), 900, 0.5, 0.1, 12);
+    let model = world.map().models.swap_remove(0);
+    let distance = |a: usize, b: usize, factor: f64| Distance {
+        photos: [a, b],
+        metres: factor * world.poses[a].position.distance(world.poses[b].position),
+    };
+    let scale_of = |model: &Model| {
+        let length = |a: usize, b: usize| {
+            model.poses[a]
+                .unwrap()
+                .position
+                .distance(model.poses[b].unwrap().position)
+        };
+        length(1, 9) / world.poses[1].position.distance(world.poses[9].position)
+    };
+    // One, of which only the poses tell how good it is; neighbours tell less than those across.
+    let (mut near, mut across) = (model.clone(), model.clone());
+    let near_fit = to_distances(&mut near, &world.photos, &[distance(3, 4, 1.0)]).expect("posed");
+    let across_fit = to_distances(&mut across, &world.photos, &[distance(3, 11, 1.0)]).expect("posed");
+    assert!(near_fit.residual_m < 1e-9 && near_fit.scale_error > 2.0 * across_fit.scale_error);
+    assert!(near_fit.scale_error < 0.01, "{near_fit:?}");
+    assert!(
+        (scale_of(&near) - 1.0).abs() < 4.0 * near_fit.scale_error,
+        "{}",
+        scale_of(&near)
+    );
+    assert!(
+        (scale_of(&across) - 1.0).abs() < 4.0 * across_fit.scale_error,
+        "{}",
+        scale_of(&across)
+    );
+    // Several that disagree by 3 %.
+    let mut several = model.clone();
+    let known = [distance(0, 8, 1.03), distance(2, 10, 0.97), distance(4, 12, 1.0)];
+    let fit = to_distances(&mut several, &world.photos, &known).expect("posed");
+    assert!(
+        (0.01..0.03).contains(&fit.scale_error) && (scale_of(&several) - 1.0).abs() < 0.03,
+        "{fit:?}"
+    );
+    // Cameras at one place tell nothing.
+    let mut turned = model.clone();
+    turned.poses[4] = turned.poses[3];
+    let before = turned.clone();
+    assert_eq!(to_distances(&mut turned, &world.photos, &[distance(3, 4, 1.0)]), None);
+    assert_eq!(turned, before);
 }

@@ -7,7 +7,7 @@ use anyhow::Result;
 use clap::builder::RangedU64ValueParser;
 use indicatif::{ProgressBar, ProgressStyle};
 use irradia_runs::formats::{DatasetFormat, has_photos};
-use irradia_runs::{Finding, Mapper, PoseInput, PoseProgress, PoseReport, TrainInput, is_film, pose};
+use irradia_runs::{Finding, KnownDistance, Mapper, PoseInput, PoseProgress, PoseReport, TrainInput, is_film, pose};
 use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
@@ -30,6 +30,10 @@ pub struct Args {
     /// Adds the photographs to this dataset, in COLMAP's format, whose poses and cameras stay as they are
     #[arg(long, value_name = "DATA", conflicts_with = "out")]
     pub into: Option<PathBuf>,
+    /// A known distance in metres between the places from which two photographs were taken, such as a.jpg,b.jpg,1.25: brings the poses to
+    /// metres. Several are averaged, and tell how well they agree
+    #[arg(long, value_name = "A,B,METRES", value_parser = known_distance, conflicts_with = "into")]
+    pub distance: Vec<KnownDistance>,
     /// Who finds the poses: irradia, or colmap, if it is installed
     #[arg(long, value_name = "WHO", default_value = "irradia", value_enum)]
     pub poses: Poses,
@@ -39,6 +43,18 @@ pub struct Args {
     /// Threads; all cores when absent. The result does not depend on it
     #[arg(long, value_name = "N", value_parser = thread_count())]
     pub threads: Option<usize>,
+}
+
+/// `a.jpg,b.jpg,1.25`
+fn known_distance(text: &str) -> Result<KnownDistance, String> {
+    let parts: Vec<&str> = text.split(',').map(str::trim).collect();
+    let [a, b, metres] = parts[..] else {
+        return Err("is two photographs and a number of metres, such as a.jpg,b.jpg,1.25".to_owned());
+    };
+    Ok(KnownDistance {
+        photos: [a.to_owned(), b.to_owned()],
+        metres: metres.parse().map_err(|_| format!("{metres} is no number of metres"))?,
+    })
 }
 
 /// Who finds poses.
@@ -63,6 +79,7 @@ pub fn run(args: &Args) -> Result<()> {
     let data = data.expect("clap requires one of them");
     let mut input = PoseInput::new(&args.photos, data);
     input.into = args.into.is_some();
+    input.distances.clone_from(&args.distance);
     input.mapper = args.poses.into();
     input.max_features = args.max_features.unwrap_or(input.max_features);
     let report = pose_with_progress(&input)?;
@@ -172,11 +189,12 @@ fn summary(report: &PoseReport) -> String {
         .map(|stage| format!("{} {:.1} s", stage.name, stage.seconds))
         .collect();
     let unit = report.scale.as_ref().map_or(String::new(), |scale| {
-        format!(
-            "; in metres by the places of {} photographs, to {:.1} %",
-            scale.photos,
-            100.0 * scale.scale_error
-        )
+        let by = match scale.distances {
+            0 => format!("the places of {} photographs", scale.photos),
+            1 => "a known distance".to_owned(),
+            several => format!("{several} known distances"),
+        };
+        format!("; in metres by {by}, to {:.1} %", 100.0 * scale.scale_error)
     });
     // COLMAP's is not asked for.
     let error = match report.mean_error_px {

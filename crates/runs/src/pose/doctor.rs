@@ -152,6 +152,7 @@ pub(super) fn examine(
         pairs: &found.pairs,
         cameras: &found.cameras,
         model,
+        zooms: &found.zooms,
         left_out: &found.left_out,
     };
     let names: Vec<String> = infos.iter().map(|info| info.name.clone()).collect();

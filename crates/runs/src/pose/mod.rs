@@ -49,6 +49,8 @@ pub struct PoseInput {
     pub out: PathBuf,
     /// Whether the photographs are added to the dataset in `out`, in COLMAP's format, whose poses and cameras stay as they are.
     pub into: bool,
+    /// Distances between cameras that are known; they bring the poses to metres.
+    pub distances: Vec<KnownDistance>,
     /// Who finds the poses.
     pub mapper: Mapper,
     /// The program that [`Mapper::Colmap`] runs.
@@ -66,12 +68,22 @@ impl PoseInput {
             photos: photos.into(),
             out: out.into(),
             into: false,
+            distances: Vec::new(),
             mapper: Mapper::default(),
             colmap: "colmap".to_owned(),
             max_features: Sift::default().max_features,
             mapping: MapOptions::default(),
         }
     }
+}
+
+/// A distance between the places from which two photographs were taken.
+#[derive(Clone, Debug, PartialEq)]
+pub struct KnownDistance {
+    /// Their file names.
+    pub photos: [String; 2],
+    /// Metres.
+    pub metres: f64,
 }
 
 /// Who finds poses.
@@ -164,16 +176,19 @@ pub struct CameraReport {
     pub focal_held: bool,
 }
 
-/// The scale of a model in metres, by the places in the photographs' metadata; +X is east and +Y north then.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+/// The scale of a model in metres, by the places in the photographs' metadata, so that +X is east and +Y north, or by known distances.
+#[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct ScaleReport {
+    /// Known distances that determine the scale; 0 if the places do.
+    pub distances: usize,
     /// Photographs whose places agree with the model.
     pub photos: usize,
     /// Posed photographs that tell their place.
     pub with_place: usize,
     /// Root mean square of the horizontal distances between places and the model, m.
     pub residual_m: f64,
-    /// Relative standard deviation of the scale.
+    /// Relative standard deviation of the scale. That of a single distance is what the poses contribute: how well it was measured
+    /// shows only when there are several.
     pub scale_error: f64,
 }
 
@@ -190,12 +205,20 @@ pub struct StageReport {
 /// depends neither on the number of threads nor on the order of the files.
 ///
 /// # Errors
-/// When there are fewer than three photographs, a film cannot be read, no three photographs can be posed together, `out` holds a
-/// dataset of another origin, or none where photographs are to be added to it, or a file cannot be written.
+/// When there are fewer than three photographs, a film cannot be read, no three photographs can be posed together, a distance is not
+/// between two posed photographs, `out` holds a dataset of another origin, or none where photographs are to be added to it, or a file
+/// cannot be written.
 pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Result<PoseReport, RunError> {
     let started = Instant::now();
     if input.max_features == 0 {
         return Err(RunError::setting("max_features", 0, "must be 1 or more"));
+    }
+    if input.into && !input.distances.is_empty() {
+        return Err(RunError::setting(
+            "into",
+            input.out.display(),
+            "keeps its unit: leave --distance out",
+        ));
     }
     let out = &input.out;
     let known = match input.into {
@@ -217,8 +240,16 @@ pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Resu
         read_photo_folder(&input.photos)?
     };
     check_enough(&input.photos, &folder)?;
+    place::check(&input.distances, &folder)?;
     clock.end("photographs");
     if input.mapper == Mapper::Colmap {
+        if !input.distances.is_empty() {
+            return Err(RunError::setting(
+                "mapper",
+                "colmap",
+                "leaves its unit as it is: leave --distance or --poses colmap out",
+            ));
+        }
         if input.into {
             return Err(RunError::setting(
                 "mapper",
@@ -262,9 +293,13 @@ pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Resu
             extend(&infos, work.features(), &pairs, &known, &input.mapping, &mut tell)
         }
     };
+    reconstruction.regroup(&mut infos);
     let scale = match reconstruction.models.first_mut() {
         // What is known keeps its unit.
-        Some(model) if is_new => place::scale(&folder, &work, model, progress),
+        Some(model) if is_new => {
+            let by_places = place::scale(&folder, &work, model, progress);
+            place::scale_by_distances(&input.distances, &infos, model)?.or(by_places)
+        }
         _ => None,
     };
     clock.end("poses");

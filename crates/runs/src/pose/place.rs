@@ -1,10 +1,11 @@
-//! Metres from what the photographs' metadata say of their places.
+//! Metres from what the photographs' metadata say of their places, or from known distances.
 
 use super::stages::Work;
-use super::{PoseProgress, ScaleReport};
+use super::{KnownDistance, PoseProgress, ScaleReport};
+use crate::RunError;
 use glam::DVec3;
 use irradia_formats::PhotoFolder;
-use irradia_sfm::map::{Model, to_metres};
+use irradia_sfm::map::{Distance, Model, PhotoInfo, to_distances, to_metres};
 
 /// Equatorial radius of the earth and the square of its eccentricity (WGS 84), m.
 const RADIUS_M: f64 = 6_378_137.0;
@@ -20,6 +21,7 @@ pub(super) fn scale(
     let gps: Vec<Option<[f64; 3]>> = work.photos().iter().map(|i| folder.photos[*i].tags.gps).collect();
     match to_metres(model, &local(&gps)) {
         Ok(metric) => Some(ScaleReport {
+            distances: 0,
             photos: metric.photos,
             with_place: metric.of,
             residual_m: metric.residual_m,
@@ -33,6 +35,69 @@ pub(super) fn scale(
             None
         }
         Err(None) => None,
+    }
+}
+
+/// Refuses distances that cannot be used, before anything else is done.
+pub(super) fn check(distances: &[KnownDistance], folder: &PhotoFolder) -> Result<(), RunError> {
+    for distance in distances {
+        let [a, b] = &distance.photos;
+        let unknown = [a, b]
+            .into_iter()
+            .find(|name| !folder.photos.iter().any(|photo| photo.name == **name));
+        let message = match unknown {
+            Some(name) => format!("{name} is not among the photographs"),
+            None if a == b => "must be between two photographs".to_owned(),
+            None if !(distance.metres.is_finite() && distance.metres > 0.0) => "must be more than 0 metres".to_owned(),
+            None => continue,
+        };
+        return Err(refused(distance, message));
+    }
+    Ok(())
+}
+
+fn refused(distance: &KnownDistance, message: String) -> RunError {
+    let [a, b] = &distance.photos;
+    RunError::setting("distance", format!("{a},{b},{}", distance.metres), message)
+}
+
+/// Brings `model` to metres by known distances; `None` if there are none.
+pub(super) fn scale_by_distances(
+    distances: &[KnownDistance],
+    infos: &[PhotoInfo],
+    model: &mut Model,
+) -> Result<Option<ScaleReport>, RunError> {
+    if distances.is_empty() {
+        return Ok(None);
+    }
+    let posed = |name: &String| (0..infos.len()).find(|i| infos[*i].name == *name && model.poses[*i].is_some());
+    let mut known = Vec::new();
+    for distance in distances {
+        let photos = distance.photos.each_ref().map(posed);
+        let [Some(a), Some(b)] = photos else {
+            let name = &distance.photos[usize::from(photos[0].is_some())];
+            return Err(refused(
+                distance,
+                format!("{name} has no pose in the largest model: name another photograph"),
+            ));
+        };
+        known.push(Distance {
+            photos: [a, b],
+            metres: distance.metres,
+        });
+    }
+    match to_distances(model, infos, &known) {
+        Some(metric) => Ok(Some(ScaleReport {
+            distances: known.len(),
+            residual_m: metric.residual_m,
+            scale_error: metric.scale_error,
+            ..ScaleReport::default()
+        })),
+        None => Err(refused(
+            &distances[0],
+            "the two were taken from one place, as far as can be told: name photographs that are farther apart"
+                .to_owned(),
+        )),
     }
 }
 

@@ -155,13 +155,14 @@ fn near_prediction(points: &[[DVec2; 2]], predicted: DQuat, seed: u64) -> (f64, 
     (fraction, (fraction > EXPLAINED).then_some(motion.rotation))
 }
 
-/// Repeated structures: neighbours that disagree with the model.
-pub(super) fn contradiction(evidence: &Evidence) -> Vec<Diagnosis> {
+/// Repeated structures: neighbours that disagree with the model, unless something moves in both: `moving` are such photographs.
+pub(super) fn contradiction(evidence: &Evidence, moving: &[usize]) -> Vec<Diagnosis> {
     let Some(model) = evidence.model else { return Vec::new() };
     let pairs = evidence.pairs;
     let agreement = agreement(evidence.photos, evidence.features, pairs, model);
     let strengths = strengths(evidence.photos, evidence.features, pairs);
-    let found = contradictions(pairs, &strengths, &agreement);
+    let mut found = contradictions(pairs, &strengths, &agreement);
+    found.retain(|i| !pairs[*i].photos.iter().all(|p| moving.contains(&(*p as usize))));
     let Some(first) = found.first().copied().filter(|_| found.len() >= PAIRS) else {
         return Vec::new();
     };

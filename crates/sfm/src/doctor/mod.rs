@@ -8,6 +8,7 @@ mod folds;
 mod lens;
 mod looks;
 mod motion;
+mod moving;
 mod overlap;
 mod ring;
 mod shots;
@@ -21,7 +22,7 @@ pub use turns::{Turns, turns};
 pub use types::{Diagnosis, Kind};
 
 use crate::geometry::camera::DCamera;
-use crate::map::{LeftOut, Model, PairKind, PhotoInfo, Reason, Source, VerifiedPair};
+use crate::map::{LeftOut, Model, PairKind, PhotoInfo, Reason, Source, VerifiedPair, Zoom};
 use crate::{Features, PairMatches};
 use std::collections::BTreeMap;
 
@@ -44,6 +45,8 @@ pub struct Evidence<'a> {
     pub cameras: &'a [(DCamera, Source)],
     /// The largest model, if the photographs were mapped.
     pub model: Option<&'a Model>,
+    /// What the mapper found of focal lengths that no metadata tell.
+    pub zooms: &'a [Zoom],
     /// What became of photographs without a pose, if the photographs were mapped.
     pub left_out: &'a [LeftOut],
 }
@@ -121,7 +124,6 @@ pub fn diagnose(evidence: &Evidence) -> Vec<Diagnosis> {
         return Vec::new();
     }
     let graph = Graph::new(n, evidence.pairs, HOLDS);
-    let rotation_only = motion::rotation_only(evidence, &graph);
     let still = motion::stands_still(evidence);
     // Pairs on a turntable seem taken from one place.
     let twice = if still.is_empty() {
@@ -129,11 +131,12 @@ pub fn diagnose(evidence: &Evidence) -> Vec<Diagnosis> {
     } else {
         Vec::new()
     };
-    let moving = if still.is_empty() {
-        motion::moving(evidence)
+    let (moving, showing) = if still.is_empty() {
+        moving::moving(evidence)
     } else {
-        Vec::new()
+        Default::default()
     };
+    let rotation_only = motion::rotation_only(evidence, &graph, &showing);
     let looks = [
         looks::blurred(evidence, &graph),
         looks::exposure(evidence, &graph),
@@ -157,7 +160,7 @@ pub fn diagnose(evidence: &Evidence) -> Vec<Diagnosis> {
             }
         }
     };
-    let contradiction = folds::contradiction(evidence);
+    let contradiction = folds::contradiction(evidence, &moving.iter().flat_map(Diagnosis::photos).collect::<Vec<_>>());
     let known = [
         contradiction,
         rotation_only,

@@ -1,16 +1,15 @@
-//! What the motion between photographs tells: none, turns only, something that stands still, something that moves by itself.
+//! What the motion between photographs tells: none, turns only, something that stands still.
 
 use super::{Diagnosis, Evidence, Graph, turns_only};
 use crate::geometry::correspondences::{Correspondences, sampson_squared};
-use crate::geometry::fundamental::{Fundamental, eight_points};
-use crate::geometry::homography::Homography;
+use crate::geometry::fundamental::Fundamental;
 use crate::geometry::ransac::{Limits, estimate};
-use crate::map::{PairKind, VerifiedPair};
+use crate::map::VerifiedPair;
 use crate::median;
 use crate::{Keypoint, PairMatches};
-use glam::{DMat3, DVec2};
+use glam::DVec2;
 use rayon::prelude::*;
-use std::collections::{BTreeMap, HashSet};
+use std::collections::BTreeMap;
 
 /// Photographs of one place from which on it is a fault of the capture.
 const TURNED: usize = 3;
@@ -25,27 +24,15 @@ const STILL_FRACTION: f64 = 0.08;
 /// Fraction of the pairs from which on it is a fault of the capture.
 const STILL_PAIRS: f64 = 0.1;
 
-/// Inliers of what moves, beside at least twice as many of the scene.
-const MOVING_MATCHES: usize = 12;
-/// Median distance from the scene's epipolar lines of what moves, in long sides.
-const MOVING_OFF: f64 = 0.012;
-/// Largest part of the picture, along each axis, of what moves.
-const MOVING_PART: f64 = 0.5;
-/// Pairs, and their fraction, from which on something moves.
-const MOVING_PAIRS: usize = 4;
-const MOVING_FRACTION: f64 = 0.08;
-
-/// Errors in long sides at which a match agrees with a geometry: four pixels of a thousand, as in verification, and half as much
-/// again for what is not rigid.
-const AGREES: f64 = 0.004;
-const AGREES_LOOSELY: f64 = 0.006;
+/// Error in long sides at which a match agrees with a geometry: four pixels of a thousand, as in verification.
+pub(super) const AGREES: f64 = 0.004;
 
 /// Fraction of the features, and largest median shift in long sides, of one photograph taken twice.
 const TWICE_FRACTION: f64 = 0.4;
 const TWICE_SHIFT: f64 = 0.001;
 
 /// Matches of a pair, centred and divided by the long sides.
-fn places(evidence: &Evidence, pair: &PairMatches) -> Vec<[DVec2; 2]> {
+pub(super) fn places(evidence: &Evidence, pair: &PairMatches) -> Vec<[DVec2; 2]> {
     let place = |side: usize, keypoint: u32| {
         let photo = pair.photos[side] as usize;
         let (info, Keypoint { x, y, .. }) = (
@@ -58,7 +45,7 @@ fn places(evidence: &Evidence, pair: &PairMatches) -> Vec<[DVec2; 2]> {
     pair.matches.iter().map(|[i, j]| [place(0, *i), place(1, *j)]).collect()
 }
 
-fn limits(pair: &PairMatches, samples: usize) -> Limits {
+pub(super) fn limits(pair: &PairMatches, samples: usize) -> Limits {
     Limits {
         samples,
         confidence: 0.999,
@@ -85,18 +72,19 @@ pub(super) fn twice(evidence: &Evidence) -> Vec<Diagnosis> {
         .collect()
 }
 
-/// Photographs all of whose pairs only turn.
-pub(super) fn rotation_only(evidence: &Evidence, graph: &Graph) -> Vec<Diagnosis> {
+/// Photographs all of whose pairs only turn. What moves across the picture seems to turn: pairs that are `moving` tell nothing.
+pub(super) fn rotation_only(evidence: &Evidence, graph: &Graph, moving: &[[u32; 2]]) -> Vec<Diagnosis> {
+    let turns = |pair: &VerifiedPair| turns_only(pair) && !moving.contains(&pair.photos);
     let turned: Vec<usize> = (0..evidence.photos.len())
         .filter(|photo| {
             let partners = &graph.partners[*photo];
-            partners.len() > 1 && partners.iter().all(|(_, pair)| turns_only(&evidence.pairs[*pair]))
+            partners.len() > 1 && partners.iter().all(|(_, pair)| turns(&evidence.pairs[*pair]))
         })
         .collect();
     let pairs = evidence
         .pairs
         .iter()
-        .filter(|pair| turns_only(pair) && pair.photos.iter().all(|p| turned.contains(&(*p as usize))))
+        .filter(|pair| turns(pair) && pair.photos.iter().all(|p| turned.contains(&(*p as usize))))
         .count();
     if turned.len() < TURNED || pairs == 0 {
         return Vec::new();
@@ -105,7 +93,7 @@ pub(super) fn rotation_only(evidence: &Evidence, graph: &Graph) -> Vec<Diagnosis
 }
 
 /// Photographs by how many of `pairs` name them, most first.
-fn most_named(pairs: &[[u32; 2]]) -> Vec<usize> {
+pub(super) fn most_named(pairs: &[[u32; 2]]) -> Vec<usize> {
     let mut counts: BTreeMap<usize, usize> = BTreeMap::new();
     for photo in pairs.iter().flatten() {
         *counts.entry(*photo as usize).or_default() += 1;
@@ -159,88 +147,4 @@ pub(super) fn stands_still(evidence: &Evidence) -> Vec<Diagnosis> {
         pairs: [found.len(), compared.len()],
         fraction: median(fractions.into_iter().flatten().collect()).unwrap_or(0.0),
     }]
-}
-
-/// Something that follows a motion of its own.
-pub(super) fn moving(evidence: &Evidence) -> Vec<Diagnosis> {
-    let by_photos: BTreeMap<[u32; 2], &PairMatches> = evidence.matches.iter().map(|pair| (pair.photos, pair)).collect();
-    let compared: Vec<&VerifiedPair> = evidence
-        .pairs
-        .iter()
-        .filter(|pair| pair.kind == PairKind::General && pair.matches.len() >= 2 * MOVING_MATCHES)
-        .collect();
-    let counts: Vec<Option<usize>> = compared
-        .par_iter()
-        .map(|pair| own_motion(evidence, by_photos.get(&pair.photos)?, pair))
-        .collect();
-    let found: Vec<[u32; 2]> = compared
-        .iter()
-        .zip(&counts)
-        .filter(|f| f.1.is_some())
-        .map(|f| f.0.photos)
-        .collect();
-    if found.len() < MOVING_PAIRS || (found.len() as f64) < MOVING_FRACTION * compared.len() as f64 {
-        return Vec::new();
-    }
-    let matches = median(counts.into_iter().flatten().map(|count| count as f64).collect());
-    vec![Diagnosis::Moving {
-        photos: most_named(&found),
-        pairs: [found.len(), compared.len()],
-        matches: matches.unwrap_or(0.0) as usize,
-    }]
-}
-
-/// Matches on something compact that agree with one another and not with the rest of a pair.
-fn own_motion(evidence: &Evidence, all: &PairMatches, pair: &VerifiedPair) -> Option<usize> {
-    let inliers: HashSet<[u32; 2]> = pair.matches.iter().copied().collect();
-    let mut rest = PairMatches {
-        photos: all.photos,
-        matches: all.matches.iter().copied().filter(|m| !inliers.contains(m)).collect(),
-    };
-    if rest.matches.len() < MOVING_MATCHES {
-        return None;
-    }
-    let scene = places(
-        evidence,
-        &PairMatches {
-            photos: pair.photos,
-            matches: pair.matches.clone(),
-        },
-    );
-    let geometry = eight_points(scene.iter().map(|p| (*p, 1.0)))?;
-    // What just misses the verification's threshold is part of the scene.
-    let candidates = places(evidence, &rest);
-    let off = |p: &[DVec2; 2]| sampson_squared(&geometry, *p).sqrt() > MOVING_OFF;
-    rest.matches.clear();
-    let candidates: Vec<[DVec2; 2]> = candidates.into_iter().filter(off).collect();
-    if candidates.len() < MOVING_MATCHES {
-        return None;
-    }
-    let points = Correspondences::new(candidates);
-    let problem = Homography {
-        points: &points,
-        threshold: AGREES_LOOSELY,
-    };
-    let found = estimate(&problem, Vec::new(), limits(&rest, 500))?;
-    let group: Vec<[DVec2; 2]> = points
-        .points
-        .iter()
-        .copied()
-        .filter(|p| agrees(&found.model, p))
-        .collect();
-    let compact = |side: usize, axis: usize| {
-        let mut values: Vec<f64> = group.iter().map(|p| p[side][axis]).collect();
-        values.sort_by(f64::total_cmp);
-        // A tenth on either side may be chance.
-        let cut = values.len() / 10;
-        let width = values[values.len() - 1 - cut] - values[cut];
-        (0.005..MOVING_PART).contains(&width)
-    };
-    (group.len() >= MOVING_MATCHES && [0, 1].iter().all(|side| compact(*side, 0) && compact(*side, 1)))
-        .then_some(group.len())
-}
-
-fn agrees(homography: &DMat3, [a, b]: &[DVec2; 2]) -> bool {
-    let mapped = *homography * a.extend(1.0);
-    (mapped.truncate() / mapped.z - *b).length() < AGREES_LOOSELY
 }

@@ -432,7 +432,7 @@ impl Display for Sentence<'_> {
             ),
             Diagnosis::Moving { photos, pairs, matches } => write!(
                 f,
-                "something moves, or repeats: {matches} matches follow a motion of their own in {} of {} pairs, among {}; mask it",
+                "something moves: {matches} matches follow a motion of their own in {} of {} pairs, among {}; mask it, or poses may follow it",
                 pairs[0],
                 pairs[1],
                 self.list(photos)

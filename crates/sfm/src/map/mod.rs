@@ -5,6 +5,7 @@
 //! threads, no order of hashing.
 
 mod agree;
+mod distance;
 mod finish;
 mod focal;
 mod grow;
@@ -17,18 +18,25 @@ mod triangulation;
 mod types;
 mod unfold;
 mod verify;
+mod zoom;
 
 pub use agree::{agreement, contradictions, strengths};
+pub use distance::{Distance, DistanceFit, to_distances};
 pub(crate) use finish::up;
 pub use focal::Source;
 pub use metric::{Metric, to_metres};
 pub use types::{
     Known, LeftOut, MapOptions, Model, ModelPoint, PairKind, PhotoInfo, Progress, Reason, Reconstruction, VerifiedPair,
+    Zoom,
 };
 pub use verify::{Cameras, verify};
 
+use crate::geometry::camera::DCamera;
 use crate::{Features, PairMatches};
 use tracks::Tracks;
+
+/// Settings of a zoom that are told apart, beside the first.
+const MOST_ZOOMS: usize = 3;
 
 /// Cameras, poses and points from matched features.
 ///
@@ -45,7 +53,50 @@ pub fn reconstruct(
     progress: &mut dyn FnMut(Progress),
 ) -> Reconstruction {
     assert_eq!(photos.len(), features.len(), "one set of features a photograph");
-    let (cameras, verified) = verify(photos, features, pairs, options, progress);
+    let mut found = mapped(photos, features, pairs, &[], options, progress);
+    let mut grouped = photos.to_vec();
+    while found.zooms.len() < MOST_ZOOMS {
+        let Some(zoom) = found.models.first().and_then(|m| zoom::find(&grouped, features, m)) else {
+            break;
+        };
+        let mut apart = grouped.clone();
+        zoom.photos.iter().for_each(|photo| apart[*photo].group = zoom.group);
+        let mut cameras: Vec<_> = found.cameras.iter().copied().map(Some).collect();
+        let lens = cameras[zoom.of].expect("listed").0;
+        cameras.push(None);
+        for (group, focal) in [zoom.of, zoom.group].into_iter().zip(zoom.focals) {
+            cameras[group] = Some((DCamera::centered(lens.width, lens.height, focal), Source::Pairs));
+        }
+        let again = mapped(&apart, features, pairs, &cameras, options, progress);
+        let registered = |found: &Reconstruction| found.models.first().map_or(0, Model::registered);
+        if registered(&again) < registered(&found) {
+            break;
+        }
+        let zooms = [std::mem::take(&mut found.zooms), vec![zoom]].concat();
+        found = Reconstruction { zooms, ..again };
+        grouped = apart;
+    }
+    // What the adjustment made of them.
+    if let Some(model) = found.models.first() {
+        for zoom in &mut found.zooms {
+            for (focal, group) in zoom.focals.iter_mut().zip([zoom.of, zoom.group]) {
+                *focal = model.cameras[group].as_ref().map_or(*focal, DCamera::focal);
+            }
+        }
+    }
+    found
+}
+
+/// As [`reconstruct`], with the groups as they are and the cameras of some of them.
+fn mapped(
+    photos: &[PhotoInfo],
+    features: &[Features],
+    pairs: &[PairMatches],
+    cameras: &[Option<(DCamera, Source)>],
+    options: &MapOptions,
+    progress: &mut dyn FnMut(Progress),
+) -> Reconstruction {
+    let (cameras, verified) = verify::verify_with(photos, features, pairs, cameras, options, progress);
     let input = Input {
         photos,
         features,
@@ -61,6 +112,7 @@ pub fn reconstruct(
         left_out,
         pairs: verified,
         cameras,
+        zooms: Vec::new(),
     }
 }
 
@@ -77,7 +129,8 @@ pub fn extend(
     progress: &mut dyn FnMut(Progress),
 ) -> Reconstruction {
     assert_eq!(photos.len(), known.poses.len(), "a pose or none a photograph");
-    let (cameras, verified) = verify::verify_with(photos, features, pairs, &known.cameras, options, progress);
+    let held: Vec<_> = known.cameras.iter().map(|c| c.map(|c| (c, Source::Prior))).collect();
+    let (cameras, verified) = verify::verify_with(photos, features, pairs, &held, options, progress);
     assert_eq!(cameras.len(), known.cameras.len(), "a camera or none a group");
     let tracks = Tracks::new(features, &verified);
     let mut working = model::Working::new(photos, &cameras, &tracks, options);
@@ -91,6 +144,7 @@ pub fn extend(
         left_out,
         pairs: verified,
         cameras,
+        zooms: Vec::new(),
     }
 }
 

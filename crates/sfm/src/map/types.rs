@@ -143,8 +143,32 @@ pub struct Reconstruction {
     pub left_out: Vec<LeftOut>,
     /// The pairs that were used.
     pub pairs: Vec<VerifiedPair>,
-    /// `[groups]` the camera of each group before any adjustment, and where its focal length comes from.
+    /// `[groups]` the camera of each group before the last mapping, and where its focal length comes from.
     pub cameras: Vec<(DCamera, Source)>,
+    /// Photographs of one group that turned out to have two focal lengths: each `Zoom` makes a further group.
+    pub zooms: Vec<Zoom>,
+}
+
+impl Reconstruction {
+    /// Puts photographs that were zoomed into the groups by which `cameras` and those of the models are numbered.
+    pub fn regroup(&self, photos: &mut [PhotoInfo]) {
+        for zoom in &self.zooms {
+            zoom.photos.iter().for_each(|photo| photos[*photo].group = zoom.group);
+        }
+    }
+}
+
+/// Photographs that have another focal length than the rest of their group, which no metadata tell.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Zoom {
+    /// Their group before.
+    pub of: usize,
+    /// Their group now.
+    pub group: usize,
+    /// Their indices, ascending.
+    pub photos: Vec<usize>,
+    /// Focal lengths of both groups, px.
+    pub focals: [f64; 2],
 }
 
 /// Cameras, poses and points in one world: that of what was known; else up is +Z, the origin is near the scene's middle, the cameras'

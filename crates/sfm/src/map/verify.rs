@@ -51,7 +51,7 @@ pub(super) fn verify_with(
     photos: &[PhotoInfo],
     features: &[Features],
     pairs: &[PairMatches],
-    cameras_known: &[Option<DCamera>],
+    given: &[Option<(DCamera, Source)>],
     options: &MapOptions,
     progress: &mut dyn FnMut(Progress),
 ) -> (Cameras, Vec<VerifiedPair>) {
@@ -73,10 +73,8 @@ pub(super) fn verify_with(
         .collect();
     let found: Vec<&Uncalibrated> = uncalibrated.iter().flatten().collect();
     let mut cameras = focal::cameras(photos, features, pairs, &found, options);
-    for (camera, known) in cameras.iter_mut().zip(cameras_known) {
-        if let Some(known) = known {
-            *camera = (*known, Source::Prior);
-        }
+    for (camera, given) in cameras.iter_mut().zip(given) {
+        *camera = given.unwrap_or(*camera);
     }
     let verified: Vec<VerifiedPair> = pairs
         .par_iter()

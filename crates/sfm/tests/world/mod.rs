@@ -154,6 +154,25 @@ impl World {
         world
     }
 
+    /// With the middle of the photographs from `first` on enlarged: what leaves them has no matches.
+    pub fn zoomed(mut self, first: usize, ratio: f32) -> Self {
+        let center = [0.5 * CAMERA.width as f32, 0.5 * CAMERA.height as f32];
+        for features in &mut self.features[first..] {
+            for k in &mut features.keypoints {
+                k.x = center[0] + ratio * (k.x - center[0]);
+                k.y = center[1] + ratio * (k.y - center[1]);
+            }
+        }
+        for pair in &mut self.pairs {
+            let seen = |side: usize, keypoint: u32| {
+                let k = &self.features[pair.photos[side] as usize].keypoints[keypoint as usize];
+                (0.0..CAMERA.width as f32).contains(&k.x) && (0.0..CAMERA.height as f32).contains(&k.y)
+            };
+            pair.matches.retain(|m| seen(0, m[0]) && seen(1, m[1]));
+        }
+        self
+    }
+
     /// Both worlds, without matches between them; the second is another camera.
     pub fn and(mut self, other: Self) -> Self {
         let shift = self.photos.len() as u32;

@@ -1,0 +1,196 @@
+//! Something that follows a motion of its own.
+//!
+//! In many pairs, matches on a small part of the pictures agree with one plane, and not with the motion of the rest, which is spread over
+//! the pictures: the scene's. Which of the two was verified as the pair's motion does not matter. Wallpaper does the same, where a motif
+//! is taken for its copy, but seldom between photographs that share most, and a third photograph that shows both tells them apart: what
+//! moves is one thing everywhere.
+
+use super::motion::{AGREES, limits, most_named, places};
+use super::{Diagnosis, Evidence};
+use crate::PairMatches;
+use crate::geometry::correspondences::{Correspondences, sampson_squared};
+use crate::geometry::fundamental::Fundamental;
+use crate::geometry::homography::Homography;
+use crate::geometry::ransac::estimate;
+use crate::median;
+use glam::DVec2;
+use rayon::prelude::*;
+use std::collections::BTreeMap;
+
+/// Partners of each photograph, those with most matches, with which it is compared.
+const STRONGEST: usize = 5;
+/// Matches on what moves, and on the scene.
+const MATCHES: usize = 12;
+const SCENE_MATCHES: usize = 15;
+/// Fraction of the other matches that are the scene.
+const SCENE_FRACTION: f64 = 0.4;
+/// Planes of a pair that are tried.
+const PLANES: usize = 3;
+/// Median distance from the scene's epipolar lines of what moves, in long sides.
+const OFF: f64 = 0.012;
+/// Largest part of the long side, along each axis, of what moves.
+const PART: f64 = 0.5;
+/// Fraction of the third photographs that must show one thing.
+const ONE_THING: f64 = 0.8;
+/// Pairs, and their fraction, from which on something moves. Four captures with a moving board reach 0.22 to 0.76, clean ones 0.1 (before
+/// wallpaper), the others less.
+const PAIRS: usize = 4;
+const FRACTION: f64 = 0.15;
+
+/// The partners of each keypoint: `[photos][keypoints]` photograph and keypoint, ascending.
+type Partners = Vec<Vec<Vec<[u32; 2]>>>;
+
+/// A match `[keypoint, keypoint]` with its places.
+type Match = ([u32; 2], [DVec2; 2]);
+
+/// What moves, and the pairs that show it.
+pub(super) fn moving(evidence: &Evidence) -> (Vec<Diagnosis>, Vec<[u32; 2]>) {
+    let compared = strongest(evidence);
+    let partners = partners(evidence);
+    let counts: Vec<Option<usize>> = compared
+        .par_iter()
+        .map(|pair| {
+            let group = own_motion(evidence, pair)?;
+            is_one_thing(&partners, pair.photos, &group).then_some(group.len())
+        })
+        .collect();
+    let found: Vec<[u32; 2]> = compared
+        .iter()
+        .zip(&counts)
+        .filter(|f| f.1.is_some())
+        .map(|f| f.0.photos)
+        .collect();
+    if found.len() < PAIRS || (found.len() as f64) < FRACTION * compared.len() as f64 {
+        return (Vec::new(), Vec::new());
+    }
+    let matches = median(counts.into_iter().flatten().map(|count| count as f64).collect());
+    let diagnosis = Diagnosis::Moving {
+        photos: most_named(&found),
+        pairs: [found.len(), compared.len()],
+        matches: matches.unwrap_or(0.0) as usize,
+    };
+    (vec![diagnosis], found)
+}
+
+/// Each photograph's pairs with most matches, in their order.
+fn strongest<'a>(evidence: &Evidence<'a>) -> Vec<&'a PairMatches> {
+    let mut order: Vec<&PairMatches> = evidence.matches.iter().collect();
+    order.retain(|pair| pair.matches.len() >= MATCHES + SCENE_MATCHES);
+    order.sort_by_key(|pair| (std::cmp::Reverse(pair.matches.len()), pair.photos));
+    let mut count = vec![0; evidence.photos.len()];
+    order.retain(|pair| {
+        let ends = pair.photos.map(|p| p as usize);
+        ends.iter().for_each(|p| count[*p] += 1);
+        ends.iter().any(|p| count[*p] <= STRONGEST)
+    });
+    order
+}
+
+/// Matches on something compact that agree with one another and not with the scene.
+fn own_motion(evidence: &Evidence, pair: &PairMatches) -> Option<Vec<[u32; 2]>> {
+    let mut rest: Vec<Match> = pair.matches.iter().copied().zip(places(evidence, pair)).collect();
+    let mut others: Vec<Match> = Vec::new();
+    for _ in 0..PLANES {
+        let (group, left) = plane(pair, rest)?;
+        if is_compact(&group) {
+            let scene: Vec<Match> = [&others[..], &left[..]].concat();
+            if is_off(pair, &group, &scene) {
+                return Some(keypoints(group));
+            }
+        }
+        others.extend(group);
+        rest = left;
+    }
+    None
+}
+
+/// Whether `group` disagrees with the motion of `scene`, if that has one and is spread over the pictures.
+fn is_off(pair: &PairMatches, group: &[Match], scene: &[Match]) -> bool {
+    let points = Correspondences::new(scene.iter().map(|m| m.1).collect());
+    let problem = Fundamental {
+        points: &points,
+        threshold: AGREES,
+    };
+    let Some(found) = estimate(&problem, Vec::new(), limits(pair, 300)) else {
+        return false;
+    };
+    let agrees = |m: &&Match| sampson_squared(&found.model, m.1) < AGREES * AGREES;
+    let spread: Vec<Match> = scene.iter().filter(agrees).copied().collect();
+    let enough = spread.len() >= SCENE_MATCHES && spread.len() as f64 >= SCENE_FRACTION * scene.len() as f64;
+    let distances = group.iter().map(|m| sampson_squared(&found.model, m.1).sqrt());
+    enough && !is_compact(&spread) && median(distances.collect()).is_some_and(|distance| distance > OFF)
+}
+
+fn keypoints(matches: Vec<Match>) -> Vec<[u32; 2]> {
+    matches.into_iter().map(|m| m.0).collect()
+}
+
+/// The matches that agree with one plane, and the others; `None` if the first are few.
+fn plane(pair: &PairMatches, matches: Vec<Match>) -> Option<(Vec<Match>, Vec<Match>)> {
+    if matches.len() < MATCHES {
+        return None;
+    }
+    let points = Correspondences::new(matches.iter().map(|m| m.1).collect());
+    let problem = Homography {
+        points: &points,
+        threshold: AGREES,
+    };
+    let found = estimate(&problem, Vec::new(), limits(pair, 500))?;
+    let agrees = |m: &Match| {
+        let mapped = found.model * m.1[0].extend(1.0);
+        (mapped.truncate() / mapped.z - m.1[1]).length() < AGREES
+    };
+    let (group, left): (Vec<Match>, Vec<Match>) = matches.into_iter().partition(agrees);
+    (group.len() >= MATCHES).then_some((group, left))
+}
+
+/// Whether matches cover a small part of both pictures, but more than a point.
+fn is_compact(matches: &[Match]) -> bool {
+    let within = |side: usize, axis: usize| {
+        let mut values: Vec<f64> = matches.iter().map(|m| m.1[side][axis]).collect();
+        values.sort_by(f64::total_cmp);
+        // A tenth on either side may be chance.
+        let cut = values.len() / 10;
+        let width = values[values.len() - 1 - cut] - values[cut];
+        (0.005..PART).contains(&width)
+    };
+    [0, 1].iter().all(|side| within(*side, 0) && within(*side, 1))
+}
+
+fn partners(evidence: &Evidence) -> Partners {
+    let mut partners: Partners = evidence
+        .features
+        .iter()
+        .map(|features| vec![Vec::new(); features.keypoints.len()])
+        .collect();
+    for PairMatches {
+        photos: [a, b],
+        matches,
+    } in evidence.matches
+    {
+        for [i, j] in matches {
+            partners[*a as usize][*i as usize].push([*b, *j]);
+            partners[*b as usize][*j as usize].push([*a, *i]);
+        }
+    }
+    partners.iter_mut().flatten().for_each(|of| of.sort_unstable());
+    partners
+}
+
+/// Whether third photographs with a match on either side of these matches have it at the same keypoint.
+fn is_one_thing(partners: &Partners, [a, b]: [u32; 2], matches: &[[u32; 2]]) -> bool {
+    let (mut same, mut both) = (0, 0);
+    for [i, j] in matches {
+        let of_b: BTreeMap<u32, u32> = partners[b as usize][*j as usize]
+            .iter()
+            .map(|[p, k]| (*p, *k))
+            .collect();
+        for [photo, keypoint] in &partners[a as usize][*i as usize] {
+            if let Some(other) = of_b.get(photo) {
+                both += 1;
+                same += usize::from(other == keypoint);
+            }
+        }
+    }
+    both >= matches.len() && same as f64 >= ONE_THING * both as f64
+}

@@ -3,7 +3,9 @@
 use irradia_runs::formats::{DatasetFormat, DatasetOptions, read_dataset, read_image, write_png};
 use irradia_runs::scene::Camera;
 use irradia_runs::synth::{Capture, Part, SynthOptions};
-use irradia_runs::{DoctorInput, Finding, Mapper, PoseInput, PoseProgress, PoseReport, RunError, doctor, pose};
+use irradia_runs::{
+    DoctorInput, Finding, KnownDistance, Mapper, PoseInput, PoseProgress, PoseReport, RunError, doctor, pose,
+};
 use irradia_testkit::shared;
 use std::fs;
 use std::path::Path;
@@ -103,6 +105,62 @@ fn ray_traced_photographs_get_their_poses_back_and_a_second_call_reuses_the_feat
             .iter()
             .all(|stage| Duration::from_secs_f64(stage.seconds) < Duration::from_secs(600))
     );
+
+    // A known distance makes the unit a metre: here, two units of the truth.
+    let place = |name: &str| {
+        truth
+            .iter()
+            .find(|t| name.ends_with(t.0.as_str()))
+            .unwrap()
+            .1
+            .pose
+            .position
+    };
+    let [first, other] = [0, dataset.views.len() / 2].map(|i| dataset.views[i].name.clone());
+    let name = |path: &str| Path::new(path).file_name().unwrap().to_str().unwrap().to_owned();
+    let known = KnownDistance {
+        photos: [name(&first), name(&other)],
+        metres: f64::from(0.5 * place(&first).distance(place(&other))),
+    };
+    let mut in_metres = input.clone();
+    in_metres.distances = vec![known.clone()];
+    let scale = quietly(&in_metres).unwrap().scale.expect("a scale");
+    assert!(
+        scale.distances == 1 && (1e-6..0.05).contains(&scale.scale_error),
+        "{scale:?}"
+    );
+    let metric = read_dataset(&out, &DatasetOptions::default()).unwrap();
+    let view = |name: &str| {
+        metric
+            .views
+            .iter()
+            .find(|v| v.name == name)
+            .unwrap()
+            .camera
+            .pose
+            .position
+    };
+    let unit = metric.world_from_dataset.scale;
+    let mut ratios: Vec<f64> = Vec::new();
+    for pair in dataset.views.windows(6) {
+        let [a, b] = [&pair[0].name, &pair[5].name];
+        ratios.push(f64::from(view(a).distance(view(b)) / place(a).distance(place(b))) / unit);
+    }
+    ratios.sort_by(f64::total_cmp);
+    assert!((ratios[ratios.len() / 2] / 0.5 - 1.0).abs() < 0.03, "{ratios:?}");
+    for (photos, metres, reason) in [
+        (
+            ["nobody.png".to_owned(), name(&first)],
+            1.0,
+            "nobody.png is not among the photographs",
+        ),
+        ([name(&first), name(&first)], 1.0, "between two photographs"),
+        (known.photos.clone(), -1.0, "more than 0 metres"),
+    ] {
+        in_metres.distances = vec![KnownDistance { photos, metres }];
+        let error = quietly(&in_metres).unwrap_err().to_string();
+        assert!(error.contains(reason), "{error}");
+    }
 }
 
 #[test]

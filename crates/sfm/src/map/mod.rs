@@ -69,7 +69,7 @@ pub fn reconstruct(
         }
         let again = mapped(&apart, features, pairs, &cameras, options, progress);
         let registered = |found: &Reconstruction| found.models.first().map_or(0, Model::registered);
-        if registered(&again) < registered(&found) {
+        if registered(&again) < registered(&found) || !again.models.first().is_some_and(|m| zoom::holds(&zoom, m)) {
             break;
         }
         let zooms = [std::mem::take(&mut found.zooms), vec![zoom]].concat();

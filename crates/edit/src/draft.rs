@@ -111,6 +111,7 @@ pub(crate) fn gather(cloud: &GaussianCloud, indices: &[u32]) -> GaussianCloud {
         log_scales: rows(&cloud.log_scales, indices),
         opacity_logits: rows(&cloud.opacity_logits, indices),
         sh: harmonics,
+        extra: cloud.extra.iter().map(|column| column.gather(indices)).collect(),
         ..empty_like(cloud)
     }
 }
@@ -125,9 +126,19 @@ pub(crate) fn empty_like(cloud: &GaussianCloud) -> GaussianCloud {
     }
 }
 
-/// Appends the splats of `other`, which has the same world and degree.
+/// Appends the splats of `other`, which has the same world and degree. What the files of only one of them have for each splat is zero for
+/// those of the other.
 pub(crate) fn append(cloud: &mut GaussianCloud, other: &GaussianCloud) {
     assert_eq!(cloud.sh_degree, other.sh_degree, "clouds of the same degree");
+    for column in &other.extra {
+        // A name that has two types has one of them in a file.
+        if cloud.extra.iter().all(|own| own.name != column.name) {
+            cloud.extra.push(column.zeros(cloud.len()));
+        }
+    }
+    for column in &mut cloud.extra {
+        column.append(&other.extra, other.len());
+    }
     cloud.means.extend_from_slice(&other.means);
     cloud.quats.extend_from_slice(&other.quats);
     cloud.log_scales.extend_from_slice(&other.log_scales);
@@ -143,6 +154,9 @@ pub(crate) fn truncate(cloud: &mut GaussianCloud, n: usize) {
     cloud.log_scales.truncate(n);
     cloud.opacity_logits.truncate(n);
     cloud.sh.truncate(n * width);
+    for column in &mut cloud.extra {
+        column.bytes.truncate(n * column.scalar.size());
+    }
 }
 
 /// Writes the rows of `from` over the splats `indices`.
@@ -154,5 +168,8 @@ pub(crate) fn scatter(cloud: &mut GaussianCloud, indices: &[u32], from: &Gaussia
         cloud.log_scales[i] = from.log_scales[row];
         cloud.opacity_logits[i] = from.opacity_logits[row];
         cloud.sh[i * width..][..width].copy_from_slice(&from.sh[row * width..][..width]);
+    }
+    for (column, from) in cloud.extra.iter_mut().zip(&from.extra) {
+        column.scatter(indices, from);
     }
 }

@@ -102,6 +102,8 @@ struct Undo {
     rows: GaussianCloud,
     removed: bool,
     sh_degree: u32,
+    /// Columns of extra values before.
+    extra: usize,
     world_from_dataset: Similarity,
     /// If they were moved.
     cameras: Option<Vec<Camera>>,
@@ -133,6 +135,7 @@ impl Undo {
             indices,
             removed,
             sh_degree: draft.cloud.sh_degree,
+            extra: draft.cloud.extra.len(),
             world_from_dataset: draft.cloud.world_from_dataset,
             cameras: matches!(change, Change::TransformScene(_)).then(|| draft.cameras.clone()),
             hidden: draft.hidden.clone(),
@@ -169,6 +172,7 @@ impl Undo {
         } else {
             let was_longer = cloud.len() > self.len;
             truncate(cloud, self.len);
+            cloud.extra.truncate(self.extra);
             cloud.set_degree(self.sh_degree);
             scatter(cloud, &self.indices, &self.rows);
             let mut changed = Selection::none(self.len);

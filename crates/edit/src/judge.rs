@@ -11,11 +11,13 @@ use irradia_splat::{
 };
 
 /// Steps of Adam over all photographs, and its rates at the first and at the last.
-const STEPS: usize = 14;
+const STEPS: usize = 20;
 const RATES: [f32; 2] = [0.2, 0.02];
 /// Decay of the means of gradients and of their squares. It is short: the fog of the first steps has gradients a thousand times larger than
 /// those by which a wall gets back what it lost in it.
 const DECAY: f32 = 0.8;
+/// Steps after which suspects that began faint may vanish: a hundred veils of the faintest opacity are a fog in which no wall comes back.
+const FADING: usize = 6;
 /// Opacity from which on a splat has gradients: 1/255 in the middle and a little more around.
 const FAINTEST: f32 = 0.012;
 
@@ -85,7 +87,10 @@ pub(crate) fn needed(
             *square += (1.0 - DECAY) * (slope * slope - *square);
             let corrected = 1.0 - DECAY.powi(step as i32);
             let pace = (*mean / corrected) / ((*square / corrected).sqrt() + 1e-12);
-            let least = (FAINTEST / whole[i]).min(0.1);
+            let least = match first < 1.0 && step > FADING {
+                true => 0.0,
+                false => (FAINTEST / whole[i]).min(0.1),
+            };
             shares[i] = (shares[i] - rate * pace).clamp(least, 1.0);
         }
     }

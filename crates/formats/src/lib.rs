@@ -36,7 +36,7 @@ pub use pack::gzip;
 pub use photos::{CameraTags, PhotoEntry, PhotoFolder, has_photos, read_photo_folder};
 pub use points_ply::{read_points_ply, write_points_ply};
 pub use splats::{
-    Quality, SogDetail, SplatFile, SplatFormat, SpzVersion, WriteOptions, encode_splats, is_sog_folder,
+    Quality, SogDetail, SplatFile, SplatFormat, SpzVersion, WriteOptions, encode_splats, is_sog_folder, parse_splats,
     read_splat_file, read_splats, splat_file_size, through_format, write_splats, write_splats_with,
 };
 pub use tensors::{Tensor, read_tensors};

@@ -1,49 +1,38 @@
 //! The PLY container: the header, and the rows of one element as fixed-size scalars in whatever encoding.
 
 use crate::Malformed;
+use irradia_scene::Scalar;
 use std::borrow::Cow;
 
 /// A header is a few kilobytes; a file without `end_header` is not searched to its end.
 const MAX_HEADER: usize = 1 << 20;
 
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Scalar {
-    I8,
-    U8,
-    I16,
-    U16,
-    I32,
-    U32,
-    F32,
-    F64,
+/// The type of this name in a header.
+fn scalar_of(name: &str) -> Option<Scalar> {
+    Some(match name {
+        "char" | "int8" => Scalar::I8,
+        "uchar" | "uint8" => Scalar::U8,
+        "short" | "int16" => Scalar::I16,
+        "ushort" | "uint16" => Scalar::U16,
+        "int" | "int32" => Scalar::I32,
+        "uint" | "uint32" => Scalar::U32,
+        "float" | "float32" => Scalar::F32,
+        "double" | "float64" => Scalar::F64,
+        _ => return None,
+    })
 }
 
-impl Scalar {
-    fn from_name(name: &str) -> Option<Self> {
-        Some(match name {
-            "char" | "int8" => Self::I8,
-            "uchar" | "uint8" => Self::U8,
-            "short" | "int16" => Self::I16,
-            "ushort" | "uint16" => Self::U16,
-            "int" | "int32" => Self::I32,
-            "uint" | "uint32" => Self::U32,
-            "float" | "float32" => Self::F32,
-            "double" | "float64" => Self::F64,
-            _ => return None,
-        })
-    }
-
-    pub fn size(self) -> usize {
-        match self {
-            Self::I8 | Self::U8 => 1,
-            Self::I16 | Self::U16 => 2,
-            Self::I32 | Self::U32 | Self::F32 => 4,
-            Self::F64 => 8,
-        }
-    }
-
-    pub fn is_float(self) -> bool {
-        matches!(self, Self::F32 | Self::F64)
+/// The name of a type in a header.
+pub(crate) fn name_of(scalar: Scalar) -> &'static str {
+    match scalar {
+        Scalar::I8 => "char",
+        Scalar::U8 => "uchar",
+        Scalar::I16 => "short",
+        Scalar::U16 => "ushort",
+        Scalar::I32 => "int",
+        Scalar::U32 => "uint",
+        Scalar::F32 => "float",
+        Scalar::F64 => "double",
     }
 }
 
@@ -150,15 +139,15 @@ impl<'a> Ply<'a> {
                     properties: Vec::new(),
                 }),
                 ["property", "list", count, item, name] => {
-                    let count = Scalar::from_name(count).filter(|c| !c.is_float()).ok_or_else(refuse)?;
-                    let item = Scalar::from_name(item).ok_or_else(refuse)?;
+                    let count = scalar_of(count).filter(|c| !c.is_float()).ok_or_else(refuse)?;
+                    let item = scalar_of(item).ok_or_else(refuse)?;
                     elements.last_mut().ok_or_else(refuse)?.properties.push(Property {
                         name: name.to_owned(),
                         kind: PropertyKind::List { count, item },
                     });
                 }
                 ["property", scalar, name] => {
-                    let scalar = Scalar::from_name(scalar).ok_or_else(refuse)?;
+                    let scalar = scalar_of(scalar).ok_or_else(refuse)?;
                     elements.last_mut().ok_or_else(refuse)?.properties.push(Property {
                         name: name.to_owned(),
                         kind: PropertyKind::One(scalar),
@@ -189,6 +178,13 @@ impl<'a> Ply<'a> {
     /// Names of an element's properties, in order.
     pub fn property_names(&self, element: &str) -> Result<impl Iterator<Item = &str>, Malformed> {
         Ok(self.find(element)?.properties.iter().map(|p| p.name.as_str()))
+    }
+
+    /// Names of an element's properties and whether they are lists, in order.
+    pub fn properties(&self, element: &str) -> Result<impl Iterator<Item = (&str, bool)>, Malformed> {
+        let is_list = |property: &Property| matches!(property.kind, PropertyKind::List { .. });
+        let properties = self.find(element)?.properties.iter();
+        Ok(properties.map(move |property| (property.name.as_str(), is_list(property))))
     }
 
     /// The scalar properties of `element`; lists in it and all elements before it are skipped.
@@ -302,6 +298,11 @@ impl Rows<'_> {
         &self.bytes[index * self.stride..(index + 1) * self.stride]
     }
 
+    /// All columns with their names, in order.
+    pub fn named_columns(&self) -> impl Iterator<Item = (&str, Column)> {
+        self.columns.iter().map(|(name, column)| (name.as_str(), *column))
+    }
+
     pub fn column(&self, name: &str) -> Option<Column> {
         self.columns.iter().find(|(n, _)| n == name).map(|(_, c)| *c)
     }
@@ -346,6 +347,15 @@ impl Column {
             Scalar::U32 => f64::from(u32::from_ne_bytes(self.native(row))),
             Scalar::F32 => f64::from(f32::from_ne_bytes(self.native(row))),
             Scalar::F64 => f64::from_ne_bytes(self.native(row)),
+        }
+    }
+
+    /// Appends the value in `row`, little endian.
+    pub fn append_to(self, bytes: &mut Vec<u8>, row: &[u8]) {
+        let (start, value) = (bytes.len(), &row[self.offset..self.offset + self.scalar.size()]);
+        bytes.extend_from_slice(value);
+        if self.big_endian {
+            bytes[start..].reverse();
         }
     }
 

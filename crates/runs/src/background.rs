@@ -1,11 +1,31 @@
 //! The background of a scene.
 
 use crate::RunError;
-use irradia_scene::{Dataset, LoadError};
+use irradia_scene::{Dataset, LoadError, Photo};
 use irradia_train::recipe::{Knob, Param};
 use irradia_train::{Recipe, TrainError};
 use serde::{Deserialize, Serialize};
 use std::str::FromStr;
+
+/// Photographs that are asked about their border.
+const SAMPLES: usize = 8;
+/// Share of a photograph's outermost pixels that are white if its object is cut out: it may touch the border.
+const BORDER_SHARE: f64 = 0.9;
+/// Least value of a white pixel: compression leaves some noise.
+const WHITE: u8 = 250;
+
+/// Whether nearly all of the outermost pixels of `photo` are white.
+fn has_white_border(photo: &Photo) -> bool {
+    let (width, height, channels) = (photo.width as usize, photo.height as usize, photo.channels as usize);
+    let is_white = |x: usize, y: usize| {
+        let at = (y * width + x) * channels;
+        photo.data[at..at + channels].iter().all(|value| *value >= WHITE)
+    };
+    let rows = (0..width).flat_map(|x| [is_white(x, 0), is_white(x, height - 1)]);
+    let columns = (0..height).flat_map(|y| [is_white(0, y), is_white(width - 1, y)]);
+    let white = rows.chain(columns).filter(|white| *white).count();
+    white as f64 >= BORDER_SHARE * (2 * (width + height)) as f64
+}
 
 /// Background of photographs with alpha, and of a scene's splats or field.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -48,18 +68,34 @@ impl Background {
         }
     }
 
-    /// The default for a dataset: white for Blender scenes with transparent photographs, judged by the first one; the
-    /// recipe's own for others.
+    /// The default for a dataset: white for Blender scenes with transparent photographs, judged by the first one, and for
+    /// photographs without alpha of objects cut out on white, judged by [`SAMPLES`] of them; the recipe's own for others.
     ///
     /// # Errors
-    /// When that photograph cannot be read.
+    /// When one of these photographs cannot be read.
     pub fn usual(dataset: &Dataset) -> Result<Option<Self>, RunError> {
-        let first = dataset.train.first().filter(|_| dataset.kind == "Blender");
-        let Some(first) = first else { return Ok(None) };
-        let photo = dataset.views[*first].photo.load();
-        let photo = photo.map_err(|error: LoadError| RunError::Train(TrainError::Photo(error)))?;
-        let transparent = photo.alpha().is_some_and(|alpha| alpha.iter().any(|a| *a < 255));
-        Ok(transparent.then_some(Self::White))
+        let load = |view: &usize| {
+            let photo = dataset.views[*view].photo.load();
+            photo.map_err(|error: LoadError| RunError::Train(TrainError::Photo(error)))
+        };
+        let Some(first) = dataset.train.first() else {
+            return Ok(None);
+        };
+        let first = load(first)?;
+        if let Some(alpha) = first.alpha() {
+            let transparent = dataset.kind == "Blender" && alpha.iter().any(|a| *a < 255);
+            return Ok(transparent.then_some(Self::White));
+        }
+        if !has_white_border(&first) {
+            return Ok(None);
+        }
+        let every = dataset.train.len().div_ceil(SAMPLES);
+        for view in dataset.train.iter().step_by(every).skip(1) {
+            if !has_white_border(&load(view)?) {
+                return Ok(None);
+            }
+        }
+        Ok(Some(Self::White))
     }
 }
 
@@ -95,6 +131,26 @@ pub(crate) fn in_words(recipe: &Recipe) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_cut_out_object_may_touch_the_border_of_its_photograph() {
+        let photo = |value: &dyn Fn(u32, u32) -> u8| Photo {
+            width: 40,
+            height: 20,
+            channels: 3,
+            data: (0..800).flat_map(|i| [value(i % 40, i / 40); 3]).collect(),
+            mask: None,
+        };
+        assert!(has_white_border(&photo(&|_, _| 252)));
+        assert!(has_white_border(&photo(&|x, y| if (15..25).contains(&x) && y > 5 {
+            90
+        } else {
+            255
+        })));
+        // A table in the lower third.
+        assert!(!has_white_border(&photo(&|_, y| if y > 13 { 200 } else { 255 })));
+        assert!(!has_white_border(&photo(&|_, _| 240)));
+    }
 
     #[test]
     fn random_applies_to_every_stage_and_white_and_black_keep_the_recipes_own() {

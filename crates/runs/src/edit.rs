@@ -83,7 +83,7 @@ impl Editing {
         &self.made
     }
 
-    /// Makes edits in their order. Scenes to merge are found from the current folder.
+    /// Makes edits in their order. Scenes to merge are found from the current folder, or else beside this one.
     ///
     /// # Errors
     /// When one is not possible; those before it have been made.
@@ -97,7 +97,7 @@ impl Editing {
                 moved,
                 split,
                 ..
-            } = apply(&mut self.draft, edit, &open_scene)?;
+            } = apply(&mut self.draft, edit, &|file| open_scene(file, &self.path))?;
             if let Some(moved) = moved {
                 self.moved = self.moved.then(&moved);
             }
@@ -226,7 +226,7 @@ impl Editing {
         let mut draft = Draft::new(cloud, self.draft.cameras.clone());
         let mut total = Provenance::identity(draft.len());
         for edit in &self.list.edits {
-            total = total.then(&apply(&mut draft, edit, &open_scene)?.provenance);
+            total = total.then(&apply(&mut draft, edit, &|file| open_scene(file, &self.path))?.provenance);
         }
         draft.cloud.set_degree(degree);
         let source = |i: usize| total.source(i).filter(|_| !total.changed.contains(i));
@@ -280,8 +280,13 @@ impl Editing {
     }
 }
 
-fn open_scene(file: &str) -> Result<GaussianCloud, String> {
-    let path = scene_of(Path::new(file));
+/// The scene `file`, from the current folder or else beside the scene `path`.
+fn open_scene(file: &str, path: &Path) -> Result<GaussianCloud, String> {
+    let here = Path::new(file);
+    let path = match here.exists() {
+        true => scene_of(here),
+        false => scene_of(&path.with_file_name(file)),
+    };
     Ok(read_splat_file(&path).map_err(|error| error.to_string())?.cloud)
 }
 

@@ -1,4 +1,4 @@
-use crate::{Similarity, sh};
+use crate::{ExtraColumn, Similarity, sh};
 use glam::DVec3;
 
 /// 3D Gaussians on the host, in the parameterisation of splat files. All columns have the same N.
@@ -20,6 +20,8 @@ pub struct GaussianCloud {
     pub antialiased: bool,
     /// From the coordinates of the dataset, in which files are written, to those of `means` and `log_scales`.
     pub world_from_dataset: Similarity,
+    /// What the file has beyond that for each splat, `[N]` each, names differing.
+    pub extra: Vec<ExtraColumn>,
 }
 
 impl GaussianCloud {
@@ -45,6 +47,7 @@ impl GaussianCloud {
             && self.log_scales.len() == n
             && self.opacity_logits.len() == n
             && self.sh.len() == n * self.sh_coefficients() * 3
+            && self.extra.iter().all(|column| column.len() == n)
     }
 
     /// Gives harmonics of `degree`: higher bands are dropped, new ones are zero.

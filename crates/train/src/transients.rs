@@ -3,7 +3,8 @@
 //! From time to time all training views are rendered. Where a photograph differs from its frame by a patch of another colour, while
 //! other views that see the same surface agree with theirs, the patch shows something that was only there once, and is hidden from
 //! training from then on. Surfaces that splats have not reached yet differ too, but in all views that see them, and detail averages
-//! out over a block of pixels. Robust losses compare residuals within one photograph (RobustNeRF, Sabour et al. 2023;
+//! out over a block of pixels. And a patch that the other photographs show too is no transient: a veil before the camera hides it in the
+//! frame. Robust losses compare residuals within one photograph (RobustNeRF, Sabour et al. 2023;
 //! SpotLessSplats, Sabour et al. 2024), here they are compared with those of other photographs at the same place: no share of outliers has
 //! to be assumed, and where there are none, nothing is hidden.
 
@@ -86,6 +87,8 @@ pub(crate) struct Difference {
     grid: Grid,
     /// Largest difference of the mean colour over the channels, beyond that of the whole photograph; NaN where masked.
     color: Vec<f32>,
+    /// Mean colour of the photograph, less that difference of the whole; NaN where masked.
+    photo: Vec<[f32; 3]>,
     /// Depth along +Z, world units; NaN where masked.
     depth: Vec<f32>,
 }
@@ -102,13 +105,15 @@ impl Difference {
                 (i / grid.columns, grid.rows, height),
             ]
             .map(|(at, blocks, side)| Grid::start(at, blocks, side)..Grid::start(at + 1, blocks, side));
-            let (mut color, mut depth, mut alpha, mut count) = ([0.0f32; 3], 0.0, 0.0, 0.0f32);
+            let (mut color, mut shown, mut depth, mut alpha, mut count) = ([0.0f32; 3], [0.0; 3], 0.0, 0.0, 0.0f32);
             for at in rows.flat_map(|y| columns.clone().map(move |x| y * width + x)) {
                 if photo.mask.as_ref().is_some_and(|mask| mask[at] == 0) {
                     continue;
                 }
-                for (c, sum) in color.iter_mut().enumerate() {
-                    *sum += f32::from(photo.rgb[3 * at + c]) / 255.0 - frame.color[c * pixels + at];
+                for c in 0..3 {
+                    let value = f32::from(photo.rgb[3 * at + c]) / 255.0;
+                    shown[c] += value;
+                    color[c] += value - frame.color[c * pixels + at];
                 }
                 depth += frame.depth[at];
                 alpha += frame.alpha[at];
@@ -119,15 +124,16 @@ impl Difference {
             } else {
                 FAR * extent
             };
-            (color.map(|sum| sum / count), if count > 0.0 { depth } else { f32::NAN })
+            let mean = |sums: [f32; 3]| sums.map(|sum| sum / count);
+            (mean(color), mean(shown), if count > 0.0 { depth } else { f32::NAN })
         };
-        let blocks: Vec<([f32; 3], f32)> = (0..grid.len()).into_par_iter().map(block).collect();
+        let blocks: Vec<([f32; 3], [f32; 3], f32)> = (0..grid.len()).into_par_iter().map(block).collect();
         // What the photograph differs by as a whole is its exposure.
         let whole: [f32; 3] = std::array::from_fn(|c| {
-            let mut values: Vec<f32> = blocks.iter().map(|(color, _)| color[c]).collect();
+            let mut values: Vec<f32> = blocks.iter().map(|(color, ..)| color[c]).collect();
             quantile(&mut values, 0.5).unwrap_or(0.0)
         });
-        let beyond = |(color, _): &([f32; 3], f32)| {
+        let beyond = |(color, ..): &([f32; 3], [f32; 3], f32)| {
             let difference = |c: usize| (color[c] - whole[c]).abs();
             // NaN in one channel is NaN in all, and `max` would drop it.
             difference(0)
@@ -139,7 +145,11 @@ impl Difference {
             camera: *camera,
             grid,
             color: blocks.iter().map(beyond).collect(),
-            depth: blocks.iter().map(|(_, depth)| *depth).collect(),
+            photo: blocks
+                .iter()
+                .map(|(_, shown, _)| std::array::from_fn(|c| shown[c] - whole[c]))
+                .collect(),
+            depth: blocks.iter().map(|(.., depth)| *depth).collect(),
         }
     }
 
@@ -195,13 +205,17 @@ impl Hidden {
                 let witness = |(_, other): &(f32, usize)| {
                     let (view, difference) = &views[*other];
                     let block = difference.sees(place)?;
-                    (!already.contains(*view, block)).then_some(difference.color[block])
+                    (!already.contains(*view, block)).then_some((difference.color[block], difference.photo[block]))
                 };
-                let mut seen: Vec<f32> = others.iter().filter_map(witness).collect();
+                let (mut seen, shown): (Vec<f32>, Vec<[f32; 3]>) = others.iter().filter_map(witness).unzip();
                 if seen.len() < MIN_WITNESSES {
                     return 0.0;
                 }
-                own.color[i] / LEAST.max(FACTOR * quantile(&mut seen, WITNESS_QUANTILE).unwrap_or(0.0))
+                // A veil before this camera differs from what the others show, the photograph behind it does not.
+                let usual = |c: usize| quantile(&mut shown.iter().map(|color| color[c]).collect(), 0.5);
+                let unlike = (0..3).filter_map(|c| Some((own.photo[i][c] - usual(c)?).abs()));
+                let least = LEAST.max(FACTOR * quantile(&mut seen, WITNESS_QUANTILE).unwrap_or(0.0));
+                (own.color[i] / least).min(unlike.fold(0.0, f32::max) / LEAST)
             };
             let excess: Vec<f32> = (0..own.grid.len()).map(excess).collect();
             (*view, patches(own.grid, &excess))
@@ -377,6 +391,19 @@ mod tests {
         assert_eq!(again, hidden);
         assert!(Hidden::from_pairs(&[4, 0], |view| (view == 3).then_some(&camera)).is_none());
         assert!(Hidden::from_pairs(&[3, 1 << 40], |_| Some(&camera)).is_none());
+    }
+
+    #[test]
+    fn what_a_veil_before_one_camera_covers_is_not_hidden() {
+        let veiled = |(view, wall): (usize, Difference)| {
+            let mut difference = of_frame(&wall.camera, person);
+            if view != 3 {
+                difference.color.fill(0.0);
+            }
+            (view, difference)
+        };
+        let views: Vec<(usize, Difference)> = wall(8).into_iter().map(veiled).collect();
+        assert_eq!(Hidden::find(&views, 1.0, &Hidden::default()), Hidden::default());
     }
 
     #[test]

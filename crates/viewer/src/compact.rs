@@ -1,6 +1,7 @@
 //! Splats as they travel to a browser that draws them itself: most important first, so that a picture stands early.
 //!
-//! Little endian. A header of 32 bytes: `IRS1`, number of splats, SH degree, splats per block, four words of zero; then blocks.
+//! Little endian. A header of 32 bytes: `IRS1`, number of splats, SH degree, splats per block, numbers of splats of up to three levels
+//! of detail, a word of zero; then the blocks of the scene, and those of each level.
 //! A block holds for each of its splats, 32 bytes: mean (3 x f32, world), ln of the standard deviations (3 x f16), opacity (f16),
 //! rotation (48 bits), colour of degree 0 (3 x f16, sRGB); then for each of them the higher bands, see [`band_bytes`]: a factor
 //! (f16), and the coefficients in units of the factor / 127 (i8; coefficient by coefficient, red, green, blue).
@@ -13,9 +14,12 @@ use irradia_scene::half::{from_half, half};
 use irradia_scene::sh;
 use irradia_splat::Splats;
 use rayon::prelude::*;
+use std::borrow::Cow;
 
 /// Splats per block: of 500,000 the first block is 1.6 %.
 pub(crate) const BLOCK: usize = 8192;
+/// Levels of detail for which the header has room.
+const LEVELS: usize = 3;
 /// Bytes of the header.
 const HEADER: usize = 32;
 /// Bytes of a splat without its higher bands.
@@ -30,19 +34,33 @@ pub(crate) const fn band_bytes(degree: u32) -> usize {
 pub(crate) fn compact(splats: &Splats, degree: u32, most: usize) -> Vec<u8> {
     let mut order = by_importance(splats);
     order.truncate(most);
-    compact_in_order(splats, degree, &order)
+    compact_in_order(splats, degree, &order, &[])
 }
 
-/// The splats `order` in compact form, with bands up to `degree`.
-pub(crate) fn compact_in_order(splats: &Splats, degree: u32, order: &[u32]) -> Vec<u8> {
+/// The splats `order` in compact form, with bands up to `degree`, and behind them `levels` of the same degree, most important first.
+pub(crate) fn compact_in_order(splats: &Splats, degree: u32, order: &[u32], levels: &[Splats]) -> Vec<u8> {
     let degree = degree.min(splats.sh_degree());
-    let band = band_bytes(degree);
-    let mut bytes = vec![0; HEADER + order.len() * (CORE + band)];
+    let mut parts = vec![(splats, Cow::Borrowed(order))];
+    let levels = levels.iter().filter(|level| level.sh_degree() >= degree).take(LEVELS);
+    parts.extend(levels.map(|level| (level, Cow::Owned(by_importance(level)))));
+    let mut bytes = vec![0; HEADER];
     bytes[..4].copy_from_slice(b"IRS1");
-    for (at, value) in [order.len() as u32, degree, BLOCK as u32].into_iter().enumerate() {
+    let counts: Vec<u32> = parts.iter().map(|(_, order)| order.len() as u32).collect();
+    let words = [&[counts[0], degree, BLOCK as u32], &counts[1..]].concat();
+    for (at, value) in words.into_iter().enumerate() {
         bytes[4 + 4 * at..][..4].copy_from_slice(&value.to_le_bytes());
     }
-    bytes[HEADER..]
+    for (splats, order) in parts {
+        write_blocks(splats, degree, &order, &mut bytes);
+    }
+    bytes
+}
+
+fn write_blocks(splats: &Splats, degree: u32, order: &[u32], bytes: &mut Vec<u8>) {
+    let band = band_bytes(degree);
+    let start = bytes.len();
+    bytes.resize(start + order.len() * (CORE + band), 0);
+    bytes[start..]
         .par_chunks_mut(BLOCK * (CORE + band))
         .zip(order.par_chunks(BLOCK))
         .for_each(|(to, order)| {
@@ -56,7 +74,6 @@ pub(crate) fn compact_in_order(splats: &Splats, degree: u32, order: &[u32]) -> V
                 }
             }
         });
-    bytes
 }
 
 fn write_core(splats: &Splats, i: usize, to: &mut [u8]) {
@@ -165,5 +182,14 @@ mod tests {
             let value = f32::from(band[2 + n] as i8) / 127.0 * factor;
             assert!((value - (n as f32 - 4.0) * 0.1).abs() < 0.002, "{n}: {value}");
         }
+        let with_level = compact_in_order(&splats, 3, &[2, 3], &[splats.gather(&[3])]);
+        let at = bytes.len();
+        assert_eq!(with_level.len(), at + CORE + 16);
+        assert_eq!(
+            (&with_level[16..20], &with_level[20..28]),
+            (&1u32.to_le_bytes()[..], &[0; 8][..])
+        );
+        assert_eq!(with_level[HEADER..at], bytes[HEADER..]);
+        assert_eq!(with_level[at..at + 4], 3f32.to_le_bytes());
     }
 }

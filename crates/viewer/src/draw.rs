@@ -59,7 +59,7 @@ fn draw_picture(
     renewed: &mut u64,
 ) {
     let opened = Instant::now();
-    painter.prepare(edition, &detail);
+    painter.prepare(edition, shot, &detail);
     // What is done once a version does not tell what pictures cost.
     let started = Instant::now();
     let k = shot.camera.intrinsics.scaled(detail.pixels.sqrt());

@@ -12,6 +12,8 @@ use std::net::IpAddr;
 
 /// Name of the cookie, and of the parameter of the address.
 pub const TOKEN: &str = "token";
+/// Where pages send scenes to.
+pub const UPLOADS: &str = "/merge/";
 
 /// Why a request is refused.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -26,7 +28,7 @@ impl Refusal {
     /// In words, for the log and the answer.
     pub fn reason(self) -> &'static str {
         match self {
-            Self::Method => "only GET is answered",
+            Self::Method => "only GET is answered, and scenes to merge",
             Self::Host => "the Host of the request is not this server",
             Self::Origin => "the request comes from a page of another site",
             Self::Token => "the address lacks the token: use the one that was printed",
@@ -52,7 +54,8 @@ pub(crate) struct Guard {
 impl Guard {
     /// Checks one request.
     pub fn check(&self, method: &Method, uri: &Uri, headers: &HeaderMap) -> Result<Entry, Refusal> {
-        if method != Method::GET {
+        let sends = method == Method::POST && uri.path().starts_with(UPLOADS);
+        if method != Method::GET && !sends {
             return Err(Refusal::Method);
         }
         let text = |name: &str| headers.get(name).and_then(|value| value.to_str().ok());
@@ -62,6 +65,8 @@ impl Guard {
         }
         match headers.get(ORIGIN) {
             Some(origin) if origin.as_bytes() != format!("http://{host}").as_bytes() => return Err(Refusal::Origin),
+            // Every browser says who sends.
+            None if sends => return Err(Refusal::Origin),
             _ => {}
         }
         // A link on another site may lead to the page; nothing else of it may be used there.
@@ -194,6 +199,14 @@ mod tests {
             local().check(&Method::POST, &Uri::from_static("/"), &HeaderMap::new()),
             Err(Refusal::Method)
         );
+        let post = |origin: Option<&'static str>| {
+            let mut headers = HeaderMap::from_iter([(HOST, "localhost:7979".parse().expect("a header"))]);
+            headers.extend(origin.map(|origin| (ORIGIN, origin.parse().expect("a header"))));
+            local().check(&Method::POST, &Uri::from_static("/merge/a.ply"), &headers)
+        };
+        assert_eq!(post(Some("http://localhost:7979")), Ok(Entry::Plain));
+        assert_eq!(post(Some("http://evil.example")), Err(Refusal::Origin));
+        assert_eq!(post(None), Err(Refusal::Origin));
     }
 
     #[test]

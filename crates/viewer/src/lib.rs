@@ -14,6 +14,7 @@
 //! |---|---|
 //! | `subject.rs`, `views.rs`, `live.rs` | what is looked at: a scene, its photographs, a training |
 //! | `desk.rs`, `pace.rs`, `draw.rs` | who wants which picture, when it is drawn, at which size |
+//! | `levels.rs` | which level of detail a moving camera gets |
 //! | `paint.rs`, `palette.rs` | a camera's picture: colours, depth, normals, counts, ellipses, errors |
 //! | `editing/` | selections and edits of a finished scene, which all pages share |
 //! | `compact.rs`, `importance.rs` | splats as they travel to a browser that draws them itself, most important first |
@@ -34,6 +35,7 @@ mod error;
 mod guard;
 mod importance;
 mod kernels;
+mod levels;
 mod listen;
 mod live;
 mod message;

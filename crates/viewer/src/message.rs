@@ -236,7 +236,7 @@ impl EditRequest {
         }
     }
 
-    /// Whether every number is in range, and nothing names a file.
+    /// Whether every number is in range.
     ///
     /// # Errors
     /// One line that names the number.
@@ -255,19 +255,7 @@ impl EditRequest {
                 }
                 steps.iter().try_for_each(SelectStep::check)
             }
-            Self::Edit {
-                edit: Operation::Merge { .. },
-                ..
-            } => Err(EditError::Selection("a page merges no files".to_owned())),
-            Self::Replay { list } => {
-                let merges = |edit: &Edit| matches!(edit.op, Operation::Merge { .. });
-                match EditList::parse(list)?.edits.iter().any(merges) {
-                    true => Err(EditError::Selection(
-                        "a page merges no files: make these edits with irradia edit --edits".to_owned(),
-                    )),
-                    false => Ok(()),
-                }
-            }
+            Self::Replay { list } => EditList::parse(list).map(drop),
             Self::Edit { whole, edit, .. } => {
                 let edit = Edit {
                     op: edit.clone(),

@@ -38,6 +38,7 @@ const FILES: &[(&str, &str, &str)] = files![
     SCRIPT "js/local/assets.js",
     SCRIPT "js/local/device.js",
     SCRIPT "js/local/frame.js",
+    SCRIPT "js/local/levels.js",
     SCRIPT "js/local/order.js",
     SCRIPT "js/local/renderer.js",
     SCRIPT "js/local/sort.js",

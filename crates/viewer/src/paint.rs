@@ -66,18 +66,32 @@ struct Most {
 #[derive(Clone, Copy, PartialEq)]
 struct Alteration {
     version: u64,
-    /// Whether they are altered from [`Painter::most`].
-    most: bool,
+    part: Part,
     clip: Option<[[f32; 3]; 2]>,
     normals: bool,
     /// Whether selected splats are tinted.
     highlight: bool,
 }
 
+/// What of the scene is altered.
+#[derive(Clone, Copy, PartialEq)]
+enum Part {
+    /// [`Painter::most`].
+    Most,
+    /// A level of detail; 0 is the scene itself.
+    Level(usize),
+}
+
+/// Whether levels of detail may stand for the scene: not where splats are shown as such, or selected ones are tinted.
+fn has_levels(edition: &Edition, shot: &Shot) -> bool {
+    !edition.levels.all().is_empty() && shot.mode == Mode::Color && !(shot.highlight && edition.selected.is_some())
+}
+
 impl Painter {
     /// Makes what pictures of this detail need, once a version.
-    pub fn prepare(&mut self, edition: &Edition, detail: &Detail) {
+    pub fn prepare(&mut self, edition: &Edition, shot: &Shot, detail: &Detail) {
         if detail.splats == 1.0
+            || has_levels(edition, shot)
             || self
                 .most
                 .as_ref()
@@ -118,14 +132,23 @@ impl Painter {
         let (rgb, range) = match (&scene.model, shot.mode) {
             (Model::Splats { splats, residual }, mode) => {
                 let most = self.most.take();
-                let few = most.as_ref().filter(|_| detail.splats < 1.0);
+                let number = match detail.moving && has_levels(edition, shot) {
+                    true => edition.levels.choose(&camera, detail.splats),
+                    false => 0,
+                };
+                let level = edition.levels.get(number);
+                let few = most.as_ref().filter(|_| detail.splats < 1.0 && level.is_none());
                 let options = RenderOptions {
                     sh_degree: if mode == Mode::Normals { 0 } else { options.sh_degree },
                     first: few.map_or(usize::MAX, |_| (detail.splats * splats.len() as f32) as usize),
                     ..options
                 };
-                let splats = few.map_or(splats.as_ref(), |most| &most.splats);
-                let altered = self.altered(edition, splats, few.map(|most| &most.order[..]), shot, &camera);
+                let part = match few {
+                    Some(_) => Part::Most,
+                    None => Part::Level(number),
+                };
+                let splats = few.map_or(level.unwrap_or(splats), |most| &most.splats);
+                let altered = self.altered(edition, splats, part, few.map(|most| &most.order[..]), shot, &camera);
                 let splats = altered.as_ref().map_or(splats, |(_, splats)| splats);
                 let residual = residual.as_deref().filter(|_| mode != Mode::Normals);
                 render_splats(splats, residual, &mut self.renderer, &camera, &options);
@@ -151,6 +174,7 @@ impl Painter {
         &mut self,
         edition: &Edition,
         splats: &Splats,
+        part: Part,
         order: Option<&[u32]>,
         shot: &Shot,
         camera: &Camera,
@@ -159,7 +183,7 @@ impl Painter {
         let selected = edition.selected.as_deref().filter(|_| shot.highlight && has_colors);
         let alteration = Alteration {
             version: edition.version,
-            most: order.is_some(),
+            part,
             clip: shot.clip,
             normals: shot.mode == Mode::Normals,
             highlight: selected.is_some(),
@@ -296,6 +320,7 @@ impl Painter {
                 let altered = self.altered(
                     edition,
                     splats,
+                    Part::Level(0),
                     None,
                     &Shot {
                         mode: Mode::Color,

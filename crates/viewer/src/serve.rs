@@ -4,14 +4,14 @@ use crate::compact::compact_in_order;
 use crate::desk::Desk;
 use crate::draw::encode;
 use crate::editing::stem_of;
-use crate::guard::{Entry, Guard, TOKEN};
+use crate::guard::{Entry, Guard, TOKEN, UPLOADS};
 use crate::importance::by_importance;
 use crate::message::MAX_REQUEST;
 use crate::notices::Notices;
 use crate::subject::{Edition, Subject};
 use crate::{client, page};
 use axum::Router;
-use axum::body::{Body, Bytes};
+use axum::body::{Body, Bytes, to_bytes};
 use axum::extract::{Path, Request, State, WebSocketUpgrade};
 use axum::http::header::{
     CACHE_CONTROL, CONTENT_DISPOSITION, CONTENT_SECURITY_POLICY, CONTENT_TYPE, REFERRER_POLICY, SET_COOKIE,
@@ -20,19 +20,28 @@ use axum::http::header::{
 use axum::http::{HeaderValue, StatusCode};
 use axum::middleware::{Next, from_fn_with_state};
 use axum::response::{IntoResponse, Response};
-use axum::routing::get;
+use axum::routing::{get, post};
 use irradia_runs::formats::{SplatFormat, encode_splats};
 use irradia_scene::Photo;
+use serde_json::json;
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
 use tokio::sync::Semaphore;
+use tokio::time::timeout;
 
 /// Longer side of a thumbnail, pixels.
 const THUMBNAIL: u32 = 192;
 /// Bytes of thumbnails that are kept.
 const THUMBNAILS: usize = 16 << 20;
+/// Bytes of a scene that a page sends.
+const MOST_UPLOADED: usize = 1 << 30;
+/// Time to send it.
+const UPLOADING: Duration = Duration::from_secs(600);
 /// JPEG quality of photographs.
 const QUALITY: u8 = 90;
+/// Splats of a scene whose levels of detail travel to a page as well: larger ones fill the textures of many browsers alone.
+const WITH_LEVELS: usize = 4_000_000;
 /// Only what this server serves is loaded, and nobody may frame the page.
 const POLICY: &str = "default-src 'self'; img-src 'self' blob: data:; style-src 'self' 'unsafe-inline'; frame-ancestors 'none'; \
                       base-uri 'none'; form-action 'none'";
@@ -52,6 +61,8 @@ pub(crate) struct Shared {
     decoding: Semaphore,
     /// Scenes that may be packed at once.
     packing: Semaphore,
+    /// Scenes that may be sent at once.
+    uploading: Semaphore,
 }
 
 impl Shared {
@@ -66,6 +77,7 @@ impl Shared {
             thumbnails: Mutex::default(),
             decoding: Semaphore::new(2),
             packing: Semaphore::new(1),
+            uploading: Semaphore::new(1),
         }
     }
 }
@@ -95,6 +107,7 @@ pub(crate) fn router(shared: Arc<Shared>) -> Router {
         .route("/splats", get(splats))
         .route("/selection/{version}", get(selection))
         .route("/download/{format}", get(download))
+        .route(&format!("{UPLOADS}{{name}}"), post(upload))
         .route(
             "/view/{view}/photo",
             get(|app: App, Path(view): Path<usize>| photo(app, view, None)),
@@ -163,7 +176,12 @@ async fn splats(State(shared): App) -> Response {
         }
         let scene = edition.scene();
         let order = worker.order(&edition)?;
-        let bytes = Bytes::from(compact_in_order(scene.model.splats()?, scene.options.sh_degree, &order));
+        let levels = match order.len() <= WITH_LEVELS {
+            true => edition.levels.all(),
+            false => &[],
+        };
+        let bytes = compact_in_order(scene.model.splats()?, scene.options.sh_degree, &order, levels);
+        let bytes = Bytes::from(bytes);
         *kept = Some((edition.splats_version, bytes.clone()));
         Some(bytes)
     });
@@ -242,6 +260,37 @@ async fn download(State(shared): App, Path(name): Path<String>) -> Response {
             (headers, Body::from(bytes)).into_response()
         }
         Ok(Err(why)) => (StatusCode::INTERNAL_SERVER_ERROR, why).into_response(),
+        Err(_) => StatusCode::INTERNAL_SERVER_ERROR.into_response(),
+    }
+}
+
+/// Keeps a scene that a page sends, to be merged by an edit with the name that is answered.
+async fn upload(State(shared): App, Path(name): Path<String>, body: Body) -> Response {
+    if shared.subject.editing.is_err() {
+        return StatusCode::NOT_FOUND.into_response();
+    }
+    let Ok(_permit) = shared.uploading.acquire().await else {
+        return StatusCode::SERVICE_UNAVAILABLE.into_response();
+    };
+    let bytes = match timeout(UPLOADING, to_bytes(body, MOST_UPLOADED)).await {
+        Ok(Ok(bytes)) => bytes,
+        Ok(Err(_)) => {
+            let why = "the scene is cut off, or larger than 1 GiB: merge it with irradia edit";
+            return (StatusCode::PAYLOAD_TOO_LARGE, why).into_response();
+        }
+        Err(_) => return (StatusCode::REQUEST_TIMEOUT, "the scene came too slowly").into_response(),
+    };
+    let worker = shared.clone();
+    let added = tokio::task::spawn_blocking(move || match &worker.subject.editing {
+        Ok(editing) => editing
+            .uploads
+            .add(&name, bytes.into())
+            .map_err(|error| error.to_string()),
+        Err(why) => Err((*why).to_owned()),
+    });
+    match added.await {
+        Ok(Ok((name, splats))) => json!({ "name": name, "splats": splats }).to_string().into_response(),
+        Ok(Err(why)) => (StatusCode::UNPROCESSABLE_ENTITY, why).into_response(),
         Err(_) => StatusCode::INTERNAL_SERVER_ERROR.into_response(),
     }
 }

@@ -27,7 +27,9 @@ const KEYS_PER_SECOND: f32 = 5.0;
 const TRIES: u32 = 5;
 
 /// Modules of the page that draw, in `js/local/`.
-const DRAWING: [&str; 7] = ["device", "frame", "renderer", "sort", "stream", "webgl", "webgpu"];
+const DRAWING: [&str; 8] = [
+    "device", "frame", "levels", "renderer", "sort", "stream", "webgl", "webgpu",
+];
 /// Their shaders, beside the program's own.
 const SHADERS: [&str; 7] = [
     "shaders/project.vert",

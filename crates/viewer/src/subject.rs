@@ -2,10 +2,11 @@
 
 use crate::ViewerError;
 use crate::editing::Editing;
+use crate::levels::Levels;
 use crate::live::{Live, Watcher};
 use crate::views::Views;
 use irradia_edit::Transform;
-use irradia_runs::{Reading, Run, RunFolder, Scene, Snapshot, TrainInput, scene_of};
+use irradia_runs::{Reading, Run, RunFolder, Scene, Snapshot, TrainInput, read_levels, scene_of};
 use irradia_scene::Dataset;
 use irradia_splat::Splats;
 use irradia_splat::init::{InitOptions, from_points};
@@ -24,6 +25,8 @@ pub(crate) struct Edition {
     pub selected: Option<Arc<Vec<bool>>>,
     /// How the scene was moved by edits, and with it what stands in it, such as the cameras of views.
     pub placement: Transform,
+    /// Levels of detail of these splats, as far as there are any: an edit leaves none.
+    pub levels: Levels,
     held: Held,
 }
 
@@ -34,12 +37,13 @@ enum Held {
 }
 
 impl Edition {
-    fn of_scene(scene: Scene) -> Self {
+    fn of_scene(scene: Scene, levels: Levels) -> Self {
         Self {
             version: 1,
             splats_version: 1,
             selected: None,
             placement: Transform::IDENTITY,
+            levels,
             held: Held::Scene(Arc::new(scene)),
         }
     }
@@ -111,6 +115,14 @@ impl Subject {
         let recipe = folder
             .as_ref()
             .and_then(|folder| std::fs::read_to_string(folder.file("recipe.toml")).ok());
+        let levels = match &scene.model {
+            Model::Splats { splats, residual: None } => read_levels(&file, splats.len()),
+            _ => Ok(Vec::new()),
+        };
+        let levels = levels.unwrap_or_else(|error| {
+            warnings.push(format!("no levels of detail: {error}"));
+            Vec::new()
+        });
         let editing = match &scene.model {
             Model::Splats { splats, residual: None } => Ok(Editing::new(file, splats.len())),
             Model::Splats { .. } => {
@@ -125,7 +137,7 @@ impl Subject {
             live: None,
             folder,
             recipe,
-            edition: Mutex::new(Some(Edition::of_scene(scene))),
+            edition: Mutex::new(Some(Edition::of_scene(scene, Levels::new(levels)))),
             warnings,
         })
     }
@@ -156,7 +168,7 @@ impl Subject {
             live: None,
             folder: None,
             recipe: None,
-            edition: Mutex::new(Some(Edition::of_scene(scene))),
+            edition: Mutex::new(Some(Edition::of_scene(scene, Levels::default()))),
             warnings,
         }
     }
@@ -188,6 +200,7 @@ impl Subject {
         edition.selected = selected;
         if let Some(scene) = scene {
             edition.splats_version = edition.version;
+            edition.levels = Levels::default();
             edition.held = Held::Scene(Arc::new(scene));
         }
     }
@@ -204,6 +217,7 @@ impl Subject {
                     splats_version: version,
                     selected: None,
                     placement: Transform::IDENTITY,
+                    levels: Levels::default(),
                     held: Held::Snapshot(snapshot),
                 });
             }

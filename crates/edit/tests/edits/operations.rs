@@ -1,7 +1,7 @@
 use crate::{cloud, difference, draft, edited, make};
 use glam::{DQuat, DVec3};
-use irradia_edit::{Draft, Edit, Operation, apply, open_nothing};
-use irradia_scene::Similarity;
+use irradia_edit::{Draft, Edit, History, Operation, apply, open_nothing};
+use irradia_scene::{ExtraColumn, Scalar, Similarity};
 
 /// Edits that change nothing, to the bit.
 #[test]
@@ -149,6 +149,45 @@ fn locked_and_hidden_splats_are_left_alone_but_move_with_the_scene() {
     assert_eq!((hidden.len(), hidden.shown().len()), (200, 0));
     let partly = edited(&hidden, &["show sphere center=0,0,0 radius=0.5"]);
     assert!((1..200).contains(&partly.shown().len()));
+}
+
+/// Numbers 0, 1, .. as an extra column.
+fn numbered(name: &str, n: u16) -> ExtraColumn {
+    ExtraColumn {
+        name: name.into(),
+        scalar: Scalar::U16,
+        bytes: (0..n).flat_map(u16::to_le_bytes).collect(),
+    }
+}
+
+#[test]
+fn what_files_have_beyond_ours_follows_its_splats() {
+    let mut draft = draft(100, 1);
+    draft.cloud.extra = vec![numbered("label", 100)];
+    let before = draft.clone();
+    let mut other = cloud(10, 0, 2);
+    other.extra = vec![numbered("time", 10), numbered("label", 10)];
+    let is_where_it_was = |draft: &Draft, i: usize, label: usize| {
+        let place = before.cloud.means[label] == draft.cloud.means[i];
+        place && draft.cloud.extra[0].get(i) == (label as u16).to_le_bytes()
+    };
+    let mut history = History::new(draft);
+    let mut make = |line: &str| history.apply(&line.parse().unwrap(), &|_| Ok(other.clone())).map(drop);
+    make("delete half-space point=0,0,0 normal=1,0,0").unwrap();
+    make("duplicate half-space point=0,0,0 normal=0,1,0").unwrap();
+    make("merge file=other").unwrap();
+    make("recolor exposure=1").unwrap();
+    let now = history.draft();
+    let label = |i: usize| u16::from_le_bytes(now.cloud.extra[0].get(i).try_into().unwrap()) as usize;
+    let n = now.len() - 10;
+    assert!(n < 100 && now.cloud.is_consistent());
+    assert!((0..n).all(|i| is_where_it_was(now, i, label(i))));
+    assert!((0..10).all(|i| label(n + i) == i));
+    let time = &now.cloud.extra[1];
+    assert!(time.bytes[..2 * n].iter().all(|byte| *byte == 0));
+    assert_eq!(time.bytes[2 * n..], numbered("", 10).bytes);
+    while history.undo().is_some() {}
+    assert_eq!(*history.draft(), before);
 }
 
 #[test]

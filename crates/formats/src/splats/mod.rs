@@ -232,7 +232,7 @@ pub struct SplatFile {
     pub cloud: GaussianCloud,
     /// Splats that were left out because a position, rotation, size, opacity or colour is not a number.
     pub left_out: usize,
-    /// Properties of the splats that are not known and were not read.
+    /// Properties of the splats that were neither read nor kept.
     pub unread: Vec<String>,
 }
 
@@ -304,6 +304,16 @@ fn parse(format: SplatFormat, bytes: &[u8]) -> Result<GaussianCloud, Malformed> 
     }
 }
 
+/// The splats in the bytes of a file of one piece; a `.ply` may be compressed. Splats that cannot be drawn are left out.
+///
+/// # Errors
+/// When the format cannot be read, or the bytes are damaged or name another file.
+pub fn parse_splats(format: SplatFormat, bytes: &[u8]) -> Result<GaussianCloud, Malformed> {
+    let mut cloud = parse(format, bytes)?;
+    rows::leave_out_invalid(&mut cloud);
+    Ok(cloud)
+}
+
 /// The bytes of a splat file. A folder of images is one archive.
 ///
 /// # Errors
@@ -339,11 +349,10 @@ pub fn through_format(
         path: name.to_owned(),
         source,
     })?;
-    let mut read = parse(format, &bytes).map_err(|source| FormatError::Malformed {
+    let read = parse_splats(format, &bytes).map_err(|source| FormatError::Malformed {
         path: name.to_owned(),
         source,
     })?;
-    rows::leave_out_invalid(&mut read);
     Ok((read, bytes.len()))
 }
 
@@ -437,6 +446,10 @@ pub fn write_splats_with(
             cloud.sh_degree,
             format.max_degree()
         ));
+    }
+    if !cloud.extra.is_empty() && format != SplatFormat::Ply {
+        let names: Vec<&str> = cloud.extra.iter().map(|column| column.name.as_str()).collect();
+        notes.push(format!("properties that only PLY keeps: {}", names.join(", ")));
     }
     if cloud.antialiased && !format.holds_antialiased() {
         notes.push(format!(

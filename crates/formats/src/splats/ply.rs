@@ -6,11 +6,11 @@
 //! at 500 km in millimetres; a comment then holds [`GaussianCloud::world_from_dataset`], by which reading returns to floats.
 
 use crate::Malformed;
-use crate::ply::{Column, Ply, Rows};
+use crate::ply::{Column, Ply, Rows, name_of};
 use crate::splats::compressed_ply;
 use crate::splats::rows::{CHUNK, decode_splats};
 use glam::DVec3;
-use irradia_scene::{GaussianCloud, Similarity, sh};
+use irradia_scene::{ExtraColumn, GaussianCloud, Similarity, sh};
 use rayon::prelude::*;
 use std::io::{self, Write};
 
@@ -27,8 +27,8 @@ const DC: [&str; 3] = ["f_dc_0", "f_dc_1", "f_dc_2"];
 const SCALE: [&str; 3] = ["scale_0", "scale_1", "scale_2"];
 const ROTATION: [&str; 4] = ["rot_0", "rot_1", "rot_2", "rot_3"];
 
-/// Parses a splat PLY, compressed or not: any encoding, any order of properties, SH degree 0 to 4 by the number of `f_rest`; other content of
-/// the file is skipped. Floats are preserved bit for bit.
+/// Parses a splat PLY, compressed or not: any encoding, any order of properties, SH degree 0 to 4 by the number of `f_rest`; other numbers of
+/// splats become [`GaussianCloud::extra`], other content of the file is skipped. Floats are preserved bit for bit.
 ///
 /// # Errors
 /// One line when the header is invalid, properties are missing (all are named), or the file is shorter than the header
@@ -61,7 +61,34 @@ pub fn parse_splat_ply(bytes: &[u8]) -> Result<GaussianCloud, Malformed> {
     });
     cloud.antialiased = ply.comments.iter().any(|comment| comment.trim() == ANTIALIASED);
     cloud.world_from_dataset = world_from_dataset;
+    cloud.extra = extra_columns(&rows);
     Ok(cloud)
+}
+
+/// Numbers of splats that are not ours; of a name that is there twice the first.
+fn extra_columns(rows: &Rows) -> Vec<ExtraColumn> {
+    let mut found: Vec<(&str, Column)> = Vec::new();
+    for (name, column) in rows.named_columns() {
+        if !is_known(name) && found.iter().all(|(other, _)| *other != name) {
+            found.push((name, column));
+        }
+    }
+    let read = |(name, column): (&str, Column)| {
+        let mut bytes = Vec::with_capacity(rows.len() * column.scalar.size());
+        (0..rows.len()).for_each(|i| column.append_to(&mut bytes, rows.row(i)));
+        ExtraColumn {
+            name: name.to_owned(),
+            scalar: column.scalar,
+            bytes,
+        }
+    };
+    found.into_par_iter().map(read).collect()
+}
+
+/// Whether a property is one of ours; the normals that everybody writes and nobody uses are.
+fn is_known(name: &str) -> bool {
+    let known = [&POSITION[..], &DC, &SCALE, &ROTATION, &["nx", "ny", "nz", "opacity"]];
+    known.into_iter().flatten().any(|known| *known == name) || name.starts_with("f_rest_")
 }
 
 /// The world of the file's splats; the identity if the file does not give one.
@@ -92,15 +119,16 @@ fn world_in(ply: &Ply) -> Result<Similarity, Malformed> {
     )))
 }
 
-/// The properties of the splats that are not read; the normals that everybody writes and nobody uses are not counted.
+/// The properties of the splats that are neither ours nor kept: lists, and whatever a compressed file has beyond its own.
 pub(crate) fn unread_properties(bytes: &[u8]) -> Vec<String> {
     let Ok(ply) = Ply::parse(bytes) else { return Vec::new() };
-    let is_read = |name: &str| {
-        let known = [&POSITION[..], &DC, &SCALE, &ROTATION, &["nx", "ny", "nz", "opacity"]].concat();
-        known.contains(&name) || name.starts_with("f_rest_") || name.starts_with("packed_")
-    };
-    let names = ply.property_names("vertex").into_iter().flatten();
-    names.filter(|name| !is_read(name)).map(str::to_owned).collect()
+    let keeps = !ply.has(compressed_ply::CHUNKS);
+    let is_read = |name: &str| is_known(name) || name.starts_with("packed_");
+    let properties = ply.properties("vertex").into_iter().flatten();
+    properties
+        .filter(|(name, is_list)| !is_read(name) && (*is_list || !keeps))
+        .map(|(name, _)| name.to_owned())
+        .collect()
 }
 
 /// Whether a PLY has PlayCanvas's compressed layout.
@@ -176,7 +204,8 @@ fn check_properties(ply: &Ply) -> Result<u32, Malformed> {
         })
 }
 
-/// Writes `cloud` in the Inria layout, in the dataset's coordinates, with zero normals; `3 ((degree + 1)^2 - 1)` values of `f_rest`.
+/// Writes `cloud` in the Inria layout, in the dataset's coordinates, with zero normals; `3 ((degree + 1)^2 - 1)` values of `f_rest`. Extra
+/// values follow.
 pub(crate) fn write_splat_ply(out: &mut dyn Write, cloud: &GaussianCloud) -> io::Result<()> {
     let rest = cloud.sh_coefficients() - 1;
     let mut names: Vec<String> = POSITION
@@ -207,13 +236,17 @@ pub(crate) fn write_splat_ply(out: &mut dyn Write, cloud: &GaussianCloud) -> io:
         };
         writeln!(out, "property {scalar} {name}")?;
     }
+    for column in &cloud.extra {
+        writeln!(out, "property {} {}", name_of(column.scalar), column.name)?;
+    }
     writeln!(out, "end_header")?;
 
     let (sh_values, log_scale) = (3 * (rest + 1), world.scale.ln());
+    let extra_bytes: usize = cloud.extra.iter().map(|column| column.scalar.size()).sum();
     let chunk_bytes = |chunk: usize| {
         let first = chunk * CHUNK;
         let last = (first + CHUNK).min(cloud.len());
-        let mut bytes = Vec::with_capacity((last - first) * (names.len() * 4 + 12));
+        let mut bytes = Vec::with_capacity((last - first) * (names.len() * 4 + 12 + extra_bytes));
         for i in first..last {
             let sh = &cloud.sh[i * sh_values..(i + 1) * sh_values];
             let position = world.invert(DVec3::from(cloud.means[i].map(f64::from)));
@@ -241,6 +274,9 @@ pub(crate) fn write_splat_ply(out: &mut dyn Write, cloud: &GaussianCloud) -> io:
                 scales.into_iter().for_each(&mut put);
             }
             cloud.quats[i].into_iter().for_each(&mut put);
+            for column in &cloud.extra {
+                bytes.extend_from_slice(column.get(i));
+            }
         }
         bytes
     };
@@ -260,7 +296,7 @@ pub(crate) fn write_splat_ply(out: &mut dyn Write, cloud: &GaussianCloud) -> io:
 #[cfg(test)]
 mod tests {
     use super::*;
-    use irradia_scene::Rng;
+    use irradia_scene::{Rng, Scalar};
 
     fn random_cloud(count: usize, sh_degree: u32, antialiased: bool) -> GaussianCloud {
         let mut rng = Rng::new(3, u64::from(sh_degree));
@@ -273,7 +309,7 @@ mod tests {
             sh: (0..count * 3 * sh::coefficients(sh_degree)).map(|_| f()).collect(),
             sh_degree,
             antialiased,
-            world_from_dataset: Similarity::IDENTITY,
+            ..GaussianCloud::default()
         }
     }
 
@@ -389,12 +425,12 @@ mod tests {
         ];
         let mut bytes = b"ply\nformat binary_big_endian 1.0\nelement vertex 1\n".to_vec();
         for name in order {
-            bytes.extend(format!("property {} {name}\n", if name == "extra" { "uchar" } else { "float" }).bytes());
+            bytes.extend(format!("property {} {name}\n", if name == "extra" { "ushort" } else { "float" }).bytes());
         }
         bytes.extend(b"end_header\n");
         for (i, name) in order.into_iter().enumerate() {
             match name {
-                "extra" => bytes.push(9),
+                "extra" => bytes.extend(0x0102u16.to_be_bytes()),
                 _ => bytes.extend((i as f32).to_be_bytes()),
             }
         }
@@ -403,6 +439,48 @@ mod tests {
         assert_eq!(cloud.quats, [[1.0, 10.0, 11.0, 0.0]]);
         assert_eq!(cloud.log_scales, [[13.0, 14.0, 12.0]]);
         assert_eq!((cloud.opacity_logits[0], &cloud.sh[..]), (2.0, &[9.0, 8.0, 7.0][..]));
+        let extra = ExtraColumn {
+            name: "extra".into(),
+            scalar: Scalar::U16,
+            bytes: vec![2, 1],
+        };
+        assert_eq!(cloud.extra, [extra]);
+        assert!(unread_properties(&bytes).is_empty());
+    }
+
+    #[test]
+    fn what_others_add_is_kept_to_the_bit_and_lists_are_named() {
+        let mut cloud = random_cloud(3, 0, false);
+        let column = |name: &str, scalar: Scalar, bytes: Vec<u8>| ExtraColumn {
+            name: name.into(),
+            scalar,
+            bytes,
+        };
+        cloud.extra = vec![
+            column("label", Scalar::U8, vec![1, 2, 255]),
+            column("weight", Scalar::F64, (0..24).map(|i| 11 * i).collect()),
+            column(
+                "time",
+                Scalar::F32,
+                [f32::NAN, -0.0, 1e-40].iter().flat_map(|v| v.to_le_bytes()).collect(),
+            ),
+        ];
+        let mut bytes = Vec::new();
+        write_splat_ply(&mut bytes, &cloud).unwrap();
+        let back = parse_splat_ply(&bytes).unwrap();
+        assert_eq!(back.extra, cloud.extra);
+        assert_eq!(bits(&back), bits(&cloud));
+        // A second column of a name, and one that does not fit a row, cannot be kept.
+        let header = "ply\nformat ascii 1.0\nelement vertex 1\n";
+        let names = [&POSITION[..], &DC, &SCALE, &ROTATION, &["opacity", "label", "label"]].concat();
+        let lines: String = names.iter().map(|name| format!("property float {name}\n")).collect();
+        let text = format!(
+            "{header}{lines}property list uchar int faces\nend_header\n{}5 6 2 7 8\n",
+            "1 ".repeat(14)
+        );
+        let cloud = parse_splat_ply(text.as_bytes()).unwrap();
+        assert_eq!(cloud.extra, [column("label", Scalar::F32, 5f32.to_le_bytes().to_vec())]);
+        assert_eq!(unread_properties(text.as_bytes()), ["faces"]);
     }
 
     #[test]

@@ -127,6 +127,10 @@ pub(crate) fn leave_out_invalid(cloud: &mut GaussianCloud) -> usize {
         cloud.log_scales.truncate(to);
         cloud.opacity_logits.truncate(to);
         cloud.sh.truncate(to * width);
+        let kept: Vec<u32> = (0..valid.len() as u32).filter(|i| valid[*i as usize]).collect();
+        for column in &mut cloud.extra {
+            *column = column.gather(&kept);
+        }
     }
     left_out
 }

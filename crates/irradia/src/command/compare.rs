@@ -66,7 +66,7 @@ pub struct Args {
     #[arg(long, value_name = "PATH")]
     pub lpips: Option<PathBuf>,
     /// Background of photographs with alpha: white, black or random (random colours in training, white in evaluation); when
-    /// absent white for Blender scenes and the recipe's own for others
+    /// absent white for Blender scenes and objects cut out on white, the recipe's own for others
     #[arg(long, value_name = "COLOR")]
     pub background: Option<Background>,
     /// Read and score the datasets as the papers do, and show their figures: blender, llff, mipnerf360 or tandt; a dataset's folder is

@@ -43,7 +43,7 @@ pub struct Args {
     /// Threads; all cores when absent
     #[arg(long, value_parser = thread_count())]
     pub threads: Option<usize>,
-    /// Background of the scene: white or black; when absent that of its run, or white for Blender scenes with alpha
+    /// Background of the scene: white or black; when absent that of its run, or white for Blender scenes with alpha and objects cut out on white
     #[arg(long, value_name = "COLOR")]
     pub background: Option<Background>,
     #[command(flatten)]

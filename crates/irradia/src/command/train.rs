@@ -79,7 +79,7 @@ pub struct Args {
     #[arg(long, value_name = "PATH")]
     pub lpips: Option<PathBuf>,
     /// Background of photographs with alpha: white, black or random (random colours in training, white in evaluation); when
-    /// absent white for Blender scenes and the recipe's own for others
+    /// absent white for Blender scenes and objects cut out on white, the recipe's own for others
     #[arg(long, value_name = "COLOR", conflicts_with = "resume")]
     pub background: Option<Background>,
     /// Serve a page on which the training can be looked at and paused; see irradia view

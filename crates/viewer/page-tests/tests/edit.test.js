@@ -305,3 +305,30 @@ test("what cannot be edited says so, and the panel fits a telephone", async () =
   await scene.stop();
   assert.ok(readdirSync(OUT).includes("edit-360-dark.png"));
 });
+
+test("another scene is merged, and the program makes the same of the saved list", async () => {
+  const scene = copy("merged");
+  const other = join(scratch, "other.sog");
+  run("convert", scene, other);
+  const server = await serve("view", scene, "--port", "0");
+  const { page, problems } = await open(browser, server.address, { width: 700, height: 500 });
+  await set(page, { drawing: "served", axes: false, tab: "edit", sidebar: true });
+  await sharp(page);
+  await page.getByLabel("Scene to merge").setInputFiles(other);
+  await edited(page, (e) => e.at === 1);
+  const { of, selected } = await get(page, "editing");
+  assert.equal(of, 2 * selected, "what came is selected");
+  await page.keyboard.press("Control+z");
+  await edited(page, (e) => e.at === 0 && e.of === selected);
+  await page.keyboard.press("Control+Shift+z");
+  await edited(page, (e) => e.at === 1);
+  await page.getByRole("button", { name: "Save" }).click();
+  await edited(page, (e) => e.saved);
+  const replayed = join(scratch, "merged.ply");
+  run("edit", scene, "--edits", join(scene, "edits.toml"), "-o", replayed);
+  assert.deepEqual(readFileSync(replayed), readFileSync(join(scene, "scene.edited.ply")));
+  await page.getByLabel("Scene to merge").setInputFiles({ name: "broken.ply", mimeType: "", buffer: Buffer.from("ply") });
+  await until(page, () => document.querySelector("main, body")?.textContent?.includes("broken.ply"));
+  assert.deepEqual(problems.filter((problem) => !problem.includes("422")), []);
+  await server.stop();
+});

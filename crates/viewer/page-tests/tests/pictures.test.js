@@ -100,6 +100,48 @@ for (const [name, make] of [["a trained scene", trained], ["random splats", () =
   });
 }
 
+test("a moving camera gets a level of detail from afar, here and from the server, one at rest the scene itself", async () => {
+  const scene = join(scratch, "detailed.ply");
+  run("convert", trained(), scene, "--lod");
+  const server = await serve("view", scene, "--port", "0");
+  const { page, problems } = await open(drawing, server.address, SIZE);
+  await set(page, { drawing: "local", axes: false });
+  await sharp(page);
+  await until(page, () => {
+    const { counts, loaded } = document.querySelector("irr-stage").local.levels;
+    return counts.length === 4 && loaded.every((count, i) => count === counts[i]);
+  });
+  // Three times as far, and a little farther with every frame.
+  const levels = await page.evaluate(async () => {
+    const stage = document.querySelector("irr-stage");
+    const { state } = await import("/page/js/state.js");
+    const { forward } = await import("/page/js/camera.js");
+    const seen = new Set();
+    const { camera, scene } = { camera: state.get("camera"), scene: state.get("scene") };
+    for (let frame = 0; frame < 40; frame += 1) {
+      const back = (2 + 0.01 * frame) * scene.radius;
+      state.set({ camera: { ...camera, position: camera.position.map((v, c) => v - back * forward(camera)[c]) } });
+      await new Promise(requestAnimationFrame);
+      seen.add(stage.local.level);
+    }
+    return [...seen];
+  });
+  assert.ok(Math.max(...levels) >= 1, `levels ${levels}`);
+  await sharp(page);
+  assert.equal(await page.evaluate(() => document.querySelector("irr-stage").local.level), 0);
+  const shown = await picture(page);
+  const db = psnr(shown, await rendered(page, scene, shown));
+  assert.ok(db >= 35, `${db} dB`);
+  await set(page, { drawing: "served" });
+  await sharp(page);
+  assert.ok(psnr(shown, await picture(page)) >= 35);
+  await drag(page, 60, 0);
+  const served = await picture(page);
+  assert.ok(psnr(served, await rendered(page, scene, served)) >= 38);
+  assert.deepEqual(problems, []);
+  await server.stop();
+});
+
 /** What paints in the page, and what the panel says of it. */
 const painter = (page) => page.evaluate(() => {
   const { api, reason } = document.querySelector("irr-stage").local;

@@ -8,6 +8,7 @@ struct Params {
     stride: u32, // of a plane
     degree: u32,
     highlight: u32, // whether selected splats are tinted
+    start: u32, // in cores and bands: of the scene, or of a level of detail
 }
 @group(0) @binding(0) var<uniform> params: Params;
 @group(0) @binding(1) var<storage, read> cores: array<vec4u>; // [splat, 2]
@@ -36,7 +37,7 @@ fn quaternion(low: u32, high: u32) -> vec4f {
 
 // Byte n of a splat's higher bands, with its sign.
 fn band_byte(i: u32, n: u32) -> f32 {
-    let word = bands[i * params.degree + n / 16u][(n / 4u) % 4u];
+    let word = bands[(params.start + i) * params.degree + n / 16u][(n / 4u) % 4u];
     return f32(i32(word << (24u - 8u * (n % 4u))) >> 24u);
 }
 
@@ -46,8 +47,8 @@ fn main(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups: ve
     if i >= params.end {
         return;
     }
-    let a = cores[2u * i];
-    let b = cores[2u * i + 1u];
+    let a = cores[2u * (params.start + i)];
+    let b = cores[2u * (params.start + i) + 1u];
     let mean = bitcast<vec3f>(a.xyz);
     let third_scale_and_opacity = unpack2x16float(b.x);
     let log_scale = vec3f(unpack2x16float(a.w), third_scale_and_opacity.x);
@@ -76,7 +77,7 @@ fn main(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups: ve
         harmonics[c * stride + i] = (color[c] - 0.5) / C0;
     }
     if params.degree > 0u {
-        let unit = kept * unpack2x16float(bands[i * params.degree].x).x / 127.0;
+        let unit = kept * unpack2x16float(bands[(params.start + i) * params.degree].x).x / 127.0;
         let count = 3u * ((params.degree + 1u) * (params.degree + 1u) - 1u);
         for (var n = 0u; n < count; n++) {
             harmonics[(3u + n) * stride + i] = unit * band_byte(i, 2u + n);

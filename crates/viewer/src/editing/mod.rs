@@ -3,6 +3,7 @@
 
 mod save;
 mod session;
+mod uploads;
 mod work;
 mod world;
 
@@ -16,7 +17,9 @@ use std::path::PathBuf;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use tokio::sync::watch;
 
+use save::folder_of;
 pub(crate) use save::stem_of;
+use uploads::Uploads;
 pub(crate) use work::work;
 pub(crate) use world::placed;
 
@@ -44,6 +47,8 @@ type Current = (Arc<Draft>, Arc<EditList>);
 pub(crate) struct Editing {
     /// The file of the scene.
     pub source: PathBuf,
+    /// Scenes to merge.
+    pub uploads: Arc<Uploads>,
     queue: Mutex<Queue>,
     asked: Condvar,
     /// What the pages are told.
@@ -60,6 +65,7 @@ impl Editing {
     /// Of the scene in the file `source`, which has so many splats.
     pub fn new(source: PathBuf, splats: usize) -> Self {
         Self {
+            uploads: Arc::new(Uploads::new(folder_of(&source))),
             source,
             queue: Mutex::default(),
             asked: Condvar::new(),

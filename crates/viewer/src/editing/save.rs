@@ -39,6 +39,11 @@ fn entry_of(source: &Path) -> &Path {
     }
 }
 
+/// Where a scene's file, or its folder of images, is.
+pub(super) fn folder_of(source: &Path) -> &Path {
+    entry_of(source).parent().unwrap_or(Path::new(""))
+}
+
 /// The name of a scene's file without its format; of a folder of images that of the folder.
 pub(crate) fn stem_of(source: &Path) -> String {
     let name = entry_of(source)
@@ -53,10 +58,10 @@ pub(crate) fn stem_of(source: &Path) -> String {
     }
 }
 
-/// Writes the list, the scene and the scenes that were split off; to the same files as before if the session was saved.
+/// Writes the list, the scene, the scenes that were split off and those that pages sent to be merged; to the same files as before if the session was saved.
 pub(super) fn save(session: &Session, source: &Path, before: Option<&Saved>) -> Result<Saved, EditingError> {
     let stem = stem_of(source);
-    let folder = entry_of(source).parent().unwrap_or(Path::new(""));
+    let folder = folder_of(source);
     let is_run = RunFolder::containing(source).is_some();
     let names = |number: usize| {
         let end = if number == 1 {
@@ -83,6 +88,7 @@ pub(super) fn save(session: &Session, source: &Path, before: Option<&Saved>) -> 
     for (name, part) in &parts {
         write_splats(&scene.with_extension(format!("{name}.ply")), part)?;
     }
+    session.save_merged()?;
     let text = session.list().to_toml();
     write_atomic(&list, |out| out.write_all(text.as_bytes()))?;
     Ok(Saved {

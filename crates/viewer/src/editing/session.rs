@@ -1,9 +1,11 @@
 //! A scene with a list of what was done to it: selections and edits, of which the first are made.
 
+use super::EditingError;
+use super::uploads::Uploads;
 use super::world::{operation_to_dataset, placement, step_to_dataset};
 use irradia_edit::{
     Draft, Edit, EditError, EditList, Mode, Operation, SelectStep, Selection, Shape, Transform, apply, floater_scores,
-    open_nothing, select,
+    select,
 };
 use irradia_scene::{GaussianCloud, Similarity};
 use std::sync::Arc;
@@ -53,6 +55,8 @@ pub(crate) struct Session {
     selected: Arc<Selection>,
     /// How much each splat of a state is a floater.
     scores: Option<(Arc<Draft>, Vec<f32>)>,
+    /// Scenes to merge.
+    uploads: Arc<Uploads>,
 }
 
 /// An entry as pages list it.
@@ -62,8 +66,8 @@ pub(crate) struct Listed<'a> {
 }
 
 impl Session {
-    /// Nothing done to a scene.
-    pub fn new(draft: Draft) -> Self {
+    /// Nothing done to a scene, with which `uploads` can be merged.
+    pub fn new(draft: Draft, uploads: Arc<Uploads>) -> Self {
         let draft = Arc::new(draft);
         Self {
             entries: Vec::new(),
@@ -76,6 +80,7 @@ impl Session {
             draft,
             steps: Vec::new(),
             scores: None,
+            uploads,
         }
     }
 
@@ -257,7 +262,7 @@ impl Session {
             *name = format!("part-{}", parts.count() + 1);
         }
         let mut draft = (*self.draft).clone();
-        let applied = apply(&mut draft, &edit, &open_nothing)?;
+        let applied = apply(&mut draft, &edit, &|file| self.uploads.open(file))?;
         let text = edit_text(&applied.edit.op, applied.selected, self.draft.len(), draft.len());
         self.push(gesture, text, Deed::Edit(applied.edit, applied.moved));
         self.set_draft(Arc::new(draft));
@@ -339,7 +344,8 @@ impl Session {
                 Deed::Deselect => steps.clear(),
                 Deed::Edit(edit, _) => {
                     steps.clear();
-                    if edit.select.is_some() && leaves_selection(&edit.op) {
+                    let is_whole = edit.select.is_none();
+                    if leaves_selection(&edit.op) && is_whole == matches!(edit.op, Operation::Merge { .. }) {
                         steps.push(SelectStep::add(Shape::Last {}));
                     }
                 }
@@ -363,7 +369,7 @@ impl Session {
                 nearest.map_or((0, self.original().clone()), |kept| (kept.edits, kept.draft.clone()));
             let again: Vec<Edit> = self.edits().skip(made).cloned().collect();
             for edit in again {
-                apply(Arc::make_mut(&mut draft), &edit, &open_nothing)?;
+                apply(Arc::make_mut(&mut draft), &edit, &|file| self.uploads.open(file))?;
                 made += 1;
             }
             debug_assert_eq!(made, edits);
@@ -373,6 +379,18 @@ impl Session {
         self.selected = Arc::new(self.evaluate(&steps, 0)?);
         self.steps = steps;
         Ok(())
+    }
+
+    /// Writes the scenes that the list merges beside the scene.
+    ///
+    /// # Errors
+    /// When one cannot be written.
+    pub fn save_merged(&self) -> Result<(), EditingError> {
+        let merged = self.edits().filter_map(|edit| match &edit.op {
+            Operation::Merge { file } => Some(file),
+            _ => None,
+        });
+        merged.into_iter().try_for_each(|file| self.uploads.save(file))
     }
 
     /// The scenes that were split off, with their names.
@@ -390,7 +408,7 @@ impl Session {
         };
         let mut draft = (**self.original()).clone();
         for edit in &edits[..=last] {
-            parts.extend(apply(&mut draft, edit, &open_nothing)?.split);
+            parts.extend(apply(&mut draft, edit, &|file| self.uploads.open(file))?.split);
         }
         Ok(parts)
     }
@@ -406,6 +424,7 @@ fn leaves_selection(op: &Operation) -> bool {
             | Operation::Duplicate { .. }
             | Operation::Recolor { .. }
             | Operation::Opacity { .. }
+            | Operation::Merge { .. }
     )
 }
 
@@ -485,6 +504,7 @@ fn edit_text(op: &Operation, selected: usize, before: usize, after: usize) -> St
 #[cfg(test)]
 mod tests {
     use super::*;
+    use irradia_edit::open_nothing;
 
     /// Splats at 0, 1, .. along x, in a world of half the dataset's unit.
     fn session(n: usize) -> Session {
@@ -503,7 +523,7 @@ mod tests {
             },
             Vec::new(),
         );
-        Session::new(draft)
+        Session::new(draft, Arc::new(Uploads::new("".as_ref())))
     }
 
     fn ball(x: f64, radius: f64) -> Vec<SelectStep> {

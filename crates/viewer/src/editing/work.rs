@@ -71,7 +71,7 @@ impl Bench {
         let cameras = scene.and_then(|scene| scene.cameras.as_deref()).unwrap_or_default();
         let mut draft = Draft::new(cloud, cameras.to_vec());
         draft.photographs = photographs_of(&editing.source);
-        let session = Session::new(draft);
+        let session = Session::new(draft, editing.uploads.clone());
         let drawn = scene.and_then(|scene| scene.model.splats()).map(Splats::len);
         Ok(Self {
             options: scene.map_or_else(RenderOptions::default, |scene| scene.options),

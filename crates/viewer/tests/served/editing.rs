@@ -2,7 +2,8 @@
 
 use crate::client::Socket;
 use crate::security::{Served, serve};
-use irradia_runs::formats::read_splats;
+use irradia_runs::Editing;
+use irradia_runs::formats::{SplatFormat, encode_splats, read_splats};
 use serde_json::{Value, json};
 use std::fs;
 
@@ -120,7 +121,7 @@ fn hostile_requests_are_refused_in_one_line_and_change_nothing() {
             "nothing is selected",
         ),
         (edit(json!({ "op": "delete" })), "needs a selection"),
-        (edit(json!({ "op": "merge", "file": "/etc/passwd" })), "merges no files"),
+        (edit(json!({ "op": "merge", "file": "/etc/passwd" })), "has been sent"),
         (edit(json!({ "op": "recolor", "exposure": 1e9 })), "exposure"),
         (
             edit(json!({ "op": "set-length", "from": [0, 0, 0], "to": [0, 0, 0], "length": 1 })),
@@ -149,6 +150,42 @@ fn hostile_requests_are_refused_in_one_line_and_change_nothing() {
     page.send(1, lasso(20_000).to_string().as_bytes());
     assert!(page.is_ended(), "larger than any request");
     served.draws();
+}
+
+#[test]
+fn a_scene_that_a_page_sends_is_merged_saved_and_replayed() {
+    let served = serve("127.0.0.1");
+    let scene = fs::read(served.scene()).expect("the scene");
+    let mut page = page(&served);
+    for (target, origin, body, says) in [
+        ("/merge/a.ply", "http://evil.example".to_owned(), &scene[..], "403"),
+        ("/merge/a.exe", served.origin(), &scene[..], "422"),
+        ("/merge/a.ply", served.origin(), &scene[..100], "422"),
+        ("/merge/", served.origin(), &scene[..], "404"),
+    ] {
+        let answer = served.send_scene(target, &origin, body);
+        assert!(answer.starts_with(&format!("HTTP/1.1 {says}")), "{target}: {answer}");
+    }
+    let cloud = read_splats(served.scene()).expect("splats");
+    let sent = encode_splats(SplatFormat::Spz, &cloud, &Default::default()).expect("encoded");
+    let answer = served.send_scene("/merge/..%2Fother.spz", &served.origin(), &sent);
+    assert!(answer.contains(r#"{"name":"_other.spz","splats":3}"#), "{answer}");
+    let merge = json!({ "do": "edit", "whole": true, "edit": { "op": "merge", "file": "_other.spz" } });
+    let merged = after(&mut page, &merge, ("of", json!(6)));
+    assert_eq!(merged["selected"], json!(3), "what came is selected");
+    after(&mut page, &json!({ "do": "undo" }), ("of", json!(3)));
+    after(&mut page, &json!({ "do": "redo" }), ("of", json!(6)));
+    let name = json!("saved scene.edits.toml and scene.edited.ply");
+    after(&mut page, &json!({ "do": "save" }), ("saved", name));
+    let folder = served.scene().parent().expect("a folder");
+    assert_eq!(fs::read(folder.join("_other.spz")).expect("what was sent"), sent);
+    let list = fs::read_to_string(folder.join("scene.edits.toml")).expect("the list");
+    let mut program = Editing::open(served.scene()).expect("the scene");
+    program
+        .apply(&irradia_edit::EditList::parse(&list).expect("a list"))
+        .expect("possible");
+    let edited = read_splats(&folder.join("scene.edited.ply")).expect("splats");
+    assert_eq!(program.draft().cloud, edited, "the program makes the same of the list");
 }
 
 #[test]

@@ -31,7 +31,7 @@ pub fn serve(host: &str) -> Served {
         sh: vec![1.0; 9],
         sh_degree: 0,
         antialiased: false,
-        world_from_dataset: Default::default(),
+        ..Default::default()
     };
     write_splats(&ply, &cloud).expect("written");
     Served {
@@ -88,6 +88,25 @@ impl Served {
 
     pub fn host(&self) -> String {
         format!("Host: {}", self.address())
+    }
+
+    /// The answer to a scene that is sent.
+    pub fn send_scene(&self, target: &str, origin: &str, scene: &[u8]) -> String {
+        let mut stream = self.connect();
+        let host = self.host();
+        let length = scene.len();
+        let head = format!(
+            "POST {target} HTTP/1.1\r\n{host}\r\nOrigin: {origin}\r\nContent-Length: {length}\r\nConnection: close\r\n\r\n"
+        );
+        stream.write_all(head.as_bytes()).expect("sent");
+        let _ = stream.write_all(scene);
+        let mut answer = Vec::new();
+        let _ = stream.read_to_end(&mut answer);
+        String::from_utf8_lossy(&answer).into_owned()
+    }
+
+    pub fn origin(&self) -> String {
+        format!("http://{}", self.address())
     }
 
     pub fn status(&self, target: &str, headers: &[&str]) -> u32 {

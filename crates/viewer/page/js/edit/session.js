@@ -76,6 +76,18 @@ class Session {
     this.send({ do: "replay", list });
   }
 
+  /** Adds the splats of another scene. @param {File} file of any splat format */
+  async merge(file) {
+    try {
+      const response = await fetch(`merge/${encodeURIComponent(file.name)}${location.search}`, { method: "POST", body: file });
+      const text = await response.text();
+      if (!response.ok) throw new Error(text);
+      this.edit({ op: "merge", file: JSON.parse(text).name }, true);
+    } catch (error) {
+      state.set({ problem: error instanceof Error ? error.message : String(error) });
+    }
+  }
+
   undo() {
     this.send({ do: "undo" });
   }

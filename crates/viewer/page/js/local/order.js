@@ -4,7 +4,8 @@
 // the farthest splat: evenly spaced in the logarithm, thousands of them between a depth and its double.
 
 /** @typedef {{ count: number, positions: Float32Array, radii: Float32Array, first: number }} Block */
-/** @typedef {{ forward: number[], right: number[], down: number[], position: number[], limits: number[], near: number }} Look */
+/** first, end: which splats; all without them.
+ * @typedef {{ forward: number[], right: number[], down: number[], position: number[], limits: number[], near: number, first?: number, end?: number }} Look */
 
 const KEYS = 1 << 16;
 
@@ -28,12 +29,12 @@ function reserve(size) {
 }
 
 /** Indices of the splats in view, farthest first. @param {Look} look @returns {Uint32Array} */
-export function order({ forward: [fx, fy, fz], right: [rx, ry, rz], down: [dx, dy, dz], position: [px, py, pz], limits, near }) {
+export function order({ forward: [fx, fy, fz], right: [rx, ry, rz], down: [dx, dy, dz], position: [px, py, pz], limits, near, first = 0, end = count }) {
   const [left, most, top, bottom] = limits;
   let n = 0;
   let least = 0xffffffff;
   let largest = 0;
-  for (let i = 0, at = 0; i < count; i += 1, at += 3) {
+  for (let i = first, at = 3 * first; i < end; i += 1, at += 3) {
     const x = positions[at] - px;
     const y = positions[at + 1] - py;
     const z = positions[at + 2] - pz;
@@ -81,7 +82,7 @@ if (typeof document === "undefined" && "onmessage" in globalThis) {
       const started = performance.now();
       const sorted = order(data.look);
       const milliseconds = performance.now() - started;
-      /** @type {any} */ (self).postMessage({ sorted, milliseconds, of: count, generation: data.generation }, [sorted.buffer]);
+      /** @type {any} */ (self).postMessage({ sorted, shown: { first: data.look.first, end: data.look.end }, milliseconds, of: count, generation: data.generation }, [sorted.buffer]);
     }
   };
 }

@@ -1,6 +1,7 @@
 // Draws splats in the browser: loads them, shares out the time, and leaves painting to WebGPU or, where that is missing, to WebGL2.
 
 import { openMask, openSplats } from "./assets.js";
+import { Levels } from "./levels.js";
 import { readSplats } from "./stream.js";
 import { WebGl } from "./webgl.js";
 import { WebGpu } from "./webgpu.js";
@@ -39,6 +40,9 @@ export class LocalRenderer {
   /** Splats of the scene, and those that have arrived. */
   total = 0;
   loaded = 0;
+  levels = new Levels([0]);
+  /** The level of detail that is drawn; 0 is the scene itself. */
+  level = 0;
   version = 0;
   /** Whether the splats of `version` have begun to arrive, and when. */
   begun = false;
@@ -201,12 +205,13 @@ export class LocalRenderer {
   }
 
   /** @param {WebGpu | WebGl} painter @param {import("./stream.js").Header} header */
-  begin(painter, { count, degree }) {
+  begin(painter, { counts, degree }) {
     this.complete ||= this.total > 0 && this.loaded === this.total;
     this.beganAt = performance.now();
-    [this.loaded, this.total, this.masked, this.begun] = [0, count, 0, true];
+    [this.loaded, this.total, this.masked, this.begun, this.level] = [0, counts[0], 0, true, 0];
+    this.levels = new Levels(counts);
     try {
-      painter.begin(count, degree);
+      painter.begin(this.levels, degree);
     } catch (error) {
       this.giveUp(painter, error);
     }
@@ -214,7 +219,10 @@ export class LocalRenderer {
 
   /** @param {WebGpu | WebGl} painter @param {import("./stream.js").Block} block */
   take(painter, block) {
+    this.levels.take(block);
     painter.take(block);
+    // Levels change no picture of a camera at rest.
+    if (block.level > 0) return;
     this.loaded = block.first + block.count;
     this.changedAt = performance.now();
     this.change();
@@ -264,7 +272,21 @@ export class LocalRenderer {
 
   /** Tells the painter which camera comes. */
   aim() {
-    if (this.wanted && this.k) this.painter?.aim(this.wanted.camera, this.k, NEAR);
+    if (this.wanted && this.k) this.painter?.aim(this.wanted.camera, this.k, NEAR, this.level);
+  }
+
+  /** Draws another level of detail from now on. @param {number} level */
+  useLevel(level) {
+    if (level === this.level) return;
+    this.level = level;
+    this.aim();
+  }
+
+  /** The level for a moving camera: not where splats are shown as such, or selected ones are tinted.
+   * @param {{ camera: Camera, shot: any }} wanted @param {Intrinsics} k */
+  levelOf({ camera, shot }, k) {
+    const plain = (shot.mode ?? PLAIN) === PLAIN && !(shot.highlight && this.masked);
+    return plain ? this.levels.choose(camera, scaled(k, this.share), NEAR) : 0;
   }
 
   /** Paints if something has changed; whether there is a new picture. @param {number} now */
@@ -280,7 +302,9 @@ export class LocalRenderer {
   async paint(painter, wanted, k, now) {
     // A newer version replaces the picture when it is whole: half of it would flicker at each edit.
     if (this.loaded < this.total && this.complete && now < this.beganAt + PATIENCE) return;
-    const moving = now - this.changedAt < REST || painter.busy;
+    const rests = now - this.changedAt >= REST;
+    this.useLevel(rests ? 0 : this.levelOf(wanted, k));
+    const moving = !rests || painter.busy;
     if (moving && !this.fresh && this.painted === wanted) return;
     const { edition } = this;
     const started = performance.now();
@@ -326,6 +350,7 @@ export class LocalRenderer {
     const [fx, fy] = [(projection[0] * width) / 2, (projection[5] * height) / 2];
     this.k = { width, height, fx, fy, cx: ((1 - projection[8]) * width) / 2, cy: ((1 + projection[9]) * height) / 2 };
     this.wanted = { camera, shot: this.wanted?.shot ?? {} };
+    this.level = 0;
     this.aim();
     this.webGl?.eye(to, port, camera, this.k, this.options({}, false));
   }

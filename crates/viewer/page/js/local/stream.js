@@ -1,10 +1,10 @@
-// Reads compact splats as they arrive: block by block, most important first. The format is that of crates/viewer/src/compact.rs.
+// Reads compact splats as they arrive: block by block, most important first, and the levels of detail after the scene. The format is that of crates/viewer/src/compact.rs.
 
 const HEADER = 32;
 const CORE = 32;
 
-/** @typedef {{ count: number, degree: number, block: number }} Header */
-/** @typedef {{ first: number, count: number, cores: Uint8Array<ArrayBuffer>, bands: Uint8Array<ArrayBuffer> }} Block */
+/** counts: splats of the scene, then of its levels. @typedef {{ counts: number[], degree: number, block: number }} Header */
+/** level: 0 for the scene. @typedef {{ level: number, first: number, count: number, cores: Uint8Array<ArrayBuffer>, bands: Uint8Array<ArrayBuffer> }} Block */
 
 /** @param {Response} response @param {(header: Header) => void} begin @param {(block: Block) => void} each */
 export async function readSplats(response, begin, each) {
@@ -12,24 +12,28 @@ export async function readSplats(response, begin, each) {
   const reader = response.body.getReader();
   /** @type {Header | null} */
   let header = null;
+  let level = 0;
   let first = 0;
   let buffer = new Uint8Array(1 << 20);
   let filled = 0;
   for (;;) {
-    const wanted = header ? blockBytes(header, first) : HEADER;
+    const wanted = header ? blockBytes(header, level, first) : HEADER;
     if (filled >= wanted) {
       if (!header) {
         header = readHeader(buffer);
         begin(header);
       } else {
-        const count = Math.min(header.block, header.count - first);
+        const count = Math.min(header.block, header.counts[level] - first);
         const cores = buffer.slice(0, count * CORE);
-        each({ first, count, cores, bands: buffer.slice(count * CORE, wanted) });
+        each({ level, first, count, cores, bands: buffer.slice(count * CORE, wanted) });
         first += count;
       }
       buffer.copyWithin(0, wanted, filled);
       filled -= wanted;
-      if (header && first >= header.count) return;
+      while (header && first >= header.counts[level]) {
+        [level, first] = [level + 1, 0];
+        if (level === header.counts.length) return;
+      }
       continue;
     }
     const { done, value } = await reader.read();
@@ -48,10 +52,12 @@ export async function readSplats(response, begin, each) {
 function readHeader(bytes) {
   const view = new DataView(bytes.buffer, bytes.byteOffset);
   if (view.getUint32(0, true) !== 0x31535249) throw new Error("these are no splats");
-  return { count: view.getUint32(4, true), degree: view.getUint32(8, true), block: view.getUint32(12, true) };
+  const word = (/** @type {number} */ at) => view.getUint32(4 * at, true);
+  const levels = [4, 5, 6].map(word).filter((count) => count > 0);
+  return { counts: [word(1), ...levels], degree: word(2), block: word(3) };
 }
 
-/** @param {Header} header @param {number} first */
-function blockBytes({ count, degree, block }, first) {
-  return Math.min(block, count - first) * (CORE + 16 * degree);
+/** @param {Header} header @param {number} level @param {number} first */
+function blockBytes({ counts, degree, block }, level, first) {
+  return Math.min(block, counts[level] - first) * (CORE + 16 * degree);
 }

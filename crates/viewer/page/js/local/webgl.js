@@ -2,6 +2,7 @@
 
 import { axes } from "../math.js";
 import { orderWorker, shader } from "./assets.js";
+import { Levels } from "./levels.js";
 
 /** @typedef {import("./renderer.js").Camera} Camera */
 /** @typedef {import("./renderer.js").Intrinsics} Intrinsics */
@@ -20,12 +21,15 @@ export class WebGl {
   /** Splats of the scene, those that have arrived, their degree, and those in view. */
   total = 0;
   loaded = 0;
+  levels = new Levels([0]);
   degree = 0;
   drawn = 0;
   generation = 0;
-  /** What the splats are to be sorted for, and what they are being sorted for. @type {{ camera: Camera, k: Intrinsics, near: number } | null} */
+  /** The splats among which the sorted ones are: the scene's, or those of a level of detail. */
+  shown = { first: 0, end: 0 };
+  /** What the splats are to be sorted for, and what they are being sorted for. @type {{ camera: Camera, k: Intrinsics, near: number, level: number } | null} */
   wanted = null;
-  /** @type {{ camera: Camera, k: Intrinsics, near: number } | null} */
+  /** @type {{ camera: Camera, k: Intrinsics, near: number, level: number } | null} */
   asked = null;
 
   /** @param {WebGL2RenderingContext} gl @param {() => void} changed told when a picture would be another one
@@ -73,10 +77,11 @@ export class WebGl {
     gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, ROW, bytes.length / ROW, gl.RED_INTEGER, gl.UNSIGNED_BYTE, bytes);
   }
 
-  /** Makes room; throws where there is too little. @param {number} count @param {number} degree */
-  begin(count, degree) {
+  /** Makes room; throws where there is too little. @param {Levels} levels @param {number} degree */
+  begin(levels, degree) {
     const gl = this.gl;
-    const rows = Math.max(1, Math.ceil(count / ROW));
+    const count = levels.counts[0];
+    const rows = Math.max(1, levels.room / ROW);
     if (rows > gl.getParameter(gl.MAX_TEXTURE_SIZE)) throw new Error("there are more splats than this browser can draw");
     for (const texture of [this.cores, this.bands, this.selected, this.place, this.look, this.order]) if (texture) gl.deleteTexture(texture);
     this.cores = texture(gl, 2 * ROW, rows);
@@ -91,13 +96,15 @@ export class WebGl {
     gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT1, gl.TEXTURE_2D, this.look, 0);
     gl.drawBuffers([gl.COLOR_ATTACHMENT0, gl.COLOR_ATTACHMENT1]);
     [this.total, this.degree, this.loaded, this.drawn] = [count, degree, 0, 0];
+    [this.levels, this.shown] = [levels, { first: 0, end: 0 }];
     this.generation += 1;
-    this.worker.postMessage({ reserve: count });
+    this.worker.postMessage({ reserve: levels.room });
   }
 
   /** @param {import("./stream.js").Block} block */
-  take({ first, count, cores, bands }) {
+  take({ level, first: within, count, cores, bands }) {
     const gl = this.gl;
+    const first = this.levels.starts[level] + within;
     const rows = Math.ceil(count / ROW);
     upload(gl, this.cores, first / ROW, 2 * ROW, rows, cores);
     if (this.degree) upload(gl, this.bands, first / ROW, this.degree * ROW, rows, bands);
@@ -111,12 +118,13 @@ export class WebGl {
       radii[i] = 3.4 * Math.exp(largest);
     }
     this.worker.postMessage({ block: { first, count, positions, radii } }, [positions.buffer, radii.buffer]);
-    this.loaded = first + count;
+    this.loaded = this.levels.loaded[0];
   }
 
-  /** Asks the worker for the order of a camera, one question at a time. @param {Camera} camera @param {Intrinsics} k @param {number} near */
-  aim(camera, k, near) {
-    this.wanted = { camera, k, near };
+  /** Asks the worker for the order of a camera, one question at a time.
+   * @param {Camera} camera @param {Intrinsics} k @param {number} near @param {number} level of detail */
+  aim(camera, k, near, level) {
+    this.wanted = { camera, k, near, level };
     this.sort();
   }
 
@@ -124,15 +132,17 @@ export class WebGl {
     if (this.busy || !this.wanted || !this.loaded) return;
     this.busy = true;
     this.asked = this.wanted;
-    const { camera, k, near } = this.asked;
+    const { camera, k, near, level } = this.asked;
     const [right, down, forward] = axes(camera.rotation);
     const { fx, fy, cx, cy, width, height } = k;
     const limits = [-cx / fx, (width - cx) / fx, -cy / fy, (height - cy) / fy];
-    this.worker.postMessage({ look: { right, down, forward, position: camera.position, limits, near }, generation: this.generation });
+    const first = this.levels.starts[level];
+    const end = first + this.levels.loaded[level];
+    this.worker.postMessage({ look: { right, down, forward, position: camera.position, limits, near, first, end }, generation: this.generation });
   }
 
-  /** @param {{ sorted: Uint32Array, generation: number }} answer */
-  ordered({ sorted, generation }) {
+  /** @param {{ sorted: Uint32Array, shown: { first: number, end: number }, generation: number }} answer */
+  ordered({ sorted, shown, generation }) {
     this.busy = false;
     const gl = this.gl;
     if (generation !== this.generation) return this.sort();
@@ -142,6 +152,7 @@ export class WebGl {
     const rest = sorted.subarray(whole * ROW);
     if (rest.length) gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, whole, rest.length, 1, gl.RED_INTEGER, gl.UNSIGNED_INT, rest);
     this.drawn = sorted.length;
+    this.shown = shown;
     this.changed();
     if (this.asked !== this.wanted) this.sort();
   }
@@ -183,7 +194,8 @@ export class WebGl {
     const [x, y, z] = axes(camera.rotation);
     const at = projecting.at;
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.target ?? null);
-    gl.viewport(0, 0, ROW, Math.max(1, Math.ceil(this.loaded / ROW)));
+    const { first, end } = this.shown;
+    gl.viewport(0, first / ROW, ROW, Math.max(1, Math.ceil((end - first) / ROW)));
     gl.disable(gl.BLEND);
     gl.useProgram(projecting.program);
     bind(gl, 0, this.cores, at("u_cores"));
@@ -191,7 +203,7 @@ export class WebGl {
     bind(gl, 2, this.selected, at("u_selected"));
     gl.uniform1i(at("u_highlight"), highlight ? 1 : 0);
     gl.uniform1i(at("u_degree"), this.degree);
-    gl.uniform1i(at("u_count"), this.loaded);
+    gl.uniform1i(at("u_count"), end);
     // Column by column: the camera's axes are the rows of camera from world.
     gl.uniformMatrix3fv(at("u_rotation"), false, [x[0], y[0], z[0], x[1], y[1], z[1], x[2], y[2], z[2]]);
     gl.uniform3fv(at("u_position"), camera.position);

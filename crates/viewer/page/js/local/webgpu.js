@@ -3,10 +3,14 @@
 import { shader } from "./assets.js";
 import { GROUP, Gpu, Words, Work } from "./device.js";
 import { Frame } from "./frame.js";
+import { Levels } from "./levels.js";
 
 /** Bytes of a splat without its higher bands, and of each of its bands, in words. */
 const CORE = 8;
 const BAND = 4;
+
+/** @typedef {import("./renderer.js").Camera} Camera */
+/** @typedef {import("./renderer.js").Intrinsics} Intrinsics */
 
 export class WebGpu {
   api = "WebGPU";
@@ -14,11 +18,14 @@ export class WebGpu {
   /** Pictures are drawn whole: nothing goes on between them. */
   busy = false;
   ready = Promise.resolve();
-  /** Splats of the scene, those that have arrived, and those unpacked. */
+  /** Splats of the scene, those to draw, and those unpacked. */
   total = 0;
   drawn = 0;
   unpacked = 0;
   degree = 0;
+  levels = new Levels([0]);
+  /** The level of detail to draw. */
+  level = 0;
   /** By what the unpacked splats were tinted and clipped. */
   dressed = "";
   /** Width and height of the last picture. */
@@ -63,20 +70,23 @@ export class WebGpu {
     }
   }
 
-  /** Makes room; throws where there is too little. @param {number} count @param {number} degree */
-  begin(count, degree) {
+  /** Makes room; throws where there is too little. @param {Levels} levels @param {number} degree */
+  begin(levels, degree) {
+    const count = levels.counts[0];
     [this.total, this.degree, this.drawn, this.unpacked, this.dressed] = [count, degree, 0, 0, ""];
-    this.cores.reserve(CORE * count);
-    this.bands.reserve(BAND * degree * count);
+    [this.levels, this.level] = [levels, 0];
+    this.cores.reserve(CORE * levels.room);
+    this.bands.reserve(BAND * degree * levels.room);
     this.selected.reserve(Math.ceil(count / 32));
     this.frame.reserve({ count, stride: count, degree });
   }
 
   /** @param {import("./stream.js").Block} block */
-  take({ first, count, cores, bands }) {
-    this.cores.write(CORE * first, cores);
-    if (this.degree) this.bands.write(BAND * this.degree * first, bands);
-    this.drawn = first + count;
+  take({ level, first, cores, bands }) {
+    const at = this.levels.starts[level] + first;
+    this.cores.write(CORE * at, cores);
+    if (this.degree) this.bands.write(BAND * this.degree * at, bands);
+    this.drawn = this.levels.loaded[this.level];
   }
 
   /** @param {Uint8Array} bits of the selected splats */
@@ -87,8 +97,9 @@ export class WebGpu {
     this.selection += 1;
   }
 
-  /** Kernels sort: nothing is to be known before. */
-  aim() {
+  /** Kernels sort: nothing of the camera is to be known before. @param {Camera} _camera @param {Intrinsics} _k @param {number} _near @param {number} level */
+  aim(_camera, _k, _near, level) {
+    [this.level, this.drawn] = [level, this.levels.loaded[level]];
     this.changed();
   }
 
@@ -106,8 +117,8 @@ export class WebGpu {
   /** Unpacks the splats that came since, or all where tint or clipping box are others.
    * @param {import("./renderer.js").Options["clip"]} clip @param {boolean} highlight */
   dress(clip, highlight) {
-    const { gpu, frame, drawn } = this;
-    const wanted = JSON.stringify([clip, highlight && this.selection]);
+    const { gpu, frame, drawn, level } = this;
+    const wanted = JSON.stringify([clip, highlight && this.selection, level]);
     const first = wanted === this.dressed ? this.unpacked : 0;
     [this.dressed, this.unpacked] = [wanted, drawn];
     if (first === drawn) return;
@@ -116,7 +127,7 @@ export class WebGpu {
     floats.set(clip?.[0] ?? [-3e38, -3e38, -3e38], 0);
     floats.set(clip?.[1] ?? [3e38, 3e38, 3e38], 4);
     [words[3], words[7]] = [first, drawn];
-    words.set([this.total, this.degree, highlight ? 1 : 0], 8);
+    words.set([this.total, this.degree, highlight ? 1 : 0, this.levels.starts[level]], 8);
     this.params.write(0, words);
     const work = new Work(gpu);
     work.run(this.unpack, [this.params, this.cores, this.bands, this.selected, frame.geometry, frame.harmonics], Math.ceil((drawn - first) / GROUP));

@@ -242,6 +242,13 @@ class EditPanel extends HTMLElement {
       state.set({ metres: metres / length(subtract(a, b)) });
       session.edit({ op: "set-length", from: a, to: b, length: metres }, true);
     });
+    const other = el("input", { type: "file", hidden: true, "aria-label": "Scene to merge" });
+    other.onchange = async () => {
+      const [chosen] = other.files ?? [];
+      if (chosen) await session.merge(chosen);
+      other.value = "";
+    };
+    const merge = button("Merge", "Adds the splats of another scene, which are selected then", () => other.click());
     const number = el("input", { type: "number", min: "1", step: "1000", "aria-label": "Number of splats to keep" });
     const reduce = button("Reduce", "Leaves the splats that cover most", () => {
       if (Number(number.value) >= 1) session.edit({ op: "reduce", count: Math.round(Number(number.value)) }, true);
@@ -251,7 +258,7 @@ class EditPanel extends HTMLElement {
       const of = state.get("editing")?.of ?? 0;
       if (document.activeElement !== number) number.value = `${Math.round(of / 2)}`;
     });
-    return section("Scene", line("Upright", found, view), line("Scale", measure), el("div", { className: "row" }, known, set), row("Splats", number, reduce));
+    return section("Scene", line("Upright", found, view), line("Scale", measure), el("div", { className: "row" }, known, set), row("Splats", number, reduce), line("Another scene", merge, other));
   }
 
   history() {

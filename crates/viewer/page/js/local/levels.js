@@ -1,0 +1,81 @@
+// Levels of detail behind the scene in the painters' arrays, and which of them is drawn while the camera moves: the twin of
+// crates/viewer/src/levels.rs.
+
+import { axes, dot, subtract } from "../math.js";
+
+/** @typedef {import("../camera.js").Camera} Camera */
+/** @typedef {import("../camera.js").Intrinsics} Intrinsics */
+
+/** Splats for each pixel that the scene covers which a level has at least. */
+const DENSE = 2;
+/** Positions by which it is estimated what a camera sees. */
+const SAMPLE = 4096;
+/** Share of what a camera sees that may lie on either side of what counts as covered. */
+const OUTSIDE = 0.05;
+/** Splats to which levels are aligned: a row of WebGL2's textures. */
+const ALIGNED = 1024;
+
+export class Levels {
+  /** Splats that have arrived, of the scene and of each level. @type {number[]} */
+  loaded = [];
+  /** Positions of the coarsest level, and how many splats each stands for. @type {number[][]} */
+  sample = [];
+  step = 1;
+
+  /** @param {number[]} counts splats of the scene, then of its levels, the finest first */
+  constructor(counts) {
+    this.counts = counts;
+    this.loaded = counts.map(() => 0);
+    this.step = Math.max(1, Math.ceil(counts[counts.length - 1] / SAMPLE));
+    /** Where each begins. @type {number[]} */
+    this.starts = [];
+    /** Room for all. */
+    this.room = 0;
+    for (const count of counts) {
+      this.starts.push(this.room);
+      this.room += ALIGNED * Math.ceil(count / ALIGNED);
+    }
+  }
+
+  /** @param {import("./stream.js").Block} block */
+  take({ level, first, count, cores }) {
+    this.loaded[level] = first + count;
+    if (level === 0 || level < this.counts.length - 1) return;
+    const words = new Float32Array(cores.buffer);
+    for (let i = 0; i < count; i += 1) if ((first + i) % this.step === 0) this.sample.push([...words.subarray(8 * i, 8 * i + 3)]);
+  }
+
+  /** The level for a moving camera, the coarsest that is dense; 0 is the scene itself. @param {Camera} camera @param {Intrinsics} k @param {number} near */
+  choose(camera, k, near) {
+    const coarsest = this.counts.length - 1;
+    if (coarsest === 0 || this.loaded[coarsest] < this.counts[coarsest]) return 0;
+    const seen = this.splatsAPixel(camera, k, near) / this.counts[coarsest];
+    let level = 0;
+    while (level < coarsest && seen * this.counts[level + 1] >= DENSE) level += 1;
+    return level;
+  }
+
+  /** Splats of the coarsest level in view for each pixel of the box that holds most of them.
+   * @param {Camera} camera @param {Intrinsics} k @param {number} near */
+  splatsAPixel({ position, rotation }, k, near) {
+    const [right, down, forward] = axes(rotation);
+    const [xs, ys] = [/** @type {number[]} */ ([]), /** @type {number[]} */ ([])];
+    for (const mean of this.sample) {
+      const offset = subtract(mean, position);
+      const z = dot(forward, offset);
+      if (z <= near) continue;
+      const [x, y] = [(k.fx * dot(right, offset)) / z + k.cx, (k.fy * dot(down, offset)) / z + k.cy];
+      if (x < 0 || y < 0 || x >= k.width || y >= k.height) continue;
+      xs.push(x);
+      ys.push(y);
+    }
+    return (xs.length * this.step) / (extent(xs) * extent(ys));
+  }
+}
+
+/** @param {number[]} values pixels */
+function extent(values) {
+  const sorted = Float64Array.from(values).sort();
+  const at = (/** @type {number} */ share) => sorted[Math.floor(sorted.length * share)] ?? 0;
+  return Math.max(1, at(1 - OUTSIDE) - at(OUTSIDE));
+}

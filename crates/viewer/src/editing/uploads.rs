@@ -1,0 +1,180 @@
+//! Scenes that pages have sent to be merged. Edits name them, and no other files.
+
+use super::EditingError;
+use irradia_edit::EditError;
+use irradia_runs::formats::{FormatError, SplatFormat, parse_splats, write_atomic};
+use irradia_scene::GaussianCloud;
+use std::collections::BTreeMap;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::sync::{Mutex, PoisonError};
+
+/// Bytes of all files that are kept.
+const MOST_BYTES: usize = 1 << 30;
+
+struct Upload {
+    bytes: Vec<u8>,
+    cloud: GaussianCloud,
+}
+
+/// What was sent, by its name.
+pub(crate) struct Uploads {
+    /// Where saving writes them.
+    folder: PathBuf,
+    files: Mutex<BTreeMap<String, Upload>>,
+}
+
+impl Uploads {
+    /// To be written to `folder`.
+    pub fn new(folder: &Path) -> Self {
+        Self {
+            folder: folder.to_owned(),
+            files: Mutex::default(),
+        }
+    }
+
+    /// Keeps a file that a page calls `name`. Returns the name by which edits find it, and its number of splats.
+    ///
+    /// # Errors
+    /// When it is no splat file, or there is no room.
+    pub fn add(&self, name: &str, bytes: Vec<u8>) -> Result<(String, usize), EditingError> {
+        let name: String = name.chars().map(plain).collect();
+        let path = PathBuf::from(name.trim_start_matches('.'));
+        let format = SplatFormat::of(&path)?;
+        if !format.is_readable() || format == SplatFormat::SogFolder {
+            return Err(refused(format!(
+                "{name}: cannot be merged in one piece: choose .ply or .sog"
+            )));
+        }
+        let cloud = parse_splats(format, &bytes).map_err(|source| FormatError::Malformed {
+            path: path.clone(),
+            source,
+        })?;
+        let mut files = self.files.lock().unwrap_or_else(PoisonError::into_inner);
+        let kept: usize = files.values().map(|upload| upload.bytes.len()).sum();
+        let shown = path.display().to_string();
+        let stem = shown.get(..shown.len() - format.suffix().len()).unwrap_or_default();
+        let numbered = |number: usize| match number {
+            1 => shown.clone(),
+            _ => format!("{stem}-{number}{}", format.suffix()),
+        };
+        let is_free = |name: &String| match files.get(name) {
+            Some(other) => other.bytes == bytes,
+            None => self.is_free(name, &bytes),
+        };
+        let name = (1..).map(numbered).find(is_free).expect("some number is free");
+        if kept + bytes.len() > MOST_BYTES && !files.contains_key(&name) {
+            return Err(refused(
+                "there is no room for further scenes: merge them with irradia edit".to_owned(),
+            ));
+        }
+        let splats = cloud.len();
+        files.insert(name.clone(), Upload { bytes, cloud });
+        Ok((name, splats))
+    }
+
+    /// Whether the folder has no other file of this name.
+    fn is_free(&self, name: &str, bytes: &[u8]) -> bool {
+        let path = self.folder.join(name);
+        match fs::metadata(&path) {
+            Ok(file) => file.len() == bytes.len() as u64 && fs::read(&path).is_ok_and(|other| other == bytes),
+            Err(_) => true,
+        }
+    }
+
+    /// The scene that edits call `name`.
+    ///
+    /// # Errors
+    /// When no page has sent it.
+    pub fn open(&self, name: &str) -> Result<GaussianCloud, String> {
+        let files = self.files.lock().unwrap_or_else(PoisonError::into_inner);
+        let upload = files.get(name);
+        upload
+            .map(|upload| upload.cloud.clone())
+            .ok_or_else(|| format!("no scene {name} has been sent: choose it with Merge first"))
+    }
+
+    /// Writes the file `name` to the folder, where `irradia edit` finds it.
+    ///
+    /// # Errors
+    /// When it cannot be written, or another one of its name has come there.
+    pub fn save(&self, name: &str) -> Result<(), EditingError> {
+        let files = self.files.lock().unwrap_or_else(PoisonError::into_inner);
+        let Some(upload) = files.get(name) else { return Ok(()) };
+        if !self.is_free(name, &upload.bytes) {
+            return Err(refused(format!(
+                "another {name} has come beside the scene: move it away"
+            )));
+        }
+        let path = self.folder.join(name);
+        if !path.exists() {
+            write_atomic(&path, |out| out.write_all(&upload.bytes))?;
+        }
+        Ok(())
+    }
+}
+
+fn refused(message: String) -> EditingError {
+    EditError::Scene(message).into()
+}
+
+/// A character of a file's name that every system takes and no path is made of.
+fn plain(c: char) -> char {
+    match c.is_alphanumeric() || "-_.".contains(c) {
+        true => c,
+        false => '_',
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use irradia_runs::formats::encode_splats;
+
+    fn scene(opacity: f32) -> Vec<u8> {
+        let cloud = GaussianCloud {
+            means: vec![[0.0; 3]],
+            quats: vec![[1.0, 0.0, 0.0, 0.0]],
+            log_scales: vec![[-1.0; 3]],
+            opacity_logits: vec![opacity],
+            sh: vec![0.5; 3],
+            ..GaussianCloud::default()
+        };
+        encode_splats(SplatFormat::Ply, &cloud, &Default::default()).unwrap()
+    }
+
+    #[test]
+    fn names_are_no_paths_and_differ_where_contents_do() {
+        let folder = tempfile::tempdir().unwrap();
+        fs::write(folder.path().join("taken.ply"), "other").unwrap();
+        let uploads = Uploads::new(folder.path());
+        let add = |name: &str, opacity: f32| uploads.add(name, scene(opacity)).map(|(name, _)| name).unwrap();
+        assert_eq!(add("../a b/c.ply", 1.0), "_a_b_c.ply");
+        assert_eq!(add("room.ply", 1.0), "room.ply");
+        assert_eq!(add("room.ply", 1.0), "room.ply");
+        assert_eq!(add("room.ply", 2.0), "room-2.ply");
+        assert_eq!(add("taken.ply", 1.0), "taken-2.ply");
+        assert_eq!(uploads.open("room-2.ply").unwrap().opacity_logits, [2.0]);
+        assert!(uploads.open("/etc/passwd").unwrap_err().contains("has been sent"));
+        uploads.save("room.ply").unwrap();
+        uploads.save("room.ply").unwrap();
+        assert_eq!(fs::read(folder.path().join("room.ply")).unwrap(), scene(1.0));
+        fs::write(folder.path().join("room-2.ply"), "other").unwrap();
+        assert!(
+            uploads
+                .save("room-2.ply")
+                .unwrap_err()
+                .to_string()
+                .contains("move it away")
+        );
+        for (name, bytes, says) in [
+            ("a.ply", b"ply".to_vec(), "a.ply"),
+            ("a.png", scene(1.0), "a.png"),
+            ("a.npz", scene(1.0), "choose .ply"),
+            ("meta.json", scene(1.0), "choose .ply"),
+        ] {
+            let error = uploads.add(name, bytes).unwrap_err().to_string();
+            assert!(error.contains(says) && !error.contains('\n'), "{error}");
+        }
+    }
+}

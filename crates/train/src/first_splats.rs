@@ -30,7 +30,7 @@ impl Trainer {
         let options = self.init_options();
         let dataset = self.dataset.clone();
         let most = self.recipe.max_splats;
-        let splats = match dataset.points.as_ref().filter(|points| points.len() >= FEWEST_POINTS) {
+        let splats = match enough_points(&dataset) {
             // Evenly over the file: SfM writes points in the order in which it finds them, region by region.
             Some(points) if points.len() > most => {
                 let chosen = (0..most).map(|i| i * points.len() / most);
@@ -82,14 +82,18 @@ impl Trainer {
     }
 }
 
+/// Whether a dataset has enough points for the first splats.
+pub(crate) fn has_points(dataset: &Dataset) -> bool {
+    enough_points(dataset).is_some()
+}
+
+fn enough_points(dataset: &Dataset) -> Option<&PointCloud> {
+    dataset.points.as_ref().filter(|points| points.len() >= FEWEST_POINTS)
+}
+
 /// Number of splats with which a training begins.
 pub(crate) fn first_count(dataset: &Dataset, recipe: &Recipe) -> usize {
-    let points = dataset
-        .points
-        .as_ref()
-        .map(PointCloud::len)
-        .filter(|points| *points >= FEWEST_POINTS);
-    let first = points.unwrap_or(recipe.init.random_points);
+    let first = enough_points(dataset).map_or(recipe.init.random_points, PointCloud::len);
     if is_field(recipe, 0) {
         0
     } else {

@@ -16,6 +16,7 @@ mod first_splats;
 mod forecast;
 mod free_space;
 pub mod half_fit;
+mod known_space;
 pub mod memory;
 mod misfits;
 pub mod model;

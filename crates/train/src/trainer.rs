@@ -177,6 +177,7 @@ impl Trainer {
             // In the recipe, so that a resumed run has the same limit.
             trainer.recipe.max_splats = trainer.memory.splats;
         }
+        trainer.settle_known_space()?;
         if is_field(&trainer.recipe, 0) {
             let state = trainer.first_field()?;
             trainer.set_field(state)?;
@@ -203,6 +204,7 @@ impl Trainer {
             return Err(TrainError::NoSplats);
         }
         let mut trainer = Self::unfilled(dataset, recipe, options, splats.len())?;
+        trainer.settle_known_space()?;
         *trainer.engine.state_mut() = SplatState::new(splats);
         trainer.sockets = trainer.first_sockets()?;
         Ok(trainer)

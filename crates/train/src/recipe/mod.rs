@@ -121,6 +121,10 @@ documented! {
         pub residual: Option<ResidualKnobs>,
         /// Parameters over the whole run; a stage may override them.
         pub params: Params,
+        /// Parameters in place of those of `params` if the data show where space is empty: the dataset has points, or the photographs
+        /// have alpha. `--set` of the same parameter in `params` prevails.
+        #[serde(default, skip_serializing_if = "Params::is_empty")]
+        pub known_space: Params,
         /// The stages, in order.
         pub stage: Vec<Stage>,
     }
@@ -411,6 +415,10 @@ impl Recipe {
             }
         })?;
         recipe.validate().map_err(invalid)?;
+        let set = |param: &Param| format!("params.{}=", param.name());
+        recipe
+            .known_space
+            .retain(|param, _| !overrides.iter().any(|given| given.starts_with(&set(param))));
         recipe.complete_sockets();
         let ingredients = recipe.ingredients;
         ingredients.apply(&mut recipe);
@@ -510,12 +518,15 @@ impl Recipe {
                 ));
             }
         }
-        let everywhere = std::iter::once(("params".to_owned(), &self.params));
+        let everywhere = [
+            ("params".to_owned(), &self.params),
+            ("known_space".to_owned(), &self.known_space),
+        ];
         let stages = self
             .stage
             .iter()
             .map(|s| (format!("stage.{}.params", s.name), &s.params));
-        for (place, params) in everywhere.chain(stages) {
+        for (place, params) in everywhere.into_iter().chain(stages) {
             for (param, knob) in params {
                 check_knob(*param, knob).map_err(|why| format!("{place}.{}: {why}", param.name()))?;
             }

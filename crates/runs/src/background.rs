@@ -69,7 +69,7 @@ impl Background {
     }
 
     /// The default for a dataset: white for Blender scenes with transparent photographs, judged by the first one, and for
-    /// photographs without alpha of objects cut out on white, judged by [`SAMPLES`] of them; the recipe's own for others.
+    /// photographs without alpha of objects cut out on white, judged by eight of them; the recipe's own for others.
     ///
     /// # Errors
     /// When one of these photographs cannot be read.

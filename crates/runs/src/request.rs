@@ -21,6 +21,9 @@ pub const HOW_TO_GET_LPIPS: &str = "import the weights once with irradia lpips -
 /// The default recipe: the best for its time on all scenes of RESULTS.md.
 pub const DEFAULT_RECIPE: &str = "fast";
 
+/// Largest factor on the length of a recipe for many photographs: 30,000 steps of `fast`, as long as 3DGS.
+const MOST_STRETCHED: u64 = 10;
+
 /// How to read a dataset, not validated.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Reading {
@@ -365,6 +368,16 @@ impl TrainRequest {
         missing.then(line).into_iter().collect()
     }
 
+    /// Sets the number of steps if neither the input does nor a budget, and the recipe's own length would visit photographs too seldom.
+    pub(crate) fn choose_length(&mut self, dataset: &Dataset) {
+        let own = self.recipe.total_steps();
+        let wanted = self.recipe.visits.saturating_mul(dataset.train.len() as u64);
+        let input = &mut self.input;
+        if wanted > own && input.steps.is_none() && input.budget.is_none() && input.replay.is_none() {
+            input.steps = Some(wanted.min(MOST_STRETCHED * own));
+        }
+    }
+
     /// Sets the background of photographs with alpha, if neither the input nor its overrides of the recipe do.
     pub(crate) fn choose_background(&mut self, dataset: &Dataset) -> Result<(), RunError> {
         let is_set = self
@@ -401,5 +414,41 @@ impl TrainRequest {
     pub(crate) fn paces(&self) -> Result<Option<Paces>, RunError> {
         let run = self.input.replay.as_deref();
         run.map(|run| RunFolder::open(run)?.0.paces()).transpose()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn many_photographs_make_a_run_longer_unless_its_length_is_given() {
+        let steps = |views: usize, input: TrainInput| {
+            let mut request = input.check().expect("valid");
+            request.choose_length(&Dataset {
+                train: (0..views).collect(),
+                ..Dataset::default()
+            });
+            request.input.steps
+        };
+        let input = || TrainInput::new("photos", "run");
+        assert_eq!(steps(50, input()), None, "the recipe's own");
+        assert_eq!(steps(100, input()), Some(6_000));
+        assert_eq!(steps(5_000, input()), Some(30_000));
+        let given = TrainInput {
+            steps: Some(700),
+            ..input()
+        };
+        assert_eq!(steps(100, given), Some(700));
+        let budget = TrainInput {
+            budget: Some(60.0),
+            ..input()
+        };
+        assert_eq!(steps(100, budget), None);
+        let published = TrainInput {
+            recipe: "classic".into(),
+            ..input()
+        };
+        assert_eq!(steps(5_000, published), None);
     }
 }

@@ -85,6 +85,7 @@ impl Run {
             return Err(RunError::setting("until_psnr", psnr, message));
         }
         request.choose_background(&dataset)?;
+        request.choose_length(&dataset);
         let (out, overwrite) = (&request.input.out, request.input.overwrite);
         RunFolder::check_free(out, overwrite)?;
         let held = FolderLock::take_existing(out)?;

@@ -84,6 +84,10 @@ documented! {
         /// recipe's steps has half the rates; 0 for none.
         #[serde(default, skip_serializing_if = "is_zero")]
         pub length_exponent: f32,
+        /// Steps for each training photograph that a run without a number of steps or a budget has at least, up to ten times the recipe's own
+        /// length; 0: it always has its own length.
+        #[serde(default, skip_serializing_if = "is_zero_steps")]
+        pub visits: u64,
         /// Steps between evaluations of held-out views while training; at least 1.
         pub eval_every: u64,
         /// Steps between checkpoints; at least 1.
@@ -541,6 +545,10 @@ fn is_false(value: &bool) -> bool {
 
 fn is_zero(value: &f32) -> bool {
     *value == 0.0
+}
+
+fn is_zero_steps(value: &u64) -> bool {
+    *value == 0
 }
 
 impl Recipe {

@@ -88,8 +88,10 @@ mod tests {
         }
         let (value, usual, _) = trained(3, false, &[]);
         assert_eq!(value, usual);
-        let (value, ..) = trained(3, true, &["params.opacity_reg=0.5"]);
-        assert_eq!(value, Knob::Const(0.5), "what is set prevails");
+        for set in ["params.opacity_reg=0.5", "params.opacity_reg = 0.5"] {
+            let (value, ..) = trained(3, true, &[set]);
+            assert_eq!(value, Knob::Const(0.5), "what is set prevails");
+        }
         let (value, ..) = trained(3, true, &["known_space.opacity_reg=0.3"]);
         assert_eq!(value, Knob::Const(0.3));
     }

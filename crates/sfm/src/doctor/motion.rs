@@ -92,6 +92,12 @@ pub(super) fn rotation_only(evidence: &Evidence, graph: &Graph, moving: &[[u32; 
     vec![Diagnosis::RotationOnly { photos: turned, pairs }]
 }
 
+/// Photographs of the pairs that have a value.
+pub(super) fn showing<T>(pairs: &[&PairMatches], values: &[Option<T>]) -> Vec<[u32; 2]> {
+    let both = pairs.iter().zip(values);
+    both.filter(|b| b.1.is_some()).map(|b| b.0.photos).collect()
+}
+
 /// Photographs by how many of `pairs` name them, most first.
 pub(super) fn most_named(pairs: &[[u32; 2]]) -> Vec<usize> {
     let mut counts: BTreeMap<usize, usize> = BTreeMap::new();
@@ -133,12 +139,7 @@ pub(super) fn stands_still(evidence: &Evidence) -> Vec<Diagnosis> {
         .filter(|p| p.matches.len() >= 3 * STILL_MATCHES)
         .collect();
     let fractions: Vec<Option<f64>> = compared.par_iter().map(|pair| fraction(pair)).collect();
-    let found: Vec<[u32; 2]> = compared
-        .iter()
-        .zip(&fractions)
-        .filter(|f| f.1.is_some())
-        .map(|f| f.0.photos)
-        .collect();
+    let found = showing(&compared, &fractions);
     if found.len() < 3 || (found.len() as f64) < STILL_PAIRS * compared.len() as f64 {
         return Vec::new();
     }

@@ -5,7 +5,7 @@
 //! is taken for its copy, but seldom between photographs that share most, and a third photograph that shows both tells them apart: what
 //! moves is one thing everywhere.
 
-use super::motion::{AGREES, limits, most_named, places};
+use super::motion::{AGREES, limits, most_named, places, showing};
 use super::{Diagnosis, Evidence};
 use crate::PairMatches;
 use crate::geometry::correspondences::{Correspondences, sampson_squared};
@@ -54,12 +54,7 @@ pub(super) fn moving(evidence: &Evidence) -> (Vec<Diagnosis>, Vec<[u32; 2]>) {
             is_one_thing(&partners, pair.photos, &group).then_some(group.len())
         })
         .collect();
-    let found: Vec<[u32; 2]> = compared
-        .iter()
-        .zip(&counts)
-        .filter(|f| f.1.is_some())
-        .map(|f| f.0.photos)
-        .collect();
+    let found = showing(&compared, &counts);
     if found.len() < PAIRS || (found.len() as f64) < FRACTION * compared.len() as f64 {
         return (Vec::new(), Vec::new());
     }

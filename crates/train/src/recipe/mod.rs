@@ -78,15 +78,15 @@ documented! {
         pub splats_per_pixel: Option<f32>,
         /// Radius around each training camera within which splats are removed at every round of density control, as a fraction of
         /// the depth of the nearest points that its view sees (or of its depth bounds); 0 for none.
-        #[serde(default, skip_serializing_if = "is_zero")]
+        #[serde(default, skip_serializing_if = "is_default")]
         pub free_space: f32,
         /// Exponent of the rates' dependence on the length of a run that is longer than the recipe: with 0.5 a run of four times the
         /// recipe's steps has half the rates; 0 for none.
-        #[serde(default, skip_serializing_if = "is_zero")]
+        #[serde(default, skip_serializing_if = "is_default")]
         pub length_exponent: f32,
         /// Steps for each training photograph that a run without a number of steps or a budget has at least, up to ten times the recipe's own
         /// length; 0: it always has its own length.
-        #[serde(default, skip_serializing_if = "is_zero_steps")]
+        #[serde(default, skip_serializing_if = "is_default")]
         pub visits: u64,
         /// Steps between evaluations of held-out views while training; at least 1.
         pub eval_every: u64,
@@ -112,13 +112,13 @@ documented! {
         #[serde(default, skip_serializing_if = "Choice::is_no")]
         pub exposure: Choice,
         /// Leave out photographs whose error, after a fifth of the run, is far beyond the others': wrong poses, or another scene.
-        #[serde(default, skip_serializing_if = "is_false")]
+        #[serde(default, skip_serializing_if = "is_default")]
         pub drop_misfits: bool,
         /// Hide from training what stands in one photograph only, such as people who walk through, found after 0.3 of the run.
-        #[serde(default, skip_serializing_if = "is_false")]
+        #[serde(default, skip_serializing_if = "is_default")]
         pub hide_transients: bool,
         /// Refine the cameras' poses.
-        #[serde(default, skip_serializing_if = "is_false")]
+        #[serde(default, skip_serializing_if = "is_default")]
         pub refine_poses: bool,
         /// A field that adds to the splats' colours.
         #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -419,10 +419,11 @@ impl Recipe {
             }
         })?;
         recipe.validate().map_err(invalid)?;
-        let set = |param: &Param| format!("params.{}=", param.name());
-        recipe
-            .known_space
-            .retain(|param, _| !overrides.iter().any(|given| given.starts_with(&set(param))));
+        let is_set = |param: &Param| {
+            let mut paths = overrides.iter().filter_map(|given| given.split_once('='));
+            paths.any(|(path, _)| path.trim().strip_prefix("params.") == Some(param.name()))
+        };
+        recipe.known_space.retain(|param, _| !is_set(param));
         recipe.complete_sockets();
         let ingredients = recipe.ingredients;
         ingredients.apply(&mut recipe);
@@ -539,16 +540,8 @@ impl Recipe {
     }
 }
 
-fn is_false(value: &bool) -> bool {
-    !value
-}
-
-fn is_zero(value: &f32) -> bool {
-    *value == 0.0
-}
-
-fn is_zero_steps(value: &u64) -> bool {
-    *value == 0
+fn is_default<T: Default + PartialEq>(value: &T) -> bool {
+    *value == T::default()
 }
 
 impl Recipe {

@@ -35,6 +35,8 @@ pub enum Background {
     White,
     /// Black in training and evaluation.
     Black,
+    /// Grey in training and evaluation, and the surfaces in front cover it: what is left to see of it matters least.
+    Grey,
     /// A random colour per training step, white in evaluation.
     Random,
 }
@@ -45,6 +47,7 @@ impl Background {
         match self {
             Self::White | Self::Random => [1.0; 3],
             Self::Black => [0.0; 3],
+            Self::Grey => [0.5; 3],
         }
     }
 
@@ -53,13 +56,18 @@ impl Background {
         match self {
             Self::White => "white",
             Self::Black => "black",
+            Self::Grey => "grey",
             Self::Random => "random",
         }
     }
 
-    /// Sets this background in `recipe`. Where the recipe already trains over random colours, it still does.
+    /// Sets this background in `recipe`. Where the recipe already trains over random colours, it still does. Before one that photographs
+    /// show, surfaces need not cover it.
     pub(crate) fn apply_to(self, recipe: &mut Recipe) {
         recipe.render.background = self.color();
+        if self != Self::Grey {
+            uncover(recipe);
+        }
         if self == Self::Random {
             for stage in &mut recipe.stage {
                 stage.params.remove(&Param::RandomBackground);
@@ -69,11 +77,12 @@ impl Background {
     }
 
     /// The default for a dataset: white for Blender scenes with transparent photographs, judged by the first one, and for
-    /// photographs without alpha of objects cut out on white, judged by eight of them; the recipe's own for others.
+    /// photographs without alpha of objects cut out on white, judged by eight of them; grey for others without alpha if the recipe
+    /// wants surfaces to cover it (`covers`); otherwise the recipe's own.
     ///
     /// # Errors
     /// When one of these photographs cannot be read.
-    pub fn usual(dataset: &Dataset) -> Result<Option<Self>, RunError> {
+    pub fn usual(dataset: &Dataset, covers: bool) -> Result<Option<Self>, RunError> {
         let load = |view: &usize| {
             let photo = dataset.views[*view].photo.load();
             photo.map_err(|error: LoadError| RunError::Train(TrainError::Photo(error)))
@@ -86,16 +95,25 @@ impl Background {
             let transparent = dataset.kind == "Blender" && alpha.iter().any(|a| *a < 255);
             return Ok(transparent.then_some(Self::White));
         }
+        let grey = covers.then_some(Self::Grey);
         if !has_white_border(&first) {
-            return Ok(None);
+            return Ok(grey);
         }
         let every = dataset.train.len().div_ceil(SAMPLES);
         for view in dataset.train.iter().step_by(every).skip(1) {
             if !has_white_border(&load(view)?) {
-                return Ok(None);
+                return Ok(grey);
             }
         }
         Ok(Some(Self::White))
+    }
+}
+
+/// Has surfaces leave free what is behind them.
+pub(crate) fn uncover(recipe: &mut Recipe) {
+    recipe.params.remove(&Param::CoverWeight);
+    for stage in &mut recipe.stage {
+        stage.params.remove(&Param::CoverWeight);
     }
 }
 
@@ -103,10 +121,10 @@ impl FromStr for Background {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
-        let found = [Self::White, Self::Black, Self::Random]
+        let found = [Self::White, Self::Black, Self::Grey, Self::Random]
             .into_iter()
             .find(|background| background.name() == text);
-        found.ok_or_else(|| "expected white, black or random".into())
+        found.ok_or_else(|| "expected white, black, grey or random".into())
     }
 }
 
@@ -115,6 +133,7 @@ pub(crate) fn in_words(recipe: &Recipe) -> String {
     let color = match recipe.render.background {
         [1.0, 1.0, 1.0] => "white".to_owned(),
         [0.0, 0.0, 0.0] => "black".to_owned(),
+        [0.5, 0.5, 0.5] => "grey".to_owned(),
         [r, g, b] => format!("sRGB {r}, {g}, {b}"),
     };
     let params = std::iter::once(&recipe.params).chain(recipe.stage.iter().map(|stage| &stage.params));
@@ -131,6 +150,9 @@ pub(crate) fn in_words(recipe: &Recipe) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use glam::Vec3;
+    use irradia_scene::{Camera, Intrinsics, Pose, View};
+    use std::sync::Arc;
 
     #[test]
     fn a_cut_out_object_may_touch_the_border_of_its_photograph() {
@@ -150,6 +172,52 @@ mod tests {
         // A table in the lower third.
         assert!(!has_white_border(&photo(&|_, y| if y > 13 { 200 } else { 255 })));
         assert!(!has_white_border(&photo(&|_, _| 240)));
+    }
+
+    #[test]
+    fn surfaces_cover_grey_and_no_background_that_photographs_show() {
+        let covers = |background: Background| {
+            let mut recipe = Recipe::parse("fast", Recipe::built_in("fast").unwrap(), &[]).unwrap();
+            background.apply_to(&mut recipe);
+            (recipe.uses(Param::CoverWeight), in_words(&recipe))
+        };
+        assert_eq!(covers(Background::Grey), (true, "grey".into()));
+        assert_eq!(covers(Background::White), (false, "white".into()));
+        assert_eq!(covers(Background::Black), (false, "black".into()));
+    }
+
+    #[test]
+    fn photographs_without_alpha_get_grey_from_recipes_that_cover_it_and_cut_out_ones_white() {
+        let dataset = |value: u8, channels: u32| {
+            let photo = Photo {
+                width: 8,
+                height: 8,
+                channels,
+                data: vec![value; 64 * channels as usize],
+                mask: None,
+            };
+            let view = View {
+                name: "a".into(),
+                camera: Camera::new(
+                    Pose::look_at(Vec3::NEG_Z, Vec3::ZERO, Vec3::NEG_Y),
+                    Intrinsics::from_fov_x(8, 8, 1.0),
+                ),
+                photo: Arc::new(photo),
+                depth_bounds: None,
+                time: None,
+                points_seen: Vec::new(),
+            };
+            Dataset {
+                views: vec![view],
+                train: vec![0],
+                ..Dataset::default()
+            }
+        };
+        let usual = |value, channels, covers| Background::usual(&dataset(value, channels), covers).unwrap();
+        assert_eq!(usual(90, 3, true), Some(Background::Grey));
+        assert_eq!(usual(90, 3, false), None);
+        assert_eq!(usual(255, 3, true), Some(Background::White));
+        assert_eq!(usual(90, 4, true), None, "alpha shows what is empty");
     }
 
     #[test]

@@ -20,6 +20,8 @@ pub const SCENE: &str = "scene.ply";
 pub const FIELD: &str = "field.safetensors";
 /// The residual field of a run's splats.
 pub const RESIDUAL: &str = socket::FILES[1];
+/// The sky behind a run's splats.
+pub const SKY: &str = socket::FILES[3];
 
 /// The length of a run's world unit, if it is known.
 pub const UNIT: &str = "unit.json";
@@ -32,7 +34,7 @@ const WORLD: &str = "world.json";
 pub(crate) const PACES: &str = "pace.txt";
 
 /// The files of a run.
-const FILES: [&str; 15] = [
+const FILES: [&str; 16] = [
     "run.json",
     VIEWS,
     WORLD,
@@ -45,6 +47,7 @@ const FILES: [&str; 15] = [
     socket::FILES[0],
     socket::FILES[1],
     socket::FILES[2],
+    SKY,
     "report.json",
     "report.html",
     UNIT,

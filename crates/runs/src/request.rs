@@ -1,5 +1,6 @@
 //! Training requests: raw input, and the validated request.
 
+use crate::background::uncover;
 use crate::{Background, RunError, RunFolder, scene_of};
 use irradia_compute::DeviceChoice;
 use irradia_formats::{DEFAULT_MAX_SIDE, DatasetFormat, DatasetOptions, Holdout, read_dataset, read_splats};
@@ -378,15 +379,20 @@ impl TrainRequest {
         }
     }
 
-    /// Sets the background of photographs with alpha, if neither the input nor its overrides of the recipe do.
+    /// Sets the usual background of such photographs, if neither the input nor its overrides of the recipe set one.
     pub(crate) fn choose_background(&mut self, dataset: &Dataset) -> Result<(), RunError> {
         let is_set = self
             .input
             .set
             .iter()
             .any(|change| change.starts_with("render.background"));
-        if self.input.background.is_none() && !is_set {
-            self.input.background = Background::usual(dataset)?;
+        if self.input.background.is_none() {
+            if is_set {
+                uncover(&mut self.recipe);
+            } else {
+                let covers = self.recipe.uses(Param::CoverWeight);
+                self.input.background = Background::usual(dataset, covers)?;
+            }
         }
         if let Some(background) = self.input.background {
             background.apply_to(&mut self.recipe);

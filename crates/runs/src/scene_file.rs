@@ -1,7 +1,7 @@
 //! A scene that can be rendered: read from a file or a run, or taken from a training.
 
 use crate::RunError;
-use crate::folder::{FIELD, RESIDUAL, SCENE, cameras_beside, world_beside};
+use crate::folder::{FIELD, RESIDUAL, SCENE, SKY, cameras_beside, world_beside};
 use crate::orbit::{Outlook, orbit, outlook};
 use irradia_edit::Draft;
 use irradia_field::{Field, Sampler};
@@ -10,7 +10,8 @@ use irradia_scene::{Camera, Dataset, Similarity};
 use irradia_splat::{RenderOptions, Renderer, Splats};
 use irradia_train::model::{Frame, Model};
 use irradia_train::recipe::RenderKnobs;
-use irradia_train::{Recipe, field_file};
+use irradia_train::socket::background_of_sky;
+use irradia_train::{Recipe, TrainError, field_file};
 use std::borrow::Cow;
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -50,7 +51,7 @@ pub struct Scene {
 
 impl Scene {
     /// Reads a splat file, a field, or the scene of a run's folder. Background and antialiasing are those of the run that
-    /// contains the file; a residual field beside a run's splats is part of the scene.
+    /// contains the file, with the mean colour of its sky if it has one; a residual field beside a run's splats is part of the scene.
     ///
     /// # Errors
     /// When it cannot be read, or is a residual field without its splats.
@@ -61,7 +62,7 @@ impl Scene {
         Ok(Self {
             model,
             options: RenderOptions {
-                background: knobs.background,
+                background: sky_beside(path)?.unwrap_or(knobs.background),
                 antialias: knobs.antialias || antialiased,
                 ..RenderOptions::default()
             },
@@ -146,6 +147,20 @@ pub(crate) fn residual_beside(scene: &Path) -> Result<Option<Field>, RunError> {
     let beside = scene.with_file_name(RESIDUAL);
     let is_there = scene.file_name().is_some_and(|name| name == SCENE) && beside.is_file();
     is_there.then(|| read_field(&beside)).transpose()
+}
+
+/// The mean colour of the sky beside `scene`, if there is one.
+fn sky_beside(scene: &Path) -> Result<Option<[f32; 3]>, RunError> {
+    let path = scene.with_file_name(SKY);
+    if scene.file_name().is_none_or(|name| name != SCENE) || !path.is_file() {
+        return Ok(None);
+    }
+    let bytes = fs::read(&path).map_err(RunError::io("read", &path))?;
+    let color = background_of_sky(&bytes).map_err(|why| RunError::File {
+        path,
+        source: TrainError::Checkpoint(why),
+    })?;
+    Ok(Some(color))
 }
 
 /// Background and antialiasing of the run that contains `scene`; otherwise the defaults.

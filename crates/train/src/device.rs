@@ -10,7 +10,7 @@ use irradia_scene::Camera;
 use irradia_splat::{Engine, RenderOptions, Update};
 #[cfg(feature = "gpu")]
 use {
-    crate::objective::photometric_weights,
+    crate::objective::{cover_weight, photometric_weights},
     crate::recipe::Param,
     irradia_measure::gpu::{Beside, DeviceFrame, GpuLoss},
     irradia_measure::{Target, Truth},
@@ -105,6 +105,7 @@ fn needs_host(reference: &Reference, plan: &StepPlan, has_lpips: bool) -> bool {
         || weighs(Param::CoarseWeight)
         || weighs(Param::PerceptualWeight) && has_lpips
         || weighs(Param::AlphaWeight) && reference.photo.alpha.is_some()
+        || weighs(Param::MaskWeight) && reference.photo.mask.is_some()
         || weighs(Param::SmoothWeight)
         || plan.edge_share > 0.0
 }
@@ -181,13 +182,14 @@ impl DeviceLoss {
         let beside = Beside {
             depths: reference.depths,
             depth_weight,
+            cover_weight: cover_weight(photo, plan),
             error: plan.gathers == Some(Statistics::Error),
         };
         let frame = DeviceFrame { planes, v_planes };
         loss.begin(&frame, &target, &photometric_weights(plan), &beside);
         let has_depth = !reference.depths.is_empty();
         engine.backward_on_device(&DeviceGradient {
-            alpha: has_depth,
+            alpha: has_depth || cover_weight(photo, plan) > 0.0,
             depth: has_depth,
             gather: plan.gathers.filter(|what| *what != Statistics::Gradient),
             camera,

@@ -4,6 +4,7 @@
 mod audit;
 pub mod checkpoint;
 pub mod compare;
+mod conditions;
 mod device;
 mod edges;
 pub mod eval;
@@ -16,7 +17,6 @@ mod first_splats;
 mod forecast;
 mod free_space;
 pub mod half_fit;
-mod known_space;
 pub mod memory;
 mod misfits;
 pub mod model;

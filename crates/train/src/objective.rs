@@ -131,17 +131,33 @@ impl Objective {
             }
         }
         let depths = plan.compares_depth();
-        let weight = plan.value(Param::AlphaWeight);
+        let coverages = [
+            (Param::AlphaWeight, photo.alpha.as_ref()),
+            (Param::MaskWeight, photo.mask.as_ref()),
+        ];
+        let coverages = coverages.map(|(param, wanted)| Some((plan.value(param), wanted?)).filter(|(w, _)| *w > 0.0));
+        let cover = cover_weight(photo, plan);
         self.has = Has {
             depth: depths,
-            alpha: depths || weight > 0.0 && photo.alpha.is_some(),
+            alpha: depths || cover > 0.0 || coverages.iter().any(Option::is_some),
         };
         if self.has.alpha {
             self.v_alpha.clear();
             self.v_alpha.resize(pixels, 0.0);
         }
-        if let Some(alpha) = photo.alpha.as_ref().filter(|_| weight > 0.0) {
-            total += compare_alpha(frame.alpha, alpha, weight, &mut self.v_alpha);
+        if cover > 0.0 {
+            let v = cover / pixels as f32;
+            match &photo.mask {
+                Some(mask) => {
+                    for (v_alpha, mask) in self.v_alpha.iter_mut().zip(mask) {
+                        *v_alpha -= v * f32::from(*mask) / 255.0;
+                    }
+                }
+                None => self.v_alpha.fill(-v),
+            }
+        }
+        for (weight, wanted) in coverages.into_iter().flatten() {
+            total += compare_alpha(frame.alpha, wanted, weight, &mut self.v_alpha);
         }
         if depths {
             self.v_depth.clear();
@@ -229,6 +245,16 @@ impl Objective {
         &mut self.v_color
     }
 
+    /// The gradients of the colour last evaluated, and of the coverage to add to: `[3, H, W]` and `[H, W]`.
+    pub fn v_color_and_alpha(&mut self) -> (&[f32], &mut [f32]) {
+        if !self.has.alpha {
+            self.has.alpha = true;
+            self.v_alpha.clear();
+            self.v_alpha.resize(self.v_color.len() / 3, 0.0);
+        }
+        (&self.v_color, &mut self.v_alpha)
+    }
+
     /// The gradients of the frame last evaluated; `gather` and `camera` are left for the caller to set.
     pub fn gradient(&self) -> OutputGradient<'_> {
         OutputGradient {
@@ -253,6 +279,14 @@ pub(crate) fn photometric_weights(plan: &StepPlan) -> LossWeights {
     }
 }
 
+/// The weight of the coverage of `photo`: photographs with alpha show what is empty.
+pub(crate) fn cover_weight(photo: &Prepared, plan: &StepPlan) -> f32 {
+    match photo.alpha {
+        Some(_) => 0.0,
+        None => plan.value(Param::CoverWeight),
+    }
+}
+
 /// Mean |got - want|, weighted; adds its gradient to `v_alpha`.
 fn compare_alpha(got: &[f32], want: &[u8], weight: f32, v_alpha: &mut [f32]) -> f64 {
     let weight = weight / got.len() as f32;
@@ -265,4 +299,64 @@ fn compare_alpha(got: &[f32], want: &[u8], weight: f32, v_alpha: &mut [f32]) -> 
         }
     }
     f64::from(weight) * sum
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::Recipe;
+    use crate::schedule::{Clock, plan};
+
+    #[test]
+    fn coverage_is_wanted_where_photographs_show_something_and_as_masks_say() {
+        let photo = Prepared {
+            width: 4,
+            height: 2,
+            rgb: vec![128; 24],
+            alpha: None,
+            mask: Some(vec![255, 255, 255, 255, 0, 0, 255, 255]),
+            background: [0.0; 3],
+        };
+        let (color, alpha) = ([0.5; 24], [0.9, 0.2, 1.0, 0.0, 0.9, 0.0, 0.5, 0.5]);
+        let v_alpha = |set: &str, photo: &Prepared| {
+            let set = ["params.cover_weight=0", set].map(str::to_owned);
+            let recipe = Recipe::parse("fast", Recipe::built_in("fast").unwrap(), &set).unwrap();
+            let mut plan = plan(&recipe, &Clock::new(&recipe));
+            plan.values[Param::DepthWeight] = 0.0;
+            let frame = FramePlanes {
+                color: &color,
+                alpha: &alpha,
+                depth: &[],
+            };
+            let reference = Reference {
+                photo,
+                background: None,
+                depths: &[],
+            };
+            let mut objective = Objective::new(None);
+            objective.evaluate(frame, &reference, &plan, &mut Rng::new(1, 1));
+            objective.gradient().alpha.map(<[f32]>::to_vec)
+        };
+        let covered = v_alpha("params.cover_weight=0.8", &photo).unwrap();
+        let near = |got: &[f32], wanted: [f32; 8]| got.iter().zip(wanted).all(|(a, b)| (a - b).abs() < 1e-7);
+        assert!(
+            near(&covered, [-0.1, -0.1, -0.1, -0.1, 0.0, 0.0, -0.1, -0.1]),
+            "{covered:?}"
+        );
+        let masked = v_alpha("params.mask_weight=0.8", &photo).unwrap();
+        assert!(
+            near(&masked, [-0.1, -0.1, 0.0, -0.1, 0.1, 0.0, -0.1, -0.1]),
+            "{masked:?}"
+        );
+        assert_eq!(v_alpha("params.mask_weight=0", &photo), None);
+        let transparent = Prepared {
+            alpha: Some(vec![255; 8]),
+            ..photo.clone()
+        };
+        assert_eq!(
+            v_alpha("params.cover_weight=0.8", &transparent),
+            None,
+            "alpha shows what is empty"
+        );
+    }
 }

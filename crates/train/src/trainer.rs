@@ -13,7 +13,7 @@ use crate::objective::{Objective, ObjectiveValues, Reference};
 use crate::photos::{PhotoCache, Prepared};
 use crate::recipe::{AdamKind, Choice, DensityControl, LengthUnit, Param, Recipe};
 use crate::schedule::{Clock, Round, StepMetrics, StepPlan, plan, upcoming_views};
-use crate::socket::{Residual, Sockets};
+use crate::socket::{Residual, Sky, Sockets};
 use crate::times::Times;
 use crate::transients::Hidden;
 use cpu_time::ProcessTime;
@@ -177,7 +177,7 @@ impl Trainer {
             // In the recipe, so that a resumed run has the same limit.
             trainer.recipe.max_splats = trainer.memory.splats;
         }
-        trainer.settle_known_space()?;
+        trainer.settle_conditions()?;
         if is_field(&trainer.recipe, 0) {
             let state = trainer.first_field()?;
             trainer.set_field(state)?;
@@ -204,7 +204,7 @@ impl Trainer {
             return Err(TrainError::NoSplats);
         }
         let mut trainer = Self::unfilled(dataset, recipe, options, splats.len())?;
-        trainer.settle_known_space()?;
+        trainer.settle_conditions()?;
         *trainer.engine.state_mut() = SplatState::new(splats);
         trainer.sockets = trainer.first_sockets()?;
         Ok(trainer)
@@ -370,7 +370,7 @@ impl Trainer {
             .then(|| std::array::from_fn(|_| rng.uniform()))
             .filter(|_| photo.alpha.is_some());
         let options = RenderOptions {
-            background: background.unwrap_or(self.recipe.render.background),
+            background: background.unwrap_or(self.background()),
             depth: plan.compares_depth(),
             ..self.render_options(plan.sh_degree)
         };
@@ -389,7 +389,7 @@ impl Trainer {
             Some(loss) => loss,
             None => {
                 self.sockets.render(&mut self.engine, view, placement, &options, &plan);
-                let loss = self.step_losses(&reference, view, &plan, &mut rng);
+                let loss = self.step_losses(&reference, (view, &camera), &plan, &mut rng);
                 self.sockets
                     .step_before_blending(&mut self.engine, view, &camera, self.extent, &plan);
                 self.engine.update(&update);
@@ -431,9 +431,15 @@ impl Trainer {
     }
 
     /// The losses of the last frame, and its backward pass.
-    fn step_losses(&mut self, reference: &Reference, view: usize, plan: &StepPlan, rng: &mut Rng) -> ObjectiveValues {
+    fn step_losses(
+        &mut self,
+        reference: &Reference,
+        (view, camera): (usize, &Camera),
+        plan: &StepPlan,
+        rng: &mut Rng,
+    ) -> ObjectiveValues {
         let camera_gradient = self.sockets.needs_camera_gradient();
-        let on_device = self.sockets.exposure.is_none().then(|| {
+        let on_device = (!self.sockets.are_after_blending()).then(|| {
             let has_lpips = self.options.lpips.is_some();
             self.device_loss
                 .step(&mut self.engine, reference, plan, camera_gradient, has_lpips)
@@ -455,7 +461,7 @@ impl Trainer {
             }
         }
         self.sockets
-            .step_after_blending(&self.engine, view, self.objective.v_color_mut(), plan);
+            .step_after_blending(&self.engine, view, camera, &mut self.objective, plan);
         let mut v_out = self.objective.gradient();
         v_out.camera = camera_gradient;
         v_out.gather = match plan.gathers {
@@ -683,10 +689,16 @@ impl Trainer {
         ended
     }
 
+    /// What is behind the splats in views that are not trained on.
+    fn background(&self) -> [f32; 3] {
+        let sky = self.sockets.sky.as_ref();
+        sky.map_or(self.recipe.render.background, Sky::background)
+    }
+
     /// How this run's frames are rendered, with SH up to `sh_degree`.
     pub fn render_options(&self, sh_degree: u32) -> RenderOptions {
         RenderOptions {
-            background: self.recipe.render.background,
+            background: self.background(),
             sh_degree,
             antialias: self.recipe.render.antialias,
             ..RenderOptions::default()

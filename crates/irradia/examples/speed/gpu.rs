@@ -104,6 +104,7 @@ fn time(
         let beside = Beside {
             depths: &[],
             depth_weight: 0.0,
+            cover_weight: 0.03,
             error: true,
         };
         loss.begin(

@@ -43,7 +43,7 @@ pub struct Args {
     /// Threads; all cores when absent
     #[arg(long, value_parser = thread_count())]
     pub threads: Option<usize>,
-    /// Background of the scene: white or black; when absent that of its run, or white for Blender scenes with alpha and objects cut out on white
+    /// Background of the scene: white, black or grey; when absent that of its run, or white for Blender scenes with alpha and objects cut out on white
     #[arg(long, value_name = "COLOR")]
     pub background: Option<Background>,
     #[command(flatten)]
@@ -79,7 +79,7 @@ pub fn run(args: &Args) -> Result<()> {
     }
     let dataset = scene.place(reading.read(&args.data)?);
     let background = match (args.background, &run) {
-        (None, None) => Background::usual(&dataset)?,
+        (None, None) => Background::usual(&dataset, false)?,
         (given, _) => given,
     };
     if let Some(background) = background {

@@ -125,6 +125,7 @@ fn blender_scenes_have_a_white_background_by_default() {
     for (run, option, said, level) in [
         ("usual", "", "white", 255),
         ("black", "--background black", "black", 0),
+        ("grey", "--background grey", "grey", 128),
         (
             "random",
             "--background random",
@@ -155,7 +156,7 @@ fn blender_scenes_have_a_white_background_by_default() {
     .success();
     let psnr = |file: &str| json(&folder.path().join(file))["psnr"].as_f64();
     assert!(psnr("white.json") < psnr("black.json"));
-    irradia(folder.path(), "train data --out x --background grey").refused(2, &["--background", "grey"]);
+    irradia(folder.path(), "train data --out x --background teal").refused(2, &["--background", "teal"]);
 }
 
 #[test]

@@ -54,6 +54,8 @@ pub struct Beside<'a> {
     pub depths: &'a [DepthSample],
     /// Weight of their loss.
     pub depth_weight: f32,
+    /// Weight of the mean 1 - alpha over the pixels of the image, of which masked ones count as 0. It is part of the gradients only.
+    pub cover_weight: f32,
     /// Whether the plane of errors is wanted: the mean absolute difference of each pixel.
     pub error: bool,
 }
@@ -167,7 +169,8 @@ impl GpuLoss {
             tiles[0] as u32,
             (tiles[0] * tiles[1]) as u32,
         ];
-        let more = [flags, samples.len() as u32 / 3, 0, 0];
+        let cover = beside.cover_weight / (width * height).max(1) as f32;
+        let more = [flags, samples.len() as u32 / 3, cover.to_bits(), 0];
         self.task.write(gpu, 0, &[sizes, gains, more]);
         self.maps.reserve(gpu, 9 * width * height);
         self.sums.reserve(gpu, 3 * groups);
@@ -324,6 +327,9 @@ mod tests {
                     v_depth,
                     v_alpha,
                 );
+                for (i, v) in v_alpha.iter_mut().enumerate() {
+                    *v -= 0.3 / pixels as f32 * mask.map_or(1.0, |mask| f32::from(mask[i]) / 255.0);
+                }
                 for (i, error) in errors.iter_mut().enumerate() {
                     if mask.is_none_or(|mask| mask[i] > 0) {
                         let of = |c: usize| (planes[c * pixels + i] - f32::from(truth[3 * i + c]) / 255.0).abs();
@@ -337,6 +343,7 @@ mod tests {
                 let beside = Beside {
                     depths: &samples,
                     depth_weight: 0.7,
+                    cover_weight: 0.3,
                     error: true,
                 };
                 let got = loss.evaluate(&frame, &target, &weights, &beside);

@@ -1,6 +1,7 @@
 //! Tries: a number of splats, trained for the format and measured.
 
 use super::{CompactEvent, CompactInput};
+use crate::background::{Background, uncover};
 use crate::convert::in_world;
 use crate::{RunError, Scene, evaluate};
 use irradia_formats::{SogDetail, SplatFormat, WriteOptions, through_format};
@@ -119,6 +120,9 @@ impl<'a> Tries<'a> {
     ) -> Result<Self, RunError> {
         let mut recipe = Recipe::parse("compact", RECIPE, &[])?;
         recipe.render.background = scene.options.background;
+        if scene.options.background != Background::Grey.color() {
+            uncover(&mut recipe);
+        }
         recipe.render.antialias = scene.options.antialias;
         Ok(Self {
             input,

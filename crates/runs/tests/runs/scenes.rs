@@ -4,6 +4,7 @@ use crate::{begin, folder};
 use irradia_runs::prelude::*;
 use irradia_runs::train::eval::{EvalOptions, Metrics};
 use irradia_runs::train::half_fit::HalfFit;
+use irradia_runs::train::tensor_file::{NamedTensor, to_bytes};
 use std::fs;
 
 #[test]
@@ -21,6 +22,18 @@ fn a_scene_takes_background_and_cameras_from_its_run_if_it_has_one() {
         (orbit.len(), orbit[0].intrinsics.width, orbit[0].intrinsics.height),
         (5, 24, 16)
     );
+
+    let sky = to_bytes(
+        &[NamedTensor::real("background", vec![3], &[0.25, 0.5, 0.75])],
+        ("irradia_sky", "1".into()),
+    );
+    fs::write(path.join("sky.safetensors"), sky).expect("written");
+    let under_sky = Scene::read(&path).expect("a scene");
+    assert_eq!(under_sky.options.background, [0.25, 0.5, 0.75]);
+    fs::write(path.join("sky.safetensors"), [7; 40]).expect("written");
+    let error = Scene::read(&path).expect_err("a damaged sky");
+    assert!(error.to_string().contains("sky.safetensors"), "{error}");
+    fs::remove_file(path.join("sky.safetensors")).expect("removed");
 
     let alone = folder.path().join("alone.ply");
     fs::copy(path.join("scene.ply"), &alone).expect("copied");

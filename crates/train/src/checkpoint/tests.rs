@@ -135,7 +135,13 @@ fn a_streamed_checkpoint_has_the_bytes_of_the_format_and_a_copy_is_that_of_its_m
 
 #[test]
 fn socket_occupants_resume_exactly() {
-    let overrides = ["exposure=true", "refine_poses=true", "params.rate_poses=0.001"].map(str::to_owned);
+    let overrides = [
+        "exposure=true",
+        "refine_poses=true",
+        "params.rate_poses=0.001",
+        "params.rate_sky=0.05",
+    ]
+    .map(str::to_owned);
     let recipe = Recipe::parse("shiny", Recipe::built_in("shiny").unwrap(), &overrides).unwrap();
     let mut trainer = Trainer::new(dataset(), recipe, TrainOptions::default()).unwrap();
     for _ in 0..3 {
@@ -144,7 +150,7 @@ fn socket_occupants_resume_exactly() {
     let bytes = to_bytes(&trainer);
     let mut again = read(&bytes).unwrap();
     let names: Vec<&str> = again.sockets.occupants().iter().map(|o| o.name()).collect();
-    assert_eq!(names, ["poses", "residual", "exposure"]);
+    assert_eq!(names, ["poses", "residual", "exposure", "sky"]);
     let learnt = [&mut trainer, &mut again].map(|trainer| {
         trainer.step(&mut Vec::new()).unwrap();
         let occupants = trainer.sockets.occupants().into_iter();

@@ -129,6 +129,12 @@ documented! {
         /// have alpha. `--set` of the same parameter in `params` prevails.
         #[serde(default, skip_serializing_if = "Params::is_empty")]
         pub known_space: Params,
+        /// The same, if masks leave out all but an object.
+        #[serde(default, skip_serializing_if = "Params::is_empty")]
+        pub cut_out: Params,
+        /// The same, if the sky differs from photograph to photograph; `known_space` prevails.
+        #[serde(default, skip_serializing_if = "Params::is_empty")]
+        pub skies: Params,
         /// The stages, in order.
         pub stage: Vec<Stage>,
     }
@@ -423,7 +429,9 @@ impl Recipe {
             let mut paths = overrides.iter().filter_map(|given| given.split_once('='));
             paths.any(|(path, _)| path.trim().strip_prefix("params.") == Some(param.name()))
         };
-        recipe.known_space.retain(|param, _| !is_set(param));
+        for params in [&mut recipe.known_space, &mut recipe.cut_out, &mut recipe.skies] {
+            params.retain(|param, _| !is_set(param));
+        }
         recipe.complete_sockets();
         let ingredients = recipe.ingredients;
         ingredients.apply(&mut recipe);
@@ -462,6 +470,14 @@ impl Recipe {
             (h ^ u64::from(b)).wrapping_mul(0x0100_0000_01b3)
         });
         format!("{hash:016x}")
+    }
+
+    /// Whether `param`, zero by default, has another value in some stage.
+    pub fn uses(&self, param: Param) -> bool {
+        let params = std::iter::once(&self.params).chain(self.stage.iter().map(|stage| &stage.params));
+        params
+            .filter_map(|params| params.get(&param))
+            .any(|knob| *knob != Knob::Const(0.0))
     }
 
     /// Recipe steps of all stages.
@@ -526,6 +542,8 @@ impl Recipe {
         let everywhere = [
             ("params".to_owned(), &self.params),
             ("known_space".to_owned(), &self.known_space),
+            ("cut_out".to_owned(), &self.cut_out),
+            ("skies".to_owned(), &self.skies),
         ];
         let stages = self
             .stage

@@ -415,6 +415,16 @@ table! {
         curve: Some("loss.exposure"),
         source: "Irradia: 0.01 falling to 0.001 if a recipe with `exposure` does not set it",
     }
+    /// Learning rate of the colours of a sky behind the splats, which each photograph has its own of; without one there is no sky.
+    RateSky {
+        name: "rate_sky",
+        unit: "",
+        default: 0.0,
+        bounds: NOT_NEGATIVE,
+        group: Group::Socket,
+        curve: Some("rate.sky"),
+        source: "Irradia",
+    }
     /// Learning rate of the poses, in radians and in extents of the scene, if the recipe has `refine_poses`.
     RatePoses {
         name: "rate_poses",
@@ -424,6 +434,27 @@ table! {
         group: Group::Socket,
         curve: Some("rate.poses"),
         source: "Irradia: 1e-3 falling to 1e-5 if a recipe with `refine_poses` does not set it; BARF (Lin et al. 2021) uses 1e-3 to 1e-5",
+    }
+    /// Weight of the mean 1 - alpha over unmasked pixels of photographs without alpha: all that they show is a surface. A regulariser: it
+    /// is no part of the reported loss.
+    CoverWeight {
+        name: "cover_weight",
+        unit: "",
+        default: 0.0,
+        bounds: NOT_NEGATIVE,
+        group: Group::Loss,
+        curve: Some("loss.cover"),
+        source: "Irradia",
+    }
+    /// Weight of the mean |alpha - mask|, if photographs have masks.
+    MaskWeight {
+        name: "mask_weight",
+        unit: "",
+        default: 0.0,
+        bounds: NOT_NEGATIVE,
+        group: Group::Loss,
+        curve: Some("loss.mask"),
+        source: "Irradia",
     }
 }
 

@@ -157,7 +157,7 @@ impl Occupant for Exposure {
 
     fn restore(&mut self, tensors: TensorSource) -> Result<(), String> {
         self.maps = tensors.rows::<N>("maps", self.maps.len())?;
-        self.adam.restore(tensors)
+        self.adam.restore(tensors, "")
     }
 
     fn export(&self) -> Option<Vec<u8>> {

@@ -4,7 +4,7 @@
 //! |---|---|---|
 //! | before projection | a [`Placement`]: the camera, and the splats if they move | gradients of the camera and of the moved splats |
 //! | at colour | a colour to add to each splat in view, by its [`irradia_splat::Surface`] | the gradients of these colours |
-//! | after blending | the frame as the photograph shows it | the gradient of that frame, which it converts to that of the scene's frame |
+//! | after blending | the frame as the photograph shows it: a sky behind it, then an exposure | the gradient of that frame, which it converts to that of the scene's frame |
 //!
 //! Each occupant has its forward pass, the vector-Jacobian product beside it, its own Adam, and named tensors. Code that saves
 //! runs (checkpoints, resume, files beside the scene) accesses occupants through [`Occupant`] alone, and rendering goes through
@@ -14,13 +14,16 @@ mod exposure;
 mod per_view;
 mod poses;
 mod residual;
+mod sky;
 
 pub use exposure::Exposure;
 pub(crate) use per_view::PerViewAdam;
 pub use poses::PoseRefinement;
 pub(crate) use poses::{corrected, tangent_gradient};
 pub use residual::{Residual, added_colors};
+pub use sky::{Sky, background_of_sky};
 
+use crate::objective::Objective;
 use crate::recipe::{Choice, Param, Recipe};
 use crate::schedule::StepPlan;
 use crate::tensor_file::{NamedTensor, TensorSource};
@@ -30,7 +33,12 @@ use irradia_scene::{Camera, Dataset};
 use irradia_splat::{Engine, Placement, RenderOptions};
 
 /// Names of the files that occupants may write beside a scene.
-pub const FILES: [&str; 3] = ["poses.safetensors", "residual.safetensors", "exposure.safetensors"];
+pub const FILES: [&str; 4] = [
+    "poses.safetensors",
+    "residual.safetensors",
+    "exposure.safetensors",
+    "sky.safetensors",
+];
 
 /// The part of a socket's occupant that is saved with a run.
 pub trait Occupant {
@@ -59,6 +67,10 @@ pub struct Sockets {
     pub residual: Option<Residual>,
     /// After blending: each photograph's exposure.
     pub exposure: Option<Exposure>,
+    /// After blending: the sky behind the splats.
+    pub sky: Option<Sky>,
+    /// The frame over [`Sky`], `[3, H, W]`.
+    over_sky: Vec<f32>,
     /// The frame after [`Exposure`], `[3, H, W]`.
     developed: Vec<f32>,
 }
@@ -81,6 +93,8 @@ impl Sockets {
             poses: recipe.refine_poses.then(|| PoseRefinement::new(dataset)),
             residual,
             exposure: (recipe.exposure == Choice::Yes).then(|| Exposure::new(dataset.views.len(), &dataset.train)),
+            sky: recipe.uses(Param::RateSky).then(|| Sky::new(dataset)),
+            over_sky: Vec::new(),
             developed: Vec::new(),
         })
     }
@@ -90,7 +104,8 @@ impl Sockets {
         let poses = self.poses.as_ref().map(|o| o as &dyn Occupant);
         let residual = self.residual.as_ref().map(|o| o as &dyn Occupant);
         let exposure = self.exposure.as_ref().map(|o| o as &dyn Occupant);
-        [poses, residual, exposure].into_iter().flatten().collect()
+        let sky = self.sky.as_ref().map(|o| o as &dyn Occupant);
+        [poses, residual, exposure, sky].into_iter().flatten().collect()
     }
 
     /// All occupants, for restoring.
@@ -98,12 +113,18 @@ impl Sockets {
         let poses = self.poses.as_mut().map(|o| o as &mut dyn Occupant);
         let residual = self.residual.as_mut().map(|o| o as &mut dyn Occupant);
         let exposure = self.exposure.as_mut().map(|o| o as &mut dyn Occupant);
-        [poses, residual, exposure].into_iter().flatten().collect()
+        let sky = self.sky.as_mut().map(|o| o as &mut dyn Occupant);
+        [poses, residual, exposure, sky].into_iter().flatten().collect()
     }
 
     /// Whether there are none: a step then is one of the splats alone.
     pub fn are_empty(&self) -> bool {
-        self.poses.is_none() && self.residual.is_none() && self.exposure.is_none()
+        self.poses.is_none() && self.residual.is_none() && !self.are_after_blending()
+    }
+
+    /// Whether there are any after blending.
+    pub fn are_after_blending(&self) -> bool {
+        self.sky.is_some() || self.exposure.is_some()
     }
 
     /// The files to write beside the scene: name and bytes.
@@ -129,6 +150,12 @@ impl Sockets {
         options: &RenderOptions,
         plan: &StepPlan,
     ) {
+        let camera = placement.camera;
+        let over_black = RenderOptions {
+            background: [0.0; 3],
+            ..*options
+        };
+        let options = if self.sky.is_some() { &over_black } else { options };
         match self.residual.as_ref().filter(|residual| residual.acts(plan)) {
             Some(residual) => {
                 let center = placement.camera.pose.position;
@@ -137,16 +164,22 @@ impl Sockets {
             }
             None => engine.render(placement, options),
         }
+        let mut color = engine.frame().color;
+        if let Some(sky) = &self.sky {
+            sky.put_behind(view, &camera, [color, engine.frame().alpha], &mut self.over_sky);
+            color = &self.over_sky;
+        }
         if let Some(exposure) = &self.exposure {
-            exposure.develop(view, engine.frame().color, &mut self.developed);
+            exposure.develop(view, color, &mut self.developed);
         }
     }
 
     /// The last frame's colour as the photograph shows it, `[3, H, W]`.
     pub fn frame_color<'a>(&'a self, engine: &'a Engine) -> &'a [f32] {
-        match self.exposure {
-            Some(_) => &self.developed,
-            None => engine.frame().color,
+        match (&self.exposure, &self.sky) {
+            (Some(_), _) => &self.developed,
+            (None, Some(_)) => &self.over_sky,
+            (None, None) => engine.frame().color,
         }
     }
 
@@ -155,12 +188,29 @@ impl Sockets {
         self.poses.is_some()
     }
 
-    /// One step of the occupants after blending: `v_color` is the gradient of [`Self::frame_color`], and becomes that of the
-    /// scene's own colours.
-    pub fn step_after_blending(&mut self, engine: &Engine, view: usize, v_color: &mut [f32], plan: &StepPlan) {
+    /// One step of the occupants after blending. The gradient of [`Self::frame_color`] in `objective` becomes that of the scene's own
+    /// colours, and of its coverage.
+    pub fn step_after_blending(
+        &mut self,
+        engine: &Engine,
+        view: usize,
+        camera: &Camera,
+        objective: &mut Objective,
+        plan: &StepPlan,
+    ) {
+        let frame = engine.frame();
         if let Some(exposure) = &mut self.exposure {
             let (rate, weight) = (plan.value(Param::RateExposure), plan.value(Param::ExposureReg));
-            exposure.step(view, engine.frame().color, v_color, rate, weight);
+            let color = if self.sky.is_some() {
+                &self.over_sky
+            } else {
+                frame.color
+            };
+            exposure.step(view, color, objective.v_color_mut(), rate, weight);
+        }
+        if let Some(sky) = &mut self.sky {
+            let (v_color, v_alpha) = objective.v_color_and_alpha();
+            sky.step(view, camera, frame.alpha, v_color, v_alpha, plan.value(Param::RateSky));
         }
     }
 

@@ -75,17 +75,19 @@ impl<const N: usize> PerViewAdam<N> {
         ]
     }
 
-    /// Restores the result of [`Self::tensors`].
+    /// Restores the result of [`Self::tensors`], whose names begin with `prefix`.
     ///
     /// # Errors
     /// One line, when a tensor is missing or has another shape.
-    pub fn restore(&mut self, tensors: TensorSource) -> Result<(), String> {
+    pub fn restore(&mut self, tensors: TensorSource, prefix: &str) -> Result<(), String> {
         let views = self.views();
         for (moment, name) in self.moments.iter_mut().zip(["first_moments", "second_moments"]) {
-            *moment = Planes::from_interleaved(N, tensors.rows::<N>(name, views)?.as_flattened());
+            let rows = tensors.rows::<N>(&format!("{prefix}{name}"), views)?;
+            *moment = Planes::from_interleaved(N, rows.as_flattened());
         }
-        let steps = tensors.whole("steps").filter(|steps| steps.len() == views);
-        self.steps = steps.ok_or("steps is missing or has the wrong length")?;
+        let name = format!("{prefix}steps");
+        let steps = tensors.whole(&name).filter(|steps| steps.len() == views);
+        self.steps = steps.ok_or(format!("{name} is missing or has the wrong length"))?;
         Ok(())
     }
 }

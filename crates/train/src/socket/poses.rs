@@ -163,7 +163,7 @@ impl Occupant for PoseRefinement {
 
     fn restore(&mut self, tensors: TensorSource) -> Result<(), String> {
         self.corrections = tensors.rows::<NUMBERS>("corrections", self.corrections.len())?;
-        self.adam.restore(tensors)
+        self.adam.restore(tensors, "")
     }
 
     fn export(&self) -> Option<Vec<u8>> {

@@ -1,4 +1,4 @@
-// The gradient of the loss in a tile and a channel: `finish` in `loss/ssim.rs`. Gradients of alpha and depth begin at zero.
+// The gradient of the loss in a tile and a channel: `finish` in `loss/ssim.rs`. Gradients of depth begin at zero, those of alpha with that of the coverage.
 @group(0) @binding(0) var<uniform> task: Target;
 @group(0) @binding(1) var<storage, read> frame: array<f32>;
 @group(0) @binding(2) var<storage, read> photo: array<u32>;
@@ -79,7 +79,7 @@ fn finish(abc: vec3f, to: u32, channel: u32) -> vec2f {
     let v_ssim = abc.x + xy.x * abc.y + xy.y * abc.z;
     v_frame[channel * pixels + to] = weight_at(to) * (2.0 * task.gains.y * v_ssim + v);
     if channel == 0u {
-        v_frame[3u * pixels + to] = 0.0;
+        v_frame[3u * pixels + to] = -bitcast<f32>(task.flags.z) * weight_at(to);
         v_frame[4u * pixels + to] = 0.0;
         if (task.flags.x & FLAG_ERROR) != 0u {
             // The mean absolute difference, for density control; hidden pixels have none.

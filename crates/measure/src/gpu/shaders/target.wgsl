@@ -4,7 +4,7 @@ struct Target {
     size: vec4u,
     // Gains of L1, of SSIM and of squares, weight of depth.
     gains: vec4f,
-    // Bits of FLAG_*; samples of depth; unused.
+    // Bits of FLAG_*; samples of depth; gain of coverage (bits of a float); unused.
     flags: vec4u,
 }
 

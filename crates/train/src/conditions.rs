@@ -1,0 +1,311 @@
+//! Parameters for what the data are, decided before the first step.
+//!
+//! - **Known space.** A scene that begins with splats at random positions needs pressure on opacities, since what floats before the cameras
+//!   fades only under it. Where points show the surfaces, or alpha or masks what is empty, the same pressure makes surfaces transparent.
+//! - **Cut-outs.** Masks leave out pixels: of people, of a watermark, or of everything but an object. Nothing then says that there is
+//!   nothing beside the object, and what floats there stands before it in other photographs.
+//! - **Skies.** Photographs of many days have skies that no scene can show at once; splats explain them by fog around all that is in
+//!   front.
+
+use crate::first_splats::has_points;
+use crate::recipe::Params;
+use crate::trainer::{TrainError, Trainer};
+use irradia_scene::Photo;
+
+/// Training photographs that are looked at, evenly spaced.
+const SAMPLES: usize = 24;
+/// Their longer side, pixels.
+const SIDE: u32 = 96;
+/// Share of the photographs that must be cut-outs, or have a sky.
+const MOST: f64 = 0.75;
+/// Largest share of a cut-out that its mask keeps, and least share of its outermost pixels that it leaves out.
+const KEPT: f64 = 0.5;
+const BORDER_LEFT_OUT: f64 = 0.6;
+/// Least share of a photograph that a sky covers.
+const SKY_SHARE: f64 = 0.1;
+/// Largest difference of a channel between adjacent pixels of a sky, of 255.
+const SKY_STEP: u8 = 8;
+/// Standard deviations between photographs, of the colours of their skies and of the same relative to their brightness, from which each
+/// photograph needs its own. Measured: the Statue of Liberty by 135 cameras 0.19 and 0.19; eleven captures of one camera, with walls and
+/// ceilings for skies, at most 0.11 and 0.08, but never both.
+const SKY_SPREAD: f64 = 0.14;
+
+/// Whether the mask of `photo` leaves out all but an object.
+fn is_cut_out(photo: &Photo) -> bool {
+    let Some(mask) = &photo.mask else { return false };
+    let (width, height) = (photo.width as usize, photo.height as usize);
+    let kept = mask.iter().filter(|m| **m != 0).count();
+    let rows = (0..width).flat_map(|x| [(x, 0), (x, height - 1)]);
+    let columns = (0..height).flat_map(|y| [(0, y), (width - 1, y)]);
+    let left_out = rows.chain(columns).filter(|(x, y)| mask[y * width + x] == 0).count();
+    kept as f64 <= KEPT * mask.len() as f64 && left_out as f64 >= BORDER_LEFT_OUT * (2 * (width + height)) as f64
+}
+
+/// The mean colour, in \[0, 1\], of the smooth region at the upper edge of `photo`, if it is large enough for a sky.
+fn sky_color(photo: &Photo) -> Option<[f64; 3]> {
+    let (width, height, channels) = (photo.width as usize, photo.height as usize, photo.channels as usize);
+    let color = |at: usize| &photo.data[channels * at..channels * at + 3];
+    let counts = |at: usize| photo.mask.as_ref().is_none_or(|mask| mask[at] != 0);
+    let mut seen: Vec<bool> = (0..width * height).map(|at| at < width && counts(at)).collect();
+    let mut edge: Vec<usize> = (0..width).filter(|at| seen[*at]).collect();
+    let (mut sum, mut count) = ([0u64; 3], 0u64);
+    while let Some(at) = edge.pop() {
+        for (sum, value) in sum.iter_mut().zip(color(at)) {
+            *sum += u64::from(*value);
+        }
+        count += 1;
+        let (x, y) = (at % width, at / width);
+        let adjacent = [
+            (x > 0).then(|| at - 1),
+            (x + 1 < width).then_some(at + 1),
+            (y > 0).then(|| at.wrapping_sub(width)),
+            (y + 1 < height).then_some(at + width),
+        ];
+        for next in adjacent.into_iter().flatten() {
+            let mut steps = color(at).iter().zip(color(next)).map(|(a, b)| a.abs_diff(*b));
+            if !seen[next] && counts(next) && steps.all(|step| step <= SKY_STEP) {
+                seen[next] = true;
+                edge.push(next);
+            }
+        }
+    }
+    let covers = count as f64 >= SKY_SHARE * (width * height) as f64;
+    covers.then(|| sum.map(|sum| sum as f64 / (255 * count) as f64))
+}
+
+/// Whether skies of these colours, of `photographs` photographs, are too different for one scene.
+fn skies_differ(colors: &[[f64; 3]], photographs: usize) -> bool {
+    if colors.len() < 2 || (colors.len() as f64) < MOST * photographs as f64 {
+        return false;
+    }
+    // The largest of the channels' standard deviations.
+    let spread = |of: &dyn Fn(&[f64; 3]) -> [f64; 3]| {
+        let values: Vec<[f64; 3]> = colors.iter().map(of).collect();
+        let deviation = |c: usize| {
+            let mean = values.iter().map(|v| v[c]).sum::<f64>() / values.len() as f64;
+            let variance = values.iter().map(|v| (v[c] - mean).powi(2)).sum::<f64>() / values.len() as f64;
+            variance.sqrt()
+        };
+        (0..3).map(deviation).fold(0.0, f64::max)
+    };
+    let balance = |color: &[f64; 3]| {
+        let brightness = color.iter().sum::<f64>() / 3.0;
+        color.map(|v| v / brightness.max(0.05))
+    };
+    spread(&|color| *color) >= SKY_SPREAD && spread(&balance) >= SKY_SPREAD
+}
+
+impl Trainer {
+    /// Puts the recipe's parameters for conditions into effect that the data meet. In the recipe, so that a resumed run has the same.
+    pub(crate) fn settle_conditions(&mut self) -> Result<(), TrainError> {
+        let [skies, known_space, cut_out] = [
+            std::mem::take(&mut self.recipe.skies),
+            std::mem::take(&mut self.recipe.known_space),
+            std::mem::take(&mut self.recipe.cut_out),
+        ];
+        let (mut cut_outs, mut sky_colors, mut photographs) = (0, Vec::new(), 0);
+        if !(skies.is_empty() && cut_out.is_empty()) {
+            let every = self.dataset.train.len().div_ceil(SAMPLES);
+            for view in self.dataset.train.iter().step_by(every) {
+                let view = &self.dataset.views[*view];
+                let k = &view.camera.intrinsics;
+                let small = k.scaled((SIDE as f32 / k.width.max(k.height) as f32).min(1.0));
+                let photo = view.photo.load_at(small.width, small.height)?;
+                photographs += 1;
+                cut_outs += usize::from(is_cut_out(&photo));
+                sky_colors.extend(sky_color(&photo).filter(|_| photo.channels == 3));
+            }
+        }
+        let are_cut_out = photographs > 0 && cut_outs as f64 >= MOST * f64::from(photographs);
+        let known = if has_points(&self.dataset) {
+            Some("points show the surfaces")
+        } else if are_cut_out {
+            Some("masks show the empty space")
+        } else if !known_space.is_empty() && self.transparent()? {
+            Some("alpha shows the empty space")
+        } else {
+            None
+        };
+        if !are_cut_out && skies_differ(&sky_colors, photographs as usize) {
+            self.put_into_effect("the sky differs from photograph to photograph", "skies", skies);
+        }
+        if let Some(why) = known {
+            self.put_into_effect(why, "known_space", known_space);
+        }
+        if are_cut_out {
+            self.put_into_effect("masks leave out all but an object", "cut_out", cut_out);
+        }
+        Ok(())
+    }
+
+    fn put_into_effect(&mut self, why: &str, table: &str, params: Params) {
+        if params.is_empty() {
+            return;
+        }
+        let names: Vec<&str> = params.keys().map(|param| param.name()).collect();
+        self.decisions
+            .push(format!("{why}: {} as in [{table}] of the recipe", names.join(", ")));
+        self.recipe.params.extend(params);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::Recipe;
+    use crate::recipe::{Knob, Param};
+    use crate::trainer::{TrainOptions, Trainer};
+    use glam::Vec3;
+    use irradia_scene::{Camera, Dataset, Intrinsics, Photo, PointCloud, Pose, View};
+    use std::sync::Arc;
+
+    /// One grey photograph of `channels` channels, with or without points.
+    fn dataset(channels: u32, points: bool) -> Arc<Dataset> {
+        let view = View {
+            name: "a".into(),
+            camera: Camera::new(
+                Pose::look_at(Vec3::NEG_Z, Vec3::ZERO, Vec3::NEG_Y),
+                Intrinsics::from_fov_x(8, 8, 1.0),
+            ),
+            photo: Arc::new(Photo {
+                width: 8,
+                height: 8,
+                channels,
+                data: vec![128; 64 * channels as usize],
+                mask: None,
+            }),
+            depth_bounds: None,
+            time: None,
+            points_seen: Vec::new(),
+        };
+        let positions: Vec<Vec3> = (0..12).map(|i| Vec3::new(0.1 * i as f32, 0.0, 1.0)).collect();
+        Arc::new(Dataset {
+            views: vec![view],
+            train: vec![0],
+            points: points.then(|| PointCloud {
+                colors: vec![[128; 3]; positions.len()],
+                positions,
+            }),
+            ..Dataset::default()
+        })
+    }
+
+    #[test]
+    fn parameters_for_known_space_hold_where_points_or_alpha_show_it() {
+        let trained = |channels, points, set: &[&str]| {
+            let set: Vec<String> = set.iter().map(|s| (*s).to_owned()).collect();
+            let recipe = Recipe::parse("fast", Recipe::built_in("fast").unwrap(), &set).unwrap();
+            let usual = recipe.params[&Param::OpacityReg].clone();
+            let given = recipe.known_space.get(&Param::OpacityReg).cloned();
+            let trainer = Trainer::new(dataset(channels, points), recipe, TrainOptions::default()).unwrap();
+            assert!(trainer.recipe.known_space.is_empty(), "settled");
+            let told = trainer.decisions.iter().any(|line| line.contains("opacity_reg"));
+            let value = trainer.recipe.params[&Param::OpacityReg].clone();
+            assert_eq!(told, value != usual);
+            (value, usual, given)
+        };
+        for (channels, points) in [(3, true), (4, false), (4, true)] {
+            let (value, _, given) = trained(channels, points, &[]);
+            assert_eq!(Some(value), given, "{channels} {points}");
+        }
+        let (value, usual, _) = trained(3, false, &[]);
+        assert_eq!(value, usual);
+        for set in ["params.opacity_reg=0.5", "params.opacity_reg = 0.5"] {
+            let (value, ..) = trained(3, true, &[set]);
+            assert_eq!(value, Knob::Const(0.5), "what is set prevails");
+        }
+        let (value, ..) = trained(3, true, &["known_space.opacity_reg=0.3"]);
+        assert_eq!(value, Knob::Const(0.3));
+    }
+
+    /// A photograph of `width` x `height` with a colour for each pixel, and what its mask keeps.
+    fn photo(
+        [width, height]: [u32; 2],
+        color: impl Fn(u32, u32) -> [u8; 3],
+        kept: Option<&dyn Fn(u32, u32) -> bool>,
+    ) -> Photo {
+        let pixels = || (0..width * height).map(|i| (i % width, i / width));
+        Photo {
+            width,
+            height,
+            channels: 3,
+            data: pixels().flat_map(|(x, y)| color(x, y)).collect(),
+            mask: kept.map(|kept| pixels().map(|(x, y)| if kept(x, y) { 255 } else { 0 }).collect()),
+        }
+    }
+
+    #[test]
+    fn masks_of_objects_are_told_from_those_of_people_and_borders() {
+        let masked = |kept: &dyn Fn(u32, u32) -> bool| is_cut_out(&photo([60, 90], |_, _| [99; 3], Some(kept)));
+        // A statue that stands on the lower edge.
+        assert!(masked(&|x, y| (20..40).contains(&x) && y > 10));
+        assert!(
+            !masked(&|x, y| !((20..40).contains(&x) && y > 40)),
+            "a person is left out"
+        );
+        assert!(
+            !masked(&|x, y| (3..57).contains(&x) && (3..87).contains(&y)),
+            "a border"
+        );
+        assert!(!masked(&|_, y| y > 40), "a sky");
+        assert!(!is_cut_out(&photo([60, 90], |_, _| [99; 3], None)));
+    }
+
+    #[test]
+    fn a_sky_is_what_is_smooth_at_the_upper_edge() {
+        let sky = |x: u32, y: u32| [100 + y as u8, 150, 200 + (x / 9) as u8];
+        let ground = |x: u32, y: u32| [(37 * x % 90) as u8, (53 * y % 90) as u8, 20];
+        let horizon = |at: u32| {
+            photo(
+                [60, 80],
+                move |x, y| if y < at { sky(x, y) } else { ground(x, y) },
+                None,
+            )
+        };
+        let [r, g, b] = sky_color(&horizon(41)).unwrap();
+        assert!((r - 120.0 / 255.0).abs() < 0.01 && (g - 150.0 / 255.0).abs() < 1e-6 && (b - 0.797).abs() < 0.01);
+        assert_eq!(sky_color(&horizon(5)), None);
+        let hidden = photo([60, 80], sky, Some(&|_, y| y > 60));
+        assert_eq!(sky_color(&hidden), None, "masked skies are none");
+    }
+
+    #[test]
+    fn skies_of_other_days_differ_and_those_of_another_exposure_do_not() {
+        let days = [
+            [0.2, 0.4, 0.9],
+            [0.5; 3],
+            [0.9, 0.9, 0.85],
+            [0.1, 0.3, 0.6],
+            [0.8, 0.6, 0.5],
+        ];
+        assert!(skies_differ(&days, 5) && skies_differ(&days, 6) && !skies_differ(&days, 10));
+        let exposures = [0.4, 0.7, 1.0, 1.3].map(|gain| [0.3 * gain, 0.45 * gain, 0.7 * gain]);
+        assert!(
+            !skies_differ(&exposures, 4),
+            "colours relative to brightness are the same"
+        );
+        let dark = [[0.02, 0.03, 0.06], [0.06, 0.03, 0.03], [0.03, 0.06, 0.03]];
+        assert!(!skies_differ(&dark, 3), "hues of what is nearly black");
+        assert!(!skies_differ(&[], 0));
+    }
+
+    #[test]
+    fn masks_that_leave_out_all_but_an_object_take_effect_and_are_told() {
+        let mut data = Dataset::clone(&dataset(3, true));
+        let cut = |kept: &dyn Fn(u32, u32) -> bool| Arc::new(photo([8, 8], |_, _| [128; 3], Some(kept)));
+        for (kept, cut_out) in [
+            (
+                &(|x: u32, _: u32| (3..5).contains(&x)) as &dyn Fn(u32, u32) -> bool,
+                true,
+            ),
+            (&|x, _| x != 3, false),
+        ] {
+            data.views[0].photo = cut(kept);
+            let recipe = Recipe::parse("fast", Recipe::built_in("fast").unwrap(), &[]).unwrap();
+            let mut trainer = Trainer::new(Arc::new(data.clone()), recipe, TrainOptions::default()).unwrap();
+            assert_eq!(trainer.recipe.params.contains_key(&Param::MaskWeight), cut_out);
+            assert_eq!(trainer.decisions.iter().any(|line| line.contains("[cut_out]")), cut_out);
+            trainer.step(&mut Vec::new()).unwrap();
+        }
+    }
+}

@@ -1,0 +1,333 @@
+//! After blending, before the exposure: a sky behind the splats, with colours of its own for each photograph.
+//!
+//! Photographs of many days have skies that no scene can show at once: splats explain them by fog around everything in front. Here what
+//! splats leave uncovered has a colour that is linear in the direction, as a clear or overcast sky nearly is within a photograph's
+//! field of view: `c + G d`, one for all photographs plus one for each. (Per-image backgrounds: "Splatfacto in the Wild", Xu et al. 2024, and
+//! "WildGaussians", Kulhanek et al. 2024, learn them by a network or as splats.) The sky is no splat: it has no alpha in exported scenes.
+
+use super::Occupant;
+use super::per_view::PerViewAdam;
+use crate::tensor_file::{NamedTensor, TensorSource, to_bytes};
+use glam::Vec3;
+use irradia_scene::{Camera, Dataset};
+use rayon::prelude::*;
+use safetensors::SafeTensors;
+
+/// Terms of a colour channel: a constant, and one for each component of the direction.
+const TERMS: usize = 4;
+/// Parameters of a sky: the terms of red, of green, of blue.
+const N: usize = 3 * TERMS;
+/// The first colour of every sky.
+const GREY: [f32; N] = [0.5, 0.0, 0.0, 0.0, 0.5, 0.0, 0.0, 0.0, 0.5, 0.0, 0.0, 0.0];
+/// Weight of the squares of what a photograph's sky has of its own: where a photograph shows none, its sky is that of the others.
+const OWN_WEIGHT: f32 = 1e-4;
+
+/// Colours of the sky: those common to all photographs, and the differences of each.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Sky {
+    common: [f32; N],
+    /// `[views][N]`.
+    own: Vec<[f32; N]>,
+    /// The training views.
+    train: Vec<usize>,
+    /// Mean optical axis of the training views, world.
+    axis: Vec3,
+    common_adam: PerViewAdam<N>,
+    own_adam: PerViewAdam<N>,
+}
+
+/// The terms of a direction.
+fn terms(direction: Vec3) -> [f32; TERMS] {
+    [1.0, direction.x, direction.y, direction.z]
+}
+
+fn color(sky: &[f32; N], direction: Vec3) -> [f32; 3] {
+    let terms = terms(direction);
+    std::array::from_fn(|c| (0..TERMS).map(|k| sky[TERMS * c + k] * terms[k]).sum())
+}
+
+/// Unit viewing directions, world, of the pixels of `row` of a pinhole camera.
+fn directions(camera: &Camera, row: usize) -> impl Iterator<Item = Vec3> {
+    let (k, rotation) = (camera.intrinsics, camera.pose.rotation);
+    let y = (row as f32 + 0.5 - k.cy) / k.fy;
+    (0..k.width).map(move |column| {
+        let x = (column as f32 + 0.5 - k.cx) / k.fx;
+        rotation * Vec3::new(x, y, 1.0).normalize()
+    })
+}
+
+impl Sky {
+    /// A grey one for the views of `dataset`.
+    pub fn new(dataset: &Dataset) -> Self {
+        let axes = dataset
+            .train
+            .iter()
+            .map(|i| dataset.views[*i].camera.pose.rotation * Vec3::Z);
+        Self {
+            common: GREY,
+            own: vec![[0.0; N]; dataset.views.len()],
+            axis: axes.sum::<Vec3>() / dataset.train.len().max(1) as f32,
+            train: dataset.train.clone(),
+            common_adam: PerViewAdam::new(1),
+            own_adam: PerViewAdam::new(dataset.views.len()),
+        }
+    }
+
+    fn of(&self, view: usize) -> [f32; N] {
+        std::array::from_fn(|i| self.common[i] + self.own[view][i])
+    }
+
+    /// The mean colour over the training views, sRGB in \[0, 1\]: the background of views that were not trained on.
+    pub fn background(&self) -> [f32; 3] {
+        let mut mean = self.common;
+        for (i, mean) in mean.iter_mut().enumerate() {
+            let sum: f32 = self.train.iter().map(|view| self.own[*view][i]).sum();
+            *mean += sum / self.train.len().max(1) as f32;
+        }
+        color(&mean, self.axis).map(|v| v.clamp(0.0, 1.0))
+    }
+
+    /// `color` `[3, H, W]`, rendered over black with coverage `alpha` `[H, W]`, over the sky of `view`.
+    pub fn put_behind(&self, view: usize, camera: &Camera, frame: [&[f32]; 2], to: &mut Vec<f32>) {
+        let ([from, alpha], sky) = (frame, self.of(view));
+        let (width, pixels) = (camera.intrinsics.width as usize, alpha.len());
+        to.resize(from.len(), 0.0);
+        let (red, rest) = to.split_at_mut(pixels);
+        let (green, blue) = rest.split_at_mut(pixels);
+        let rows = red
+            .par_chunks_mut(width)
+            .zip(green.par_chunks_mut(width))
+            .zip(blue.par_chunks_mut(width));
+        rows.enumerate().for_each(|(row, ((red, green), blue))| {
+            for (x, direction) in directions(camera, row).enumerate() {
+                let at = row * width + x;
+                let (behind, left) = (color(&sky, direction), 1.0 - alpha[at]);
+                red[x] = from[at] + left * behind[0];
+                green[x] = from[pixels + at] + left * behind[1];
+                blue[x] = from[2 * pixels + at] + left * behind[2];
+            }
+        });
+    }
+
+    /// The vector-Jacobian product of [`Self::put_behind`]: adds the gradient of `alpha` to `v_alpha`, and returns that of the view's
+    /// colours; that of `color` is `v` itself.
+    pub fn vjp(&self, view: usize, camera: &Camera, alpha: &[f32], v: &[f32], v_alpha: &mut [f32]) -> [f32; N] {
+        let (sky, pixels) = (self.of(view), alpha.len());
+        let width = camera.intrinsics.width as usize;
+        let rows: Vec<[f64; N]> = v_alpha
+            .par_chunks_mut(width)
+            .enumerate()
+            .map(|(row, v_alpha)| {
+                let mut sum = [0.0f64; N];
+                for (x, direction) in directions(camera, row).enumerate() {
+                    let at = row * width + x;
+                    let (behind, left) = (color(&sky, direction), 1.0 - alpha[at]);
+                    let terms = terms(direction);
+                    for c in 0..3 {
+                        let v = v[c * pixels + at];
+                        v_alpha[x] -= v * behind[c];
+                        for k in 0..TERMS {
+                            sum[TERMS * c + k] += f64::from(v * left * terms[k]);
+                        }
+                    }
+                }
+                sum
+            })
+            .collect();
+        // In the order of rows: threads do not change the sum.
+        std::array::from_fn(|i| rows.iter().map(|row| row[i]).sum::<f64>() as f32)
+    }
+
+    /// [`Self::vjp`] and a step of Adam at `rate`.
+    pub fn step(&mut self, view: usize, camera: &Camera, alpha: &[f32], v: &[f32], v_alpha: &mut [f32], rate: f32) {
+        let gradient = self.vjp(view, camera, alpha, v, v_alpha);
+        let common = self.common_adam.step(0, gradient, [rate; N]);
+        let of_own = std::array::from_fn(|i| gradient[i] + 2.0 * OWN_WEIGHT * self.own[view][i]);
+        let own = self.own_adam.step(view, of_own, [rate; N]);
+        for i in 0..N {
+            self.common[i] += common[i];
+            self.own[view][i] += own[i];
+        }
+    }
+}
+
+/// The background in the file of [`Sky::export`].
+///
+/// # Errors
+/// One line, when it is no such file.
+pub fn background_of_sky(file: &[u8]) -> Result<[f32; 3], String> {
+    let file = SafeTensors::deserialize(file).map_err(|error| error.to_string())?;
+    let found = TensorSource::new(&file, "").real("background");
+    let color: Option<[f32; 3]> = found.and_then(|values| values.try_into().ok());
+    let valid = color.filter(|color| color.iter().all(|v| (0.0..=1.0).contains(v)));
+    valid.ok_or_else(|| "background is missing or no colour".into())
+}
+
+impl Occupant for Sky {
+    fn name(&self) -> &'static str {
+        "sky"
+    }
+
+    fn tensors(&self) -> Vec<NamedTensor> {
+        let colors = [
+            NamedTensor::real("common", vec![1, N], &self.common),
+            NamedTensor::real("own", vec![self.own.len(), N], self.own.as_flattened()),
+        ];
+        let common = self.common_adam.tensors().into_iter().map(|t| t.prefixed("common_"));
+        let own = self.own_adam.tensors().into_iter().map(|t| t.prefixed("own_"));
+        colors.into_iter().chain(common).chain(own).collect()
+    }
+
+    fn restore(&mut self, tensors: TensorSource) -> Result<(), String> {
+        [self.common] = tensors.rows::<N>("common", 1)?[..]
+            .try_into()
+            .map_err(|_| "common has the wrong shape")?;
+        self.own = tensors.rows::<N>("own", self.own.len())?;
+        self.common_adam.restore(tensors, "common_")?;
+        self.own_adam.restore(tensors, "own_")
+    }
+
+    fn export(&self) -> Option<Vec<u8>> {
+        let tensors = [
+            NamedTensor::real("background", vec![3], &self.background()),
+            NamedTensor::real("common", vec![1, N], &self.common),
+            NamedTensor::real("own", vec![self.own.len(), N], self.own.as_flattened()),
+        ];
+        Some(to_bytes(&tensors, ("irradia_sky", "1".into())))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use glam::Quat;
+    use irradia_scene::{Intrinsics, Pose, Rng};
+
+    const SIZE: [u32; 2] = [9, 7];
+    const PIXELS: usize = 63;
+
+    fn camera() -> Camera {
+        let pose = Pose {
+            rotation: Quat::from_rotation_x(0.7) * Quat::from_rotation_y(0.4),
+            position: Vec3::ZERO,
+        };
+        Camera::new(pose, Intrinsics::from_fov_x(SIZE[0], SIZE[1], 1.0))
+    }
+
+    fn example() -> (Sky, Vec<f32>, Vec<f32>, Vec<f32>) {
+        let mut rng = Rng::new(3, 3);
+        let sky = Sky {
+            common: GREY.map(|v| v + rng.range(-0.2, 0.2)),
+            own: vec![[0.0; N], std::array::from_fn(|_| rng.range(-0.2, 0.2))],
+            train: vec![0, 1],
+            axis: Vec3::Z,
+            common_adam: PerViewAdam::new(1),
+            own_adam: PerViewAdam::new(2),
+        };
+        let mut random = |count, most| (0..count).map(|_| rng.range(0.0, most)).collect::<Vec<f32>>();
+        (
+            sky,
+            random(3 * PIXELS, 0.6),
+            random(PIXELS, 1.0),
+            random(3 * PIXELS, 1.0),
+        )
+    }
+
+    fn loss(sky: &Sky, color: &[f32], alpha: &[f32], weights: &[f32]) -> f64 {
+        let mut over = Vec::new();
+        sky.put_behind(1, &camera(), [color, alpha], &mut over);
+        over.iter()
+            .zip(weights)
+            .map(|(y, w)| f64::from(*y) * f64::from(*w))
+            .sum()
+    }
+
+    #[test]
+    fn gradients_agree_with_finite_differences() {
+        let (sky, color, alpha, weights) = example();
+        let mut v_alpha = vec![0.0; PIXELS];
+        let of_sky = sky.vjp(1, &camera(), &alpha, &weights, &mut v_alpha);
+        // Linear in all of them: a large step costs only rounding.
+        let h = 1e-1f32;
+        for i in 0..N {
+            let at = |sign: f32| {
+                let mut moved = sky.clone();
+                moved.own[1][i] += sign * h;
+                loss(&moved, &color, &alpha, &weights)
+            };
+            let want = (at(1.0) - at(-1.0)) / f64::from(2.0 * h);
+            assert!(
+                (f64::from(of_sky[i]) - want).abs() < 1e-3,
+                "{i}: {} and {want}",
+                of_sky[i]
+            );
+        }
+        for i in (0..PIXELS).step_by(5) {
+            let at = |sign: f32| {
+                let mut moved = alpha.clone();
+                moved[i] += sign * h;
+                loss(&sky, &color, &moved, &weights)
+            };
+            let want = (at(1.0) - at(-1.0)) / f64::from(2.0 * h);
+            assert!(
+                (f64::from(v_alpha[i]) - want).abs() < 1e-4,
+                "{i}: {} and {want}",
+                v_alpha[i]
+            );
+        }
+    }
+
+    #[test]
+    fn steps_recover_the_sky_of_each_photograph_and_nothing_where_splats_cover_it() {
+        let (mut sky, ..) = example();
+        sky.own = vec![[0.0; N]; 3];
+        sky.own_adam = PerViewAdam::new(3);
+        let color = vec![0.0; 3 * PIXELS];
+        let wanted = [[0.2f32, 0.4, 0.9], [0.8, 0.8, 0.7]];
+        let alphas = [vec![0.0; PIXELS], vec![0.5; PIXELS], vec![1.0; PIXELS]];
+        for step in 0..400 {
+            let rate = if step < 300 { 0.03 } else { 0.002 };
+            for view in 0..3 {
+                let (mut over, mut v_alpha) = (Vec::new(), vec![0.0; PIXELS]);
+                sky.put_behind(view, &camera(), [&color, &alphas[view]], &mut over);
+                let left = 1.0 - alphas[view][0];
+                let v: Vec<f32> = over
+                    .iter()
+                    .enumerate()
+                    .map(|(i, y)| {
+                        if view < 2 {
+                            y - left * wanted[view][i / PIXELS]
+                        } else {
+                            1.0
+                        }
+                    })
+                    .collect();
+                sky.step(view, &camera(), &alphas[view], &v, &mut v_alpha, rate);
+            }
+        }
+        for (view, wanted) in wanted.iter().enumerate() {
+            let got = super::color(&sky.of(view), directions(&camera(), 3).nth(4).unwrap());
+            assert!(
+                got.iter().zip(wanted).all(|(got, wanted)| (got - wanted).abs() < 0.02),
+                "{view}: {got:?}"
+            );
+        }
+        assert!(sky.own[2].iter().all(|v| *v == 0.0), "{:?}", sky.own[2]);
+    }
+
+    #[test]
+    fn the_exported_background_is_the_mean_over_the_training_views() {
+        let (sky, ..) = example();
+        let background = background_of_sky(&sky.export().unwrap()).unwrap();
+        let of = |view: usize| super::color(&sky.of(view), sky.axis);
+        for c in 0..3 {
+            assert!((background[c] - 0.5 * (of(0)[c] + of(1)[c])).abs() < 1e-6);
+        }
+        assert!(background_of_sky(b"{}").is_err());
+        let without = to_bytes(
+            &[NamedTensor::real("background", vec![2], &[0.0; 2])],
+            ("x", "1".into()),
+        );
+        assert!(background_of_sky(&without).unwrap_err().contains("background"));
+    }
+}

@@ -110,7 +110,10 @@ impl Trainer {
                 let view = &self.dataset.views[*view];
                 let k = &view.camera.intrinsics;
                 let small = k.scaled((SIDE as f32 / k.width.max(k.height) as f32).min(1.0));
-                let photo = view.photo.load_at(small.width, small.height)?;
+                // One that cannot be read ends the first step, from which the run can be resumed.
+                let Ok(photo) = view.photo.load_at(small.width, small.height) else {
+                    continue;
+                };
                 photographs += 1;
                 cut_outs += usize::from(is_cut_out(&photo));
                 sky_colors.extend(sky_color(&photo).filter(|_| photo.channels == 3));

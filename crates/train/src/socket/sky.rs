@@ -2,7 +2,7 @@
 //!
 //! Photographs of many days have skies that no scene can show at once: splats explain them by fog around everything in front. Here what
 //! splats leave uncovered has a colour that is linear in the direction, as a clear or overcast sky nearly is within a photograph's
-//! field of view: `c + G d`, one for all photographs plus one for each. (Per-image backgrounds: "Splatfacto in the Wild", Xu et al. 2024, and
+//! field of view: `c + G d`, one for all photographs plus one for each. (Per-image backgrounds: "Splatfacto-W", Xu et al. 2024, and
 //! "WildGaussians", Kulhanek et al. 2024, learn them by a network or as splats.) The sky is no splat: it has no alpha in exported scenes.
 
 use super::Occupant;

@@ -16,15 +16,13 @@ const WHITE: u8 = 250;
 
 /// Whether nearly all of the outermost pixels of `photo` are white.
 fn has_white_border(photo: &Photo) -> bool {
-    let (width, height, channels) = (photo.width as usize, photo.height as usize, photo.channels as usize);
-    let is_white = |x: usize, y: usize| {
-        let at = (y * width + x) * channels;
-        photo.data[at..at + channels].iter().all(|value| *value >= WHITE)
+    let channels = photo.channels as usize;
+    let is_white = |at: &usize| {
+        photo.data[at * channels..][..channels]
+            .iter()
+            .all(|value| *value >= WHITE)
     };
-    let rows = (0..width).flat_map(|x| [is_white(x, 0), is_white(x, height - 1)]);
-    let columns = (0..height).flat_map(|y| [is_white(0, y), is_white(width - 1, y)]);
-    let white = rows.chain(columns).filter(|white| *white).count();
-    white as f64 >= BORDER_SHARE * (2 * (width + height)) as f64
+    photo.border().filter(is_white).count() as f64 >= BORDER_SHARE * photo.border().count() as f64
 }
 
 /// Background of photographs with alpha, and of a scene's splats or field.
@@ -66,12 +64,10 @@ impl Background {
     pub(crate) fn apply_to(self, recipe: &mut Recipe) {
         recipe.render.background = self.color();
         if self != Self::Grey {
-            uncover(recipe);
+            recipe.unset(Param::CoverWeight);
         }
         if self == Self::Random {
-            for stage in &mut recipe.stage {
-                stage.params.remove(&Param::RandomBackground);
-            }
+            recipe.unset(Param::RandomBackground);
             recipe.params.insert(Param::RandomBackground, Knob::Const(1.0));
         }
     }
@@ -109,14 +105,6 @@ impl Background {
     }
 }
 
-/// Has surfaces leave free what is behind them.
-pub(crate) fn uncover(recipe: &mut Recipe) {
-    recipe.params.remove(&Param::CoverWeight);
-    for stage in &mut recipe.stage {
-        stage.params.remove(&Param::CoverWeight);
-    }
-}
-
 impl FromStr for Background {
     type Err = String;
 
@@ -136,11 +124,7 @@ pub(crate) fn in_words(recipe: &Recipe) -> String {
         [0.5, 0.5, 0.5] => "grey".to_owned(),
         [r, g, b] => format!("sRGB {r}, {g}, {b}"),
     };
-    let params = std::iter::once(&recipe.params).chain(recipe.stage.iter().map(|stage| &stage.params));
-    let random = params
-        .filter_map(|params| params.get(&Param::RandomBackground))
-        .any(|knob| *knob != Knob::Const(0.0));
-    if random {
+    if recipe.uses(Param::RandomBackground) {
         format!("{color}; trained over random colours if photographs have alpha")
     } else {
         color

@@ -1,6 +1,5 @@
 //! Training requests: raw input, and the validated request.
 
-use crate::background::uncover;
 use crate::{Background, RunError, RunFolder, scene_of};
 use irradia_compute::DeviceChoice;
 use irradia_formats::{DEFAULT_MAX_SIDE, DatasetFormat, DatasetOptions, Holdout, read_dataset, read_splats};
@@ -379,7 +378,7 @@ impl TrainRequest {
         }
     }
 
-    /// Sets the usual background of such photographs, if neither the input nor its overrides of the recipe set one.
+    /// Sets the background that is usual for the photographs, if neither the input nor its overrides of the recipe set one.
     pub(crate) fn choose_background(&mut self, dataset: &Dataset) -> Result<(), RunError> {
         let is_set = self
             .input
@@ -388,7 +387,7 @@ impl TrainRequest {
             .any(|change| change.starts_with("render.background"));
         if self.input.background.is_none() {
             if is_set {
-                uncover(&mut self.recipe);
+                self.recipe.unset(Param::CoverWeight);
             } else {
                 let covers = self.recipe.uses(Param::CoverWeight);
                 self.input.background = Background::usual(dataset, covers)?;

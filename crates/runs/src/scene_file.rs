@@ -142,19 +142,22 @@ fn read_model(path: &Path) -> Result<(Model<'static>, bool, Similarity), RunErro
     Ok((model, cloud.antialiased, cloud.world_from_dataset))
 }
 
+/// The file `name` beside the scene of a run, if there is one.
+fn beside(scene: &Path, name: &str) -> Option<PathBuf> {
+    let path = scene.with_file_name(name);
+    (scene.file_name().is_some_and(|name| name == SCENE) && path.is_file()).then_some(path)
+}
+
 /// The residual field beside `scene`, if there is one.
 pub(crate) fn residual_beside(scene: &Path) -> Result<Option<Field>, RunError> {
-    let beside = scene.with_file_name(RESIDUAL);
-    let is_there = scene.file_name().is_some_and(|name| name == SCENE) && beside.is_file();
-    is_there.then(|| read_field(&beside)).transpose()
+    beside(scene, RESIDUAL).as_deref().map(read_field).transpose()
 }
 
 /// The mean colour of the sky beside `scene`, if there is one.
 fn sky_beside(scene: &Path) -> Result<Option<[f32; 3]>, RunError> {
-    let path = scene.with_file_name(SKY);
-    if scene.file_name().is_none_or(|name| name != SCENE) || !path.is_file() {
+    let Some(path) = beside(scene, SKY) else {
         return Ok(None);
-    }
+    };
     let bytes = fs::read(&path).map_err(RunError::io("read", &path))?;
     let color = background_of_sky(&bytes).map_err(|why| RunError::File {
         path,

@@ -58,6 +58,14 @@ impl Photo {
         self.data.chunks_exact(4).flat_map(pixel).collect()
     }
 
+    /// Indices of the outermost pixels: upper and lower row, left and right column, the corners twice; `2 * (width + height)` in all.
+    pub fn border(&self) -> impl Iterator<Item = usize> {
+        let (width, height) = (self.width as usize, self.height as usize);
+        let rows = (0..width).flat_map(move |x| [x, (height - 1) * width + x]);
+        let columns = (0..height).flat_map(move |y| [y * width, (y + 1) * width - 1]);
+        rows.chain(columns)
+    }
+
     /// The alpha channel `[H, W]`, if any.
     pub fn alpha(&self) -> Option<Vec<u8>> {
         (self.channels == 4).then(|| self.data.iter().skip(3).step_by(4).copied().collect())

@@ -33,12 +33,9 @@ const SKY_SPREAD: f64 = 0.14;
 /// Whether the mask of `photo` leaves out all but an object.
 fn is_cut_out(photo: &Photo) -> bool {
     let Some(mask) = &photo.mask else { return false };
-    let (width, height) = (photo.width as usize, photo.height as usize);
     let kept = mask.iter().filter(|m| **m != 0).count();
-    let rows = (0..width).flat_map(|x| [(x, 0), (x, height - 1)]);
-    let columns = (0..height).flat_map(|y| [(0, y), (width - 1, y)]);
-    let left_out = rows.chain(columns).filter(|(x, y)| mask[y * width + x] == 0).count();
-    kept as f64 <= KEPT * mask.len() as f64 && left_out as f64 >= BORDER_LEFT_OUT * (2 * (width + height)) as f64
+    let left_out = photo.border().filter(|at| mask[*at] == 0).count();
+    kept as f64 <= KEPT * mask.len() as f64 && left_out as f64 >= BORDER_LEFT_OUT * photo.border().count() as f64
 }
 
 /// The mean colour, in \[0, 1\], of the smooth region at the upper edge of `photo`, if it is large enough for a sky.
@@ -58,7 +55,7 @@ fn sky_color(photo: &Photo) -> Option<[f64; 3]> {
         let adjacent = [
             (x > 0).then(|| at - 1),
             (x + 1 < width).then_some(at + 1),
-            (y > 0).then(|| at.wrapping_sub(width)),
+            (y > 0).then(|| at - width),
             (y + 1 < height).then_some(at + width),
         ];
         for next in adjacent.into_iter().flatten() {
@@ -103,7 +100,7 @@ impl Trainer {
             std::mem::take(&mut self.recipe.known_space),
             std::mem::take(&mut self.recipe.cut_out),
         ];
-        let (mut cut_outs, mut sky_colors, mut photographs) = (0, Vec::new(), 0);
+        let (mut cut_outs, mut sky_colors, mut photographs) = (0usize, Vec::new(), 0usize);
         if !(skies.is_empty() && cut_out.is_empty()) {
             let every = self.dataset.train.len().div_ceil(SAMPLES);
             for view in self.dataset.train.iter().step_by(every) {
@@ -119,7 +116,7 @@ impl Trainer {
                 sky_colors.extend(sky_color(&photo).filter(|_| photo.channels == 3));
             }
         }
-        let are_cut_out = photographs > 0 && cut_outs as f64 >= MOST * f64::from(photographs);
+        let are_cut_out = photographs > 0 && cut_outs as f64 >= MOST * photographs as f64;
         let known = if has_points(&self.dataset) {
             Some("points show the surfaces")
         } else if are_cut_out {
@@ -129,7 +126,7 @@ impl Trainer {
         } else {
             None
         };
-        if !are_cut_out && skies_differ(&sky_colors, photographs as usize) {
+        if !are_cut_out && skies_differ(&sky_colors, photographs) {
             self.put_into_effect("the sky differs from photograph to photograph", "skies", skies);
         }
         if let Some(why) = known {

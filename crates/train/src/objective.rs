@@ -142,8 +142,7 @@ impl Objective {
             alpha: depths || cover > 0.0 || coverages.iter().any(Option::is_some),
         };
         if self.has.alpha {
-            self.v_alpha.clear();
-            self.v_alpha.resize(pixels, 0.0);
+            clear(&mut self.v_alpha, pixels);
         }
         if cover > 0.0 {
             let v = cover / pixels as f32;
@@ -160,8 +159,7 @@ impl Objective {
             total += compare_alpha(frame.alpha, wanted, weight, &mut self.v_alpha);
         }
         if depths {
-            self.v_depth.clear();
-            self.v_depth.resize(pixels, 0.0);
+            clear(&mut self.v_depth, pixels);
             let (v_depth, v_alpha) = (&mut self.v_depth, &mut self.v_alpha);
             let weight = plan.value(Param::DepthWeight);
             if weight > 0.0 {
@@ -249,8 +247,7 @@ impl Objective {
     pub fn v_color_and_alpha(&mut self) -> (&[f32], &mut [f32]) {
         if !self.has.alpha {
             self.has.alpha = true;
-            self.v_alpha.clear();
-            self.v_alpha.resize(self.v_color.len() / 3, 0.0);
+            clear(&mut self.v_alpha, self.v_color.len() / 3);
         }
         (&self.v_color, &mut self.v_alpha)
     }
@@ -277,6 +274,12 @@ pub(crate) fn photometric_weights(plan: &StepPlan) -> LossWeights {
         ssim: plan.value(Param::SsimWeight),
         mse: plan.value(Param::MseWeight),
     }
+}
+
+/// Makes `plane` one of `pixels` zeros.
+fn clear(plane: &mut Vec<f32>, pixels: usize) {
+    plane.clear();
+    plane.resize(pixels, 0.0);
 }
 
 /// The weight of the coverage of `photo`: photographs with alpha show what is empty.

@@ -369,10 +369,11 @@ impl Trainer {
             .is_on(Param::RandomBackground)
             .then(|| std::array::from_fn(|_| rng.uniform()))
             .filter(|_| photo.alpha.is_some());
+        let usual = self.render_options(plan.sh_degree);
         let options = RenderOptions {
-            background: background.unwrap_or(self.background()),
+            background: background.unwrap_or(usual.background),
             depth: plan.compares_depth(),
-            ..self.render_options(plan.sh_degree)
+            ..usual
         };
         let reference = Reference {
             photo: &photo,
@@ -689,16 +690,11 @@ impl Trainer {
         ended
     }
 
-    /// What is behind the splats in views that are not trained on.
-    fn background(&self) -> [f32; 3] {
-        let sky = self.sockets.sky.as_ref();
-        sky.map_or(self.recipe.render.background, Sky::background)
-    }
-
     /// How this run's frames are rendered, with SH up to `sh_degree`.
     pub fn render_options(&self, sh_degree: u32) -> RenderOptions {
+        let sky = self.sockets.sky.as_ref();
         RenderOptions {
-            background: self.background(),
+            background: sky.map_or(self.recipe.render.background, Sky::background),
             sh_degree,
             antialias: self.recipe.render.antialias,
             ..RenderOptions::default()

@@ -1,9 +1,8 @@
 //! Tries: a number of splats, trained for the format and measured.
 
 use super::{CompactEvent, CompactInput};
-use crate::background::{Background, uncover};
 use crate::convert::in_world;
-use crate::{RunError, Scene, evaluate};
+use crate::{Background, RunError, Scene, evaluate};
 use irradia_formats::{SogDetail, SplatFormat, WriteOptions, through_format};
 use irradia_scene::{Camera, Dataset, GaussianCloud, Similarity};
 use irradia_splat::contribution::{Contributions, contributions};
@@ -12,6 +11,7 @@ use irradia_train::eval::{EvalOptions, Metrics};
 use irradia_train::half_fit::HalfFit;
 use irradia_train::memory::usual_limit;
 use irradia_train::model::{Model, RenderOptions};
+use irradia_train::recipe::Param;
 use irradia_train::{Recipe, TrainOptions, Trainer};
 use std::sync::Arc;
 
@@ -156,7 +156,7 @@ impl<'a> Tries<'a> {
         let mut recipe = Recipe::parse("compact", RECIPE, &[])?;
         recipe.render.background = scene.options.background;
         if scene.options.background != Background::Grey.color() {
-            uncover(&mut recipe);
+            recipe.unset(Param::CoverWeight);
         }
         recipe.render.antialias = scene.options.antialias;
         Ok(Self {
@@ -276,30 +276,32 @@ impl<'a> Tries<'a> {
         let first = self.begin.len();
         let mut order = SplatState::new(self.begin.clone());
         let judged = self.judge(&order.splats, self.input.seed);
-        for grain in FINER {
-            self.grain = grain;
-            if self.through(&order.splats)?.1 as f64 <= SPARE * most as f64 {
-                let found = self.with(first, see)?;
-                if found.bytes <= most {
-                    return Ok(found);
-                }
-            }
-        }
-        self.grain = COARSE;
         hide_harmonics(&mut order.splats, &judged.weight, self.grain.shown);
         // Bytes are nearly linear in the number of splats: two points on the line, then its place at the limit.
-        let bytes_with = |count: usize| -> Result<f64, RunError> {
+        let bytes_with = |tries: &Self, count: usize| -> Result<f64, RunError> {
             let mut state = order.clone();
             keep(&mut state, &judged.change, count);
-            Ok(self.through(&state.splats)?.1 as f64)
+            Ok(tries.through(&state.splats)?.1 as f64)
         };
         let half_count = (first / 2).max(1);
-        let (all, half) = (bytes_with(first)?, bytes_with(half_count)?);
+        let (all, half) = (bytes_with(self, first)?, bytes_with(self, half_count)?);
+        if all <= most as f64 {
+            for grain in FINER {
+                self.grain = grain;
+                if self.through(&self.begin)?.1 as f64 <= SPARE * most as f64 {
+                    let found = self.with(first, see)?;
+                    if found.bytes <= most {
+                        return Ok(found);
+                    }
+                }
+            }
+            self.grain = COARSE;
+        }
         let slope = ((all - half) / (first - half_count).max(1) as f64).max(1.0);
         let mut count = first;
         if all > most as f64 {
             count = (first as f64 - (all - most as f64) / slope) as usize;
-            let near = bytes_with(count.clamp(1, first))?;
+            let near = bytes_with(self, count.clamp(1, first))?;
             count = (count as f64 + (most as f64 - near) / slope).max(0.0) as usize;
         }
         for _ in 0..4 {

@@ -480,6 +480,12 @@ impl Recipe {
             .any(|knob| *knob != Knob::Const(0.0))
     }
 
+    /// Takes `param` out of all stages: it has its default.
+    pub fn unset(&mut self, param: Param) {
+        let params = std::iter::once(&mut self.params).chain(self.stage.iter_mut().map(|stage| &mut stage.params));
+        params.for_each(|params| drop(params.remove(&param)));
+    }
+
     /// Recipe steps of all stages.
     pub fn total_steps(&self) -> u64 {
         self.stage.iter().map(|s| s.steps).sum()

@@ -3,8 +3,8 @@
 //! It models a camera's automatic exposure and white balance (Kerbl et al., "Hierarchical 3D Gaussians", 2024, train the same
 //! 3 x 4 matrix): `y = A x + b` in the photograph's own, sRGB-encoded colours. Photographs saturate at 1, and so does `y`.
 
-use super::Occupant;
 use super::per_view::PerViewAdam;
+use super::{Occupant, pieces};
 use crate::tensor_file::{NamedTensor, TensorSource, to_bytes};
 use irradia_measure::Affine;
 use rayon::prelude::*;
@@ -83,15 +83,9 @@ impl Exposure {
     /// view's parameters. Where the output is saturated, only gradients that darken it pass.
     pub fn vjp(&self, view: usize, color: &[f32], v: &mut [f32]) -> [f32; N] {
         let (m, pixels) = (&self.maps[view], color.len() / 3);
-        let (red, rest) = v.split_at_mut(pixels);
-        let (green, blue) = rest.split_at_mut(pixels);
-        let pieces = red
-            .par_chunks_mut(PIECE)
-            .zip(green.par_chunks_mut(PIECE))
-            .zip(blue.par_chunks_mut(PIECE));
-        let sums: Vec<[f64; N]> = pieces
+        let sums: Vec<[f64; N]> = pieces(v, PIECE)
             .enumerate()
-            .map(|(piece, ((red, green), blue))| {
+            .map(|(piece, [red, green, blue])| {
                 let mut sum = [0.0f64; N];
                 for i in 0..red.len() {
                     let at = piece * PIECE + i;

@@ -31,6 +31,7 @@ use crate::trainer::TrainError;
 use irradia_field::Space;
 use irradia_scene::{Camera, Dataset};
 use irradia_splat::{Engine, Placement, RenderOptions};
+use rayon::prelude::*;
 
 /// Names of the files that occupants may write beside a scene.
 pub const FILES: [&str; 4] = [
@@ -39,6 +40,15 @@ pub const FILES: [&str; 4] = [
     "exposure.safetensors",
     "sky.safetensors",
 ];
+
+/// The planes of `frame` `[3, H, W]` in pieces of `length` pixels, for all threads.
+fn pieces(frame: &mut [f32], length: usize) -> impl IndexedParallelIterator<Item = [&mut [f32]; 3]> {
+    let (red, rest) = frame.split_at_mut(frame.len() / 3);
+    let (green, blue) = rest.split_at_mut(rest.len() / 2);
+    let pieces = red.par_chunks_mut(length).zip(green.par_chunks_mut(length));
+    let pieces = pieces.zip(blue.par_chunks_mut(length));
+    pieces.map(|((red, green), blue)| [red, green, blue])
+}
 
 /// The part of a socket's occupant that is saved with a run.
 pub trait Occupant {

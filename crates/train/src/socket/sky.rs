@@ -5,8 +5,8 @@
 //! field of view: `c + G d`, one for all photographs plus one for each. (Per-image backgrounds: "Splatfacto-W", Xu et al. 2024, and
 //! "WildGaussians", Kulhanek et al. 2024, learn them by a network or as splats.) The sky is no splat: it has no alpha in exported scenes.
 
-use super::Occupant;
 use super::per_view::PerViewAdam;
+use super::{Occupant, pieces};
 use crate::tensor_file::{NamedTensor, TensorSource, to_bytes};
 use glam::Vec3;
 use irradia_scene::{Camera, Dataset};
@@ -92,13 +92,7 @@ impl Sky {
         let ([from, alpha], sky) = (frame, self.of(view));
         let (width, pixels) = (camera.intrinsics.width as usize, alpha.len());
         to.resize(from.len(), 0.0);
-        let (red, rest) = to.split_at_mut(pixels);
-        let (green, blue) = rest.split_at_mut(pixels);
-        let rows = red
-            .par_chunks_mut(width)
-            .zip(green.par_chunks_mut(width))
-            .zip(blue.par_chunks_mut(width));
-        rows.enumerate().for_each(|(row, ((red, green), blue))| {
+        pieces(to, width).enumerate().for_each(|(row, [red, green, blue])| {
             for (x, direction) in directions(camera, row).enumerate() {
                 let at = row * width + x;
                 let (behind, left) = (color(&sky, direction), 1.0 - alpha[at]);
@@ -202,6 +196,7 @@ mod tests {
     use super::*;
     use glam::Quat;
     use irradia_scene::{Intrinsics, Pose, Rng};
+    use irradia_testkit::differences::Differences;
 
     const SIZE: [u32; 2] = [9, 7];
     const PIXELS: usize = 63;
@@ -248,33 +243,24 @@ mod tests {
         let mut v_alpha = vec![0.0; PIXELS];
         let of_sky = sky.vjp(1, &camera(), &alpha, &weights, &mut v_alpha);
         // Linear in all of them: a large step costs only rounding.
-        let h = 1e-1f32;
-        for i in 0..N {
-            let at = |sign: f32| {
-                let mut moved = sky.clone();
-                moved.own[1][i] += sign * h;
-                loss(&moved, &color, &alpha, &weights)
-            };
-            let want = (at(1.0) - at(-1.0)) / f64::from(2.0 * h);
-            assert!(
-                (f64::from(of_sky[i]) - want).abs() < 1e-3,
-                "{i}: {} and {want}",
-                of_sky[i]
-            );
-        }
-        for i in (0..PIXELS).step_by(5) {
-            let at = |sign: f32| {
-                let mut moved = alpha.clone();
-                moved[i] += sign * h;
-                loss(&sky, &color, &moved, &weights)
-            };
-            let want = (at(1.0) - at(-1.0)) / f64::from(2.0 * h);
-            assert!(
-                (f64::from(v_alpha[i]) - want).abs() < 1e-4,
-                "{i}: {} and {want}",
-                v_alpha[i]
-            );
-        }
+        let within = |absolute| Differences {
+            step: 1e-1,
+            relative: 0.0,
+            of_largest: 0.0,
+            absolute,
+        };
+        let own = sky.own[1].map(f64::from);
+        within(1e-3).check("sky", &own, &of_sky.map(f64::from), 0..N, |own| {
+            let mut moved = sky.clone();
+            moved.own[1] = std::array::from_fn(|i| own[i] as f32);
+            loss(&moved, &color, &alpha, &weights)
+        });
+        let wide = |values: &[f32]| values.iter().map(|v| f64::from(*v)).collect::<Vec<f64>>();
+        let every_fifth = (0..PIXELS).step_by(5);
+        within(1e-4).check("alpha", &wide(&alpha), &wide(&v_alpha), every_fifth, |alpha| {
+            let alpha: Vec<f32> = alpha.iter().map(|v| *v as f32).collect();
+            loss(&sky, &color, &alpha, &weights)
+        });
     }
 
     #[test]

@@ -5,7 +5,7 @@
 //! that cameras see; one without, in front of that depth, is in empty space. Where cameras are not known, geometry alone decides.
 
 use crate::draft::median;
-use crate::judge::needed;
+use crate::judge::{Presumption, needed};
 use crate::sight::{Observer, SEEN};
 use crate::{Draft, Photographs, Selection, Taken};
 use irradia_splat::{Nearest, sigmoid};
@@ -24,12 +24,10 @@ const NEEDLE: [f32; 2] = [15.0, 0.1];
 /// they are apart.
 const HUGE: f32 = 0.6;
 const HUGE_AMONG: [f32; 2] = [0.35, 4.0];
-/// Share of its opacity that photographs leave to a splat that they need.
-const NEEDED: f32 = 0.5;
-/// Share with which those that have the shape of a floater begin, so that a hundred veils do not hide everything.
-const FIRST_SHARE: f32 = 0.1;
-/// Score from which on photographs decide about huge splats and needles.
-const SUSPICIOUS: f32 = 0.5;
+/// Score from which on photographs decide.
+const SUSPICIOUS: f32 = 0.4;
+/// Score of a splat in front of what views show from which on photographs are not asked: the one that it explains would speak for it.
+const CERTAIN: f32 = 1.5;
 /// Spacing in units of size of a splat that no view shows.
 const UNSEEN: f32 = 6.0;
 /// Of a splat in front of what views show: the share of views that see past it, its spacing in units of size, the product of both, its
@@ -65,6 +63,24 @@ impl FloaterScores {
         [isolated, needle, huge, unseen, in_front]
             .into_iter()
             .fold(0.0, f32::max)
+    }
+
+    /// The score of the strongest reason.
+    fn strongest(&mut self) -> &mut f32 {
+        let Self {
+            isolated,
+            needle,
+            huge,
+            unseen,
+            in_front,
+        } = self;
+        let mut strongest = isolated;
+        for reason in [needle, huge, unseen, in_front] {
+            if *reason > *strongest {
+                strongest = reason;
+            }
+        }
+        strongest
     }
 }
 
@@ -126,25 +142,29 @@ pub fn floater_scores(draft: &Draft) -> Vec<FloaterScores> {
 }
 
 /// Photographs decide about huge splats and needles: by its shape alone, a part of a plain wall or of the edge of a table looks like one,
-/// and a veil far behind everything does not.
+/// and a veil far behind everything does not. They also decide about what is nearly a floater for other reasons.
 fn ask_photographs(draft: &Draft, taken: &Taken, shown: &Selection, scores: &mut [FloaterScores]) {
     let shape = |scores: &FloaterScores| scores.huge.max(scores.needle);
+    let other = |scores: &FloaterScores| scores.isolated.max(scores.unseen).max(scores.in_front);
+    let is_certain = |scores: &FloaterScores| scores.isolated.max(scores.unseen).max(scores.in_front / CERTAIN) >= 1.0;
     // Other floaters would be made up for.
     let mut rest = Selection::of(draft.len(), |i| {
-        let other = scores[i].isolated.max(scores[i].unseen).max(scores[i].in_front);
-        shown.contains(i) && (other < 1.0 || shape(&scores[i]) >= SUSPICIOUS)
+        shown.contains(i) && (!is_certain(&scores[i]) || shape(&scores[i]) >= SUSPICIOUS)
     });
     // Those that have the shape first, as long as nothing else can give way to them; what they hid is judged in clear air.
-    for (least, first) in [(1.0, FIRST_SHARE), (SUSPICIOUS, 1.0)] {
-        let suspects = Selection::of(draft.len(), |i| rest.contains(i) && shape(&scores[i]) >= least);
-        for (i, share) in needed(draft, taken, &rest, &suspects, first) {
-            let FloaterScores { huge, needle, .. } = &mut scores[i as usize];
-            if share < NEEDED {
-                let strongest = if huge > needle { huge } else { needle };
-                *strongest = strongest.max(1.0);
+    for (least, presumption) in [(1.0, Presumption::Guilty), (SUSPICIOUS, Presumption::Innocent)] {
+        let suspects = Selection::of(draft.len(), |i| {
+            rest.contains(i) && (shape(&scores[i]) >= least || least < 1.0 && other(&scores[i]) >= SUSPICIOUS)
+        });
+        for (i, is_needed) in needed(draft, taken, &rest, &suspects, presumption) {
+            let scores = &mut scores[i as usize];
+            if !is_needed {
+                *scores.strongest() = scores.score().max(1.0);
                 rest.set(i as usize, false);
             } else if least < 1.0 {
-                (*huge, *needle) = (huge.min(SUSPICIOUS), needle.min(SUSPICIOUS));
+                for reason in [&mut scores.huge, &mut scores.needle, &mut scores.in_front] {
+                    *reason = reason.min(SUSPICIOUS);
+                }
             }
         }
     }

@@ -1,21 +1,19 @@
 // Shared pages: opened from a file without a network, and as a folder from a web server.
 
 import assert from "node:assert/strict";
-import { mkdirSync, readdirSync, readFileSync, statSync, writeFileSync } from "node:fs";
+import { readdirSync, readFileSync, statSync, writeFileSync } from "node:fs";
 import { createServer } from "node:http";
 import { join } from "node:path";
 import { pathToFileURL } from "node:url";
 import { after, before, test } from "node:test";
-import { PNG } from "pngjs";
-import { browse, OUT, pretendGpu, psnr, readPng, run, scratch } from "./harness.js";
+import { browse, OUT, pretendGpu, psnr, run, scratch } from "./harness.js";
+import { isSettled, rendered, shown, SIZE } from "./shared.js";
 import { random, trained } from "./scenes.js";
 
 /** @type {import("playwright-core").Browser} */
 let browser;
 before(async () => (browser = await browse("webgl")));
 after(() => browser.close());
-
-const SIZE = { width: 640, height: 360 };
 
 /** Opens a shared page and waits for its final picture. */
 async function open(address, options = {}, { by = browser, before = () => {} } = {}) {
@@ -33,36 +31,10 @@ async function open(address, options = {}, { by = browser, before = () => {} } =
 }
 
 async function settled(page, problems) {
-  const holds = () => {
-    const renderer = /** @type {any} */ (window).irradia?.renderer;
-    return renderer && renderer.total > 0 && renderer.loaded === renderer.total && renderer.sharp && !renderer.busy && renderer.drawn > 0;
-  };
   await page.waitForTimeout(200);
-  await page.waitForFunction(holds, null, { timeout: 120000 }).catch((error) => {
+  await page.waitForFunction(isSettled, null, { timeout: 120000 }).catch((error) => {
     throw new Error(`${error.message}; ${problems.join("; ")}`);
   });
-}
-
-const shown = async (page) => {
-  const address = await page.evaluate(() => {
-    // WebGPU's canvas is empty once the browser has composed it.
-    /** @type {any} */ (window).irradia.renderer.painter.present();
-    return document.querySelector("canvas").toDataURL("image/png");
-  });
-  return PNG.sync.read(Buffer.from(address.split(",")[1], "base64"));
-};
-
-let frames = 0;
-
-/** The program's picture of the page's camera. */
-async function rendered(page, scene, { width, height } = SIZE) {
-  const camera = await page.evaluate(() => /** @type {any} */ (window).irradia.camera());
-  const file = join(scratch, "shared_camera.json");
-  writeFileSync(file, JSON.stringify({ irradia_path: 1, fps: 30, loop: false, ease: false, closing: 0, keys: [{ time: 0, ...camera }] }));
-  const out = join(scratch, `shared_${(frames += 1)}`);
-  mkdirSync(out);
-  run("render", scene, "--path", file, "--size", `${width}x${height}`, "--out", out);
-  return readPng(join(out, readdirSync(out)[0]));
 }
 
 for (const [name, make] of [["a trained scene", trained], ["random splats", () => random(4000)]]) {

@@ -1,0 +1,87 @@
+// Shared pages in Firefox: opened from a file, without a network.
+
+import assert from "node:assert/strict";
+import { spawn } from "node:child_process";
+import { existsSync } from "node:fs";
+import { join } from "node:path";
+import { pathToFileURL } from "node:url";
+import { after, before, test } from "node:test";
+import puppeteer from "puppeteer-core";
+import { OUT, psnr, run, scratch } from "./harness.js";
+import { trained } from "./scenes.js";
+import { isSettled, rendered, shown, SIZE } from "./shared.js";
+
+const FIREFOX = [process.env.FIREFOX, "/usr/bin/firefox-esr", "/usr/bin/firefox"].find((path) => path && existsSync(path));
+// Headless, Firefox has no WebGL without a GPU: it gets a screen in memory, where Mesa draws.
+const XVFB = "/usr/bin/Xvfb";
+const skip = !FIREFOX ? "there is no Firefox" : !process.env.DISPLAY && !existsSync(XVFB) ? "there is neither a screen nor Xvfb" : false;
+if (skip) console.log(`SKIPPED: shared pages were NOT opened in Firefox: ${skip}`);
+
+/** @type {import("node:child_process").ChildProcess | undefined} */
+let screen;
+/** @type {import("puppeteer-core").Browser} */
+let browser;
+
+/** Starts a screen in memory and returns its name. */
+const startScreen = () => new Promise((resolve, reject) => {
+  screen = spawn(XVFB, ["-displayfd", "3", "-screen", "0", "1280x800x24"], { stdio: ["ignore", "ignore", "ignore", "pipe"] });
+  screen.on("error", reject);
+  screen.on("exit", () => reject(new Error("Xvfb ended")));
+  screen.stdio[3].on("data", (number) => resolve(`:${String(number).trim()}`));
+});
+
+before(async () => {
+  if (skip) return;
+  const display = process.env.DISPLAY ?? (await startScreen());
+  browser = await puppeteer.launch({
+    browser: "firefox",
+    executablePath: FIREFOX,
+    headless: false,
+    env: { ...process.env, DISPLAY: display, LIBGL_ALWAYS_SOFTWARE: "1" },
+    // There is no network: what is asked for goes to a proxy that is not there.
+    extraPrefsFirefox: { "webgl.force-enabled": true, "network.proxy.type": 1, "network.proxy.http": "127.0.0.1", "network.proxy.http_port": 9, "network.proxy.ssl": "127.0.0.1", "network.proxy.ssl_port": 9 },
+  });
+});
+after(async () => {
+  await browser?.close();
+  screen?.removeAllListeners("exit");
+  screen?.kill();
+});
+
+test("a trained scene opens in Firefox and looks as the program draws it", { skip }, async (context) => {
+  const blank = await browser.newPage();
+  if (!(await blank.evaluate(() => document.createElement("canvas").getContext("webgl2") !== null))) {
+    console.log("SKIPPED: shared pages were NOT opened in Firefox: it has no WebGL2 here");
+    return context.skip();
+  }
+  const scene = trained();
+  const html = join(scratch, "firefox.html");
+  run("share", scene, "-o", html, "--title", "In Firefox");
+  const page = await browser.newPage();
+  await page.setViewport(SIZE);
+  const problems = [];
+  const asked = [];
+  page.on("pageerror", (error) => problems.push(String(error)));
+  page.on("console", (message) => message.type() === "error" && problems.push(message.text()));
+  page.on("request", (request) => /^(data|blob):/.test(request.url()) || asked.push(request.url()));
+  await page.goto(pathToFileURL(html).href);
+  const settled = () => page.waitForFunction(isSettled, { timeout: 120000 });
+  await settled();
+  const first = await shown(page);
+  const db = psnr(first, await rendered(page, scene));
+  console.log(`${await browser.version()}: ${db.toFixed(2)} dB`);
+  assert.ok(db >= 35, `${db} dB`);
+  await page.screenshot({ path: join(OUT, "shared_firefox.png") });
+  await page.mouse.move(300, 180);
+  await page.mouse.down();
+  await page.mouse.move(420, 200, { steps: 5 });
+  await page.mouse.up();
+  await new Promise((resolve) => setTimeout(resolve, 200));
+  await settled();
+  const second = await shown(page);
+  assert.ok(psnr(first, second) < 30, "the drag did not change the picture");
+  const turned = psnr(second, await rendered(page, scene));
+  assert.ok(turned >= 35, `${turned} dB after the drag`);
+  assert.deepEqual(problems, []);
+  assert.deepEqual(asked.filter((address) => address !== pathToFileURL(html).href), []);
+});

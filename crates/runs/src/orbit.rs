@@ -41,20 +41,24 @@ pub(crate) fn outlook(splats: Option<&Splats>, cameras: Option<&[Camera]>) -> Ou
             }
         }
         None => {
-            let middle = |c: usize| {
-                let plane = splats.map_or(&[][..], |splats| &splats.means.plane(c)[..splats.len()]);
+            let quantiles = |plane: &dyn Fn(&Splats) -> &[f32]| {
+                let plane = splats.map_or(&[][..], |splats| &plane(splats)[..splats.len()]);
                 let mut values: Vec<f32> = plane.iter().copied().filter(|v| v.is_finite()).collect();
                 values.sort_unstable_by(f32::total_cmp);
-                let at = |share: f32| {
-                    values
-                        .get((values.len() as f32 * share) as usize)
-                        .copied()
-                        .unwrap_or(0.0)
-                };
-                (at(0.5), at(0.9) - at(0.1))
+                move |share: f32| values.get((values.len() as f32 * share) as usize).copied()
             };
-            let axes = [middle(0), middle(1), middle(2)];
-            let size = axes.iter().map(|a| a.1).fold(1e-3, f32::max);
+            let axes = [0, 1, 2].map(|c| {
+                let at = quantiles(&|splats| splats.means.plane(c));
+                let at = |share| at(share).unwrap_or(0.0);
+                (at(0.5), at(0.9) - at(0.1))
+            });
+            // A few splats in one place are as large as themselves.
+            let sizes = [0, 1, 2].map(|c| quantiles(&|splats| splats.log_scales.plane(c))(0.5).map_or(0.0, f32::exp));
+            let size = axes
+                .iter()
+                .map(|a| a.1)
+                .chain(sizes.map(|size| 4.0 * size))
+                .fold(1e-3, f32::max);
             Outlook {
                 center: Vec3::from_array(axes.map(|a| a.0)),
                 // Most files of this kind come from COLMAP, whose y axis points down.

@@ -53,20 +53,19 @@ pub struct FloaterScores {
 impl FloaterScores {
     /// The strongest reason's.
     pub fn score(&self) -> f32 {
-        let Self {
-            isolated,
-            needle,
-            huge,
-            unseen,
-            in_front,
-        } = *self;
-        [isolated, needle, huge, unseen, in_front]
-            .into_iter()
-            .fold(0.0, f32::max)
+        let mut scores = *self;
+        scores.reasons().into_iter().fold(0.0, |most, reason| most.max(*reason))
     }
 
     /// The score of the strongest reason.
     fn strongest(&mut self) -> &mut f32 {
+        let [first, others @ ..] = self.reasons();
+        others
+            .into_iter()
+            .fold(first, |most, reason| if *reason > *most { reason } else { most })
+    }
+
+    fn reasons(&mut self) -> [&mut f32; 5] {
         let Self {
             isolated,
             needle,
@@ -74,13 +73,7 @@ impl FloaterScores {
             unseen,
             in_front,
         } = self;
-        let mut strongest = isolated;
-        for reason in [needle, huge, unseen, in_front] {
-            if *reason > *strongest {
-                strongest = reason;
-            }
-        }
-        strongest
+        [isolated, needle, huge, unseen, in_front]
     }
 }
 

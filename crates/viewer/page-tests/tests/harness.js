@@ -1,7 +1,7 @@
 // Starts the program and a browser, and compares pictures.
 
 import { spawn, execFileSync } from "node:child_process";
-import { existsSync, mkdirSync, mkdtempSync, readFileSync, rmSync } from "node:fs";
+import { existsSync, mkdirSync, mkdtempSync, readdirSync, readFileSync, rmSync, writeFileSync } from "node:fs";
 import { tmpdir } from "node:os";
 import { join } from "node:path";
 import { chromium } from "playwright-core";
@@ -125,6 +125,18 @@ export const set = (page, values) => page.evaluate(async (values) => {
 export const get = (page, key) => page.evaluate(async (key) => (await import("/page/js/state.js")).state.get(key), key);
 
 export const readPng = (path) => PNG.sync.read(readFileSync(path));
+
+let frames = 0;
+
+/** The program's picture of a page's camera. */
+export function renderFrom(camera, scene, { width, height }) {
+  const out = join(scratch, `frames_${(frames += 1)}`);
+  const file = `${out}.json`;
+  writeFileSync(file, JSON.stringify({ irradia_path: 1, fps: 30, loop: false, ease: false, closing: 0, keys: [{ time: 0, ...camera }] }));
+  mkdirSync(out);
+  run("render", scene, "--path", file, "--size", `${width}x${height}`, "--out", out);
+  return readPng(join(out, readdirSync(out)[0]));
+}
 
 /** PSNR in dB of the colours. */
 export function psnr(a, b) {

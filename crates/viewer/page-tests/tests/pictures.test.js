@@ -1,10 +1,10 @@
 // Pictures on the page against those that `irradia render` draws of the same camera.
 
 import assert from "node:assert/strict";
-import { mkdirSync, readdirSync, writeFileSync } from "node:fs";
+import { readdirSync, writeFileSync } from "node:fs";
 import { join } from "node:path";
 import { after, before, test } from "node:test";
-import { browse, get, open, picture, pretendGpu, psnr, readPng, run, scratch, serve, set, sharp, stopAll, until } from "./harness.js";
+import { browse, get, open, picture, pretendGpu, psnr, readPng, renderFrom, run, scratch, serve, set, sharp, stopAll, until } from "./harness.js";
 import { field, fox, random, shiny, trained } from "./scenes.js";
 
 /** One shows pictures, the others draw them. @type {Record<"browser" | "drawing" | "computing", import("playwright-core").Browser>} */
@@ -15,18 +15,8 @@ after(async () => {
   await Promise.all([browser, drawing, computing].map((one) => one.close()));
 });
 
-let frames = 0;
-
 /** The program's picture of the page's camera. */
-async function rendered(page, scene, { width, height }) {
-  const camera = await get(page, "camera");
-  const file = join(scratch, "camera.json");
-  writeFileSync(file, JSON.stringify({ irradia_path: 1, fps: 30, loop: false, ease: false, closing: 0, keys: [{ time: 0, ...camera }] }));
-  const out = join(scratch, `frames_${(frames += 1)}`);
-  mkdirSync(out);
-  run("render", scene, "--path", file, "--size", `${width}x${height}`, "--out", out);
-  return readPng(join(out, readdirSync(out)[0]));
-}
+const rendered = async (page, scene, size) => renderFrom(await get(page, "camera"), scene, size);
 
 /** Drags over the stage. */
 async function drag(page, dx, dy) {

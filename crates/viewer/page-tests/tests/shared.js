@@ -1,11 +1,21 @@
-// What tests of shared pages have in common, whatever the browser.
+// What tests of shared pages have in common, whatever the browser: pages of Playwright and of Puppeteer.
 
-import { mkdirSync, readdirSync, writeFileSync } from "node:fs";
+import assert from "node:assert/strict";
 import { join } from "node:path";
 import { PNG } from "pngjs";
-import { readPng, run, scratch } from "./harness.js";
+import { OUT, psnr, renderFrom } from "./harness.js";
 
 export const SIZE = { width: 640, height: 360 };
+
+/** Collects the page's errors, and the addresses that it asks for. */
+export function watch(page) {
+  const problems = [];
+  const asked = [];
+  page.on("pageerror", (error) => problems.push(String(error)));
+  page.on("console", (message) => message.type() === "error" && problems.push(message.text()));
+  page.on("request", (request) => /^(data|blob):/.test(request.url()) || asked.push(request.url()));
+  return { problems, asked };
+}
 
 /** In the page: whether its final picture is drawn. */
 export const isSettled = () => {
@@ -13,9 +23,9 @@ export const isSettled = () => {
   return renderer && renderer.total > 0 && renderer.loaded === renderer.total && renderer.sharp && !renderer.busy && renderer.drawn > 0;
 };
 
-/** The page's picture. @param {{ evaluate: (run: () => Promise<string>) => Promise<string> }} page */
+/** The page's picture. */
 export async function shown(page) {
-  const address = await page.evaluate(async () => {
+  const address = await page.evaluate(() => {
     // WebGPU's canvas is empty once the browser has composed it.
     /** @type {any} */ (window).irradia.renderer.painter.present();
     return document.querySelector("canvas").toDataURL("image/png");
@@ -23,15 +33,26 @@ export async function shown(page) {
   return PNG.sync.read(Buffer.from(address.split(",")[1], "base64"));
 }
 
-let frames = 0;
-
 /** The program's picture of the page's camera. */
-export async function rendered(page, scene, { width, height } = SIZE) {
-  const camera = await page.evaluate(() => /** @type {any} */ (window).irradia.camera());
-  const file = join(scratch, "shared_camera.json");
-  writeFileSync(file, JSON.stringify({ irradia_path: 1, fps: 30, loop: false, ease: false, closing: 0, keys: [{ time: 0, ...camera }] }));
-  const out = join(scratch, `shared_${(frames += 1)}`);
-  mkdirSync(out);
-  run("render", scene, "--path", file, "--size", `${width}x${height}`, "--out", out);
-  return readPng(join(out, readdirSync(out)[0]));
+export const rendered = async (page, scene, size = SIZE) =>
+  renderFrom(await page.evaluate(() => /** @type {any} */ (window).irradia.camera()), scene, size);
+
+/** The page looks as the program draws it, before and after a drag and `zoom`; `settled` waits for its final picture. Returns the first
+ * PSNR, and leaves a screenshot. */
+export async function looksAsDrawn(page, scene, screenshot, { settled, zoom }) {
+  const first = await shown(page);
+  const db = psnr(first, await rendered(page, scene));
+  assert.ok(db >= 35, `${db} dB`);
+  await page.screenshot({ path: join(OUT, screenshot) });
+  await page.mouse.move(300, 180);
+  await page.mouse.down();
+  await page.mouse.move(420, 200, { steps: 5 });
+  await page.mouse.up();
+  await zoom();
+  await settled();
+  const second = await shown(page);
+  assert.ok(psnr(first, second) < 30, "the drag did not change the picture");
+  const turned = psnr(second, await rendered(page, scene));
+  assert.ok(turned >= 35, `${turned} dB after the drag`);
+  return db;
 }

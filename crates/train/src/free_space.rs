@@ -78,25 +78,26 @@ fn distance_to_points(points: &PointCloud, view: &View) -> f32 {
 
 /// Depth along +Z of the nearest points that a view sees, or of its depth bounds, world units.
 fn nearest_depth(dataset: &Dataset, view: &View) -> Option<f32> {
-    let positions = dataset
-        .points
-        .as_ref()
-        .map(|points| &points.positions[..])
-        .unwrap_or_default();
-    let seen = view.points_seen.iter().filter_map(|i| positions.get(*i as usize));
-    let mut depths: Vec<f32> = seen
-        .map(|position| view.camera.pose.camera_from_world(*position).z)
-        .filter(|depth| *depth > view.camera.near)
-        .collect();
-    if depths.len() < ENOUGH_POINTS {
+    let Some(mut depths) = seen_depths(dataset, view) else {
         return view.depth_bounds.map(|bounds| bounds[0]);
-    }
+    };
     let at = (depths.len() as f64 * OUTLIERS) as usize;
     Some(*depths.select_nth_unstable_by(at, f32::total_cmp).1)
 }
 
+/// Depths along +Z of the points that a view sees, world units; `None` if they are too few to know its surfaces.
+pub(crate) fn seen_depths(dataset: &Dataset, view: &View) -> Option<Vec<f32>> {
+    let positions = &dataset.points.as_ref()?.positions;
+    let seen = view.points_seen.iter().filter_map(|i| positions.get(*i as usize));
+    let depths: Vec<f32> = seen
+        .map(|position| view.camera.pose.camera_from_world(*position).z)
+        .filter(|depth| *depth > view.camera.near)
+        .collect();
+    (depths.len() >= ENOUGH_POINTS).then_some(depths)
+}
+
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use super::*;
     use glam::{Quat, Vec3};
     use irradia_scene::{Camera, Intrinsics, Photo, Pose};
@@ -104,7 +105,7 @@ mod tests {
     use std::sync::Arc;
 
     /// A camera at the origin that sees a wall of 100 points at a depth of 10 and two wrong points, and a wall 1 behind it.
-    fn dataset(seen: usize, bounds: Option<[f32; 2]>) -> Dataset {
+    pub(crate) fn dataset(seen: usize, bounds: Option<[f32; 2]>) -> Dataset {
         let pose = Pose {
             rotation: Quat::IDENTITY,
             position: Vec3::ZERO,

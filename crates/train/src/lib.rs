@@ -24,6 +24,7 @@ mod objective;
 pub mod paces;
 pub mod painter;
 mod photos;
+mod pixel_size;
 pub mod recipe;
 pub mod report;
 mod robust;

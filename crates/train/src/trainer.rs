@@ -11,6 +11,7 @@ use crate::memory::{MemoryPlan, Needs};
 use crate::model::Model;
 use crate::objective::{Objective, ObjectiveValues, Reference};
 use crate::photos::{PhotoCache, Prepared};
+use crate::pixel_size::pixel_size;
 use crate::recipe::{AdamKind, Choice, DensityControl, LengthUnit, Param, Recipe};
 use crate::schedule::{Clock, Round, StepMetrics, StepPlan, plan, upcoming_views};
 use crate::socket::{Residual, Sky, Sockets};
@@ -141,6 +142,8 @@ pub struct Trainer {
     pub pace: f64,
     /// Extent of the scene, world units: 1.1 times the largest distance of a camera from their mean (3DGS).
     pub extent: f32,
+    /// What the rate of the means is relative to, world units: the extent, or a number of pixels.
+    extent_of_rate: f32,
     /// Wall time of all steps so far, excluding the loading of photographs and the evaluation of held-out views.
     pub seconds: f64,
     /// CPU time of all steps so far, over all threads.
@@ -234,13 +237,18 @@ impl Trainer {
         let memory = MemoryPlan::new(&needs, options.memory)?;
         let mut engine = Engine::new(SplatState::new(Splats::zeros(0, sh::MAX_DEGREE)));
         let decisions = use_device(&mut engine, &options.device, &recipe, first_splats)?;
+        let extent = init::camera_extent(&cameras);
         Ok(Self {
             clock: Clock::new(&recipe),
             pace: options.steps.map_or(1.0, |steps| total / steps.max(1) as f64),
             seconds: 0.0,
             cpu_seconds: 0.0,
             times: Times::default(),
-            extent: init::camera_extent(&cameras),
+            extent,
+            extent_of_rate: match recipe.extent_pixels {
+                pixels if pixels > 0.0 => pixels * pixel_size(&dataset),
+                _ => extent,
+            },
             photos: PhotoCache::new(dataset.clone(), recipe.render.background, memory.photos),
             cap: cap(&recipe, &cameras).min(memory.splats).min(engine.most_splats()),
             memory,
@@ -478,7 +486,7 @@ impl Trainer {
     fn update(&self, plan: &StepPlan) -> Update {
         let longer = self.pace.min(1.0).powf(f64::from(self.recipe.length_exponent)) as f32;
         let mut rates = plan.rates().scaled(longer);
-        rates.means *= self.extent;
+        rates.means *= self.extent_of_rate;
         let adam = &self.recipe.adam;
         let (noise, limit) = (plan.value(Param::Noise), plan.value(Param::ConditionCap));
         Update {
@@ -746,7 +754,7 @@ impl Trainer {
     }
 }
 
-fn train_cameras(dataset: &Dataset) -> Vec<Camera> {
+pub(crate) fn train_cameras(dataset: &Dataset) -> Vec<Camera> {
     dataset.train.iter().map(|i| dataset.views[*i].camera).collect()
 }
 

@@ -150,10 +150,13 @@ test("an address holds the camera", async () => {
   const server = await serve("view", trained(), "--port", "0");
   const { page } = await open(browser, server.address, { width: 500, height: 400 });
   await page.locator("irr-stage .overlay").hover();
+  const before = (await get(page, "camera")).position;
   await page.mouse.wheel(0, -300);
+  // Playwright does not wait for the page to see the wheel, or for its own `url()` to follow the address bar.
+  await until(page, async (before) => (await import("/page/js/state.js")).state.get("camera").position.some((v, i) => v !== before[i]), before);
   await page.keyboard.press("u");
-  const address = page.url();
-  assert.match(address, /#p=/);
+  await until(page, () => location.hash.startsWith("#p="));
+  const address = await page.evaluate(() => location.href);
   const other = await open(browser, address, { width: 500, height: 400 });
   const [here, there] = [await get(page, "camera"), await get(other.page, "camera")];
   assert.ok(here.position.every((v, i) => Math.abs(v - there.position[i]) < 1e-4));

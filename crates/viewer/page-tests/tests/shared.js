@@ -48,7 +48,11 @@ export async function looksAsDrawn(page, scene, screenshot, { settled, zoom }) {
   await page.mouse.down();
   await page.mouse.move(420, 200, { steps: 5 });
   await page.mouse.up();
+  const camera = () => page.evaluate(() => JSON.stringify(/** @type {any} */ (window).irradia.camera()));
+  const dragged = await camera();
   await zoom();
+  // The page may see the wheel later than the browser took it.
+  while ((await camera()) === dragged) await new Promise((resolve) => setTimeout(resolve, 20));
   await settled();
   const second = await shown(page);
   assert.ok(psnr(first, second) < 30, "the drag did not change the picture");

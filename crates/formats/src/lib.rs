@@ -11,6 +11,7 @@ mod complete;
 mod dataset;
 mod describe;
 mod error;
+mod faces;
 mod image_file;
 mod pack;
 pub mod parse;

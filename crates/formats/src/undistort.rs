@@ -1,7 +1,7 @@
 //! Undistortion of photographs to pinhole images: same focal lengths, cropped so that every pixel is valid.
 
 use crate::Pixels;
-use glam::DVec2;
+use glam::{DQuat, DVec2, DVec3};
 use irradia_scene::{Intrinsics, Lens};
 
 /// Spacing of the grid on which the lens is evaluated, pixels; in between, it is interpolated. The error is the second
@@ -13,25 +13,20 @@ const LARGEST: f64 = 2.0;
 /// Minimum side of a crop, pixels.
 const SMALLEST: i64 = 16;
 
-/// The undistortion of the photographs of one distorted camera.
+/// The way from the photographs of one camera to pinhole images.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Undistortion {
-    /// The distorted camera.
+    /// The camera of the photographs.
     source: Intrinsics,
-    /// First column of the crop, in pixels of the pinhole image that shares the source's principal point.
-    left: i64,
-    /// First row of the crop.
-    top: i64,
-    width: u32,
-    height: u32,
+    /// The camera of the results.
+    pinhole: Intrinsics,
+    /// From the results' axes to the photographs'.
+    turn: DQuat,
 }
 
 impl Undistortion {
-    /// The pinhole with the source's focal lengths, cropped to the largest upright rectangle in which every pixel lies
+    /// The pinhole with the source's axes and focal lengths, cropped to the largest upright rectangle in which every pixel lies
     /// in the photograph; `None` when there is no such rectangle.
-    ///
-    /// The rectangle is found by peeling: of a box that is certainly too large, the side with the largest fraction outside is
-    /// moved in until all four sides are inside. The valid region has no holes, so that the interior is valid, too.
     pub fn plan(source: &Intrinsics) -> Option<Self> {
         let half = DVec2::new(f64::from(source.width), f64::from(source.height)) * (0.5 * LARGEST);
         let (cx, cy) = (f64::from(source.cx), f64::from(source.cy));
@@ -41,14 +36,52 @@ impl Undistortion {
             right: (cx + half.x) as i64,
             bottom: (cy + half.y) as i64,
         };
-        let mut crop = largest;
         let reach = reach(
             &source.lens,
             (half.x / f64::from(source.fx)).hypot(half.y / f64::from(source.fy)),
         );
-        let valid = |x: f64, y: f64| is_valid(source, reach, x, y);
+        let whole = Self {
+            source: *source,
+            pinhole: Intrinsics {
+                lens: Lens::Pinhole,
+                ..*source
+            },
+            turn: DQuat::IDENTITY,
+        };
+        whole.cropped(largest, |p| p.length() < reach)
+    }
 
-        let step = (i64::from(source.width.max(source.height)) / 256).max(1);
+    /// The image of a pinhole of `pinhole`'s focal lengths and principal point that is turned by `turn`, from its axes to the photographs', cropped
+    /// as by [`Undistortion::plan`] to directions of which `shows` holds.
+    pub fn turned(
+        source: &Intrinsics,
+        pinhole: Intrinsics,
+        turn: DQuat,
+        shows: impl Fn(DVec3) -> bool,
+    ) -> Option<Self> {
+        let whole = Self {
+            source: *source,
+            pinhole,
+            turn,
+        };
+        let largest = Crop {
+            left: 0,
+            top: 0,
+            right: i64::from(pinhole.width),
+            bottom: i64::from(pinhole.height),
+        };
+        whole.cropped(largest, |p| shows(turn * p.extend(1.0)))
+    }
+
+    /// The part of `self` within `largest`, in pixels of its image, in which every pixel lies in the photograph and every point of the undistorted
+    /// plane in `shown`.
+    ///
+    /// The rectangle is found by peeling: of a box that is certainly too large, the side with the largest fraction outside is
+    /// moved in until all four sides are inside. The valid region has no holes, so that the interior is valid, too.
+    fn cropped(self, largest: Crop, shown: impl Fn(DVec2) -> bool) -> Option<Self> {
+        let valid = |x: f64, y: f64| shown(plane_point(&self.pinhole, x, y)) && self.is_in_photograph(x, y);
+        let mut crop = largest;
+        let step = (i64::from(self.source.width.max(self.source.height)) / 256).max(1);
         loop {
             let outside = Side::ALL.map(|side| crop.outside(side, 64, valid));
             let worst = (0..4).max_by_key(|i| outside[*i]).expect("four sides");
@@ -72,24 +105,51 @@ impl Undistortion {
             }
         }
         Some(Self {
-            source: *source,
-            left: crop.left,
-            top: crop.top,
-            width: (crop.right - crop.left) as u32,
-            height: (crop.bottom - crop.top) as u32,
+            pinhole: Intrinsics {
+                width: (crop.right - crop.left) as u32,
+                height: (crop.bottom - crop.top) as u32,
+                cx: (f64::from(self.pinhole.cx) - crop.left as f64) as f32,
+                cy: (f64::from(self.pinhole.cy) - crop.top as f64) as f32,
+                ..self.pinhole
+            },
+            ..self
         })
     }
 
-    /// The camera of the undistorted images.
+    /// The camera of the results.
     pub fn pinhole(&self) -> Intrinsics {
-        Intrinsics {
-            width: self.width,
-            height: self.height,
-            cx: (f64::from(self.source.cx) - self.left as f64) as f32,
-            cy: (f64::from(self.source.cy) - self.top as f64) as f32,
-            lens: Lens::Pinhole,
-            ..self.source
-        }
+        self.pinhole
+    }
+
+    /// The rotation from the results' axes to the photographs'.
+    pub fn turn(&self) -> DQuat {
+        self.turn
+    }
+
+    /// Where the centre of the photograph's pixel `(x, y)`, if the lens has a direction for it, lies in the results: inside or not.
+    pub fn shows(&self, x: f64, y: f64) -> bool {
+        let direction = self.source.lens.direction(plane_point(&self.source, x, y));
+        let ray = direction.map(|direction| self.turn.inverse() * direction);
+        ray.filter(|ray| ray.z > 0.0).is_some_and(|ray| {
+            let k = &self.pinhole;
+            let at = pixel(k, ray.truncate() / ray.z);
+            (0.0..=f64::from(k.width)).contains(&at.x) && (0.0..=f64::from(k.height)).contains(&at.y)
+        })
+    }
+
+    /// Position in the photograph, pixels, of a position in the results; `None` where the lens has none.
+    fn source_position(&self, x: f64, y: f64) -> Option<DVec2> {
+        let direction = self.turn * plane_point(&self.pinhole, x, y).extend(1.0);
+        Some(pixel(&self.source, self.source.lens.project(direction)?))
+    }
+
+    /// Whether a position in the results lies between the centres of the photograph's outermost pixels; the left and the right edge of a panorama
+    /// are one.
+    fn is_in_photograph(&self, x: f64, y: f64) -> bool {
+        let wraps = self.source.lens == Lens::Equirectangular;
+        let within = |at: f64, side: u32| (0.5..=f64::from(side) - 0.5).contains(&at);
+        self.source_position(x, y)
+            .is_some_and(|at| wraps || within(at.x, self.source.width) && within(at.y, self.source.height))
     }
 
     /// Undistorts an image of the source's size, or of a fraction of it, bilinearly; the result has the same fraction of the size.
@@ -102,40 +162,49 @@ impl Undistortion {
     }
 
     fn apply_channels<const C: usize>(&self, from: &Pixels) -> Pixels {
-        // Pixels of the source for each of `from`, and of the whole crop for each of the result; 1 at full size.
+        // Pixels of the source for each of `from`, and of the whole result for each of this one; 1 at full size.
         let per_source = [
             f64::from(self.source.width) / f64::from(from.width),
             f64::from(self.source.height) / f64::from(from.height),
         ];
         let side = |full: u32, step: f64| ((f64::from(full) / step) as u32).max(1);
-        let (width, height) = (side(self.width, per_source[0]), side(self.height, per_source[1]));
+        let (width, height) = (
+            side(self.pinhole.width, per_source[0]),
+            side(self.pinhole.height, per_source[1]),
+        );
         let per_result = [
-            f64::from(self.width) / f64::from(width),
-            f64::from(self.height) / f64::from(height),
+            f64::from(self.pinhole.width) / f64::from(width),
+            f64::from(self.pinhole.height) / f64::from(height),
         ];
-        let grid_columns = width.div_ceil(GRID) + 1;
+        // Longitudes jump behind the camera, and all meet at the poles.
+        let wraps = self.source.lens == Lens::Equirectangular;
+        let grid = if wraps { 1 } else { GRID };
+        let grid_columns = width.div_ceil(grid) + 1;
         let grid_row = |y: u32| -> Vec<[f32; 2]> {
             (0..grid_columns)
                 .map(|column| {
-                    let at = self.source_position(column * GRID, y, per_result);
+                    let center = [column * grid, y].map(|at| f64::from(at) + 0.5);
+                    let at = self.source_position(center[0] * per_result[0], center[1] * per_result[1]);
+                    // Only of the grid beyond the result.
+                    let at = at.unwrap_or(DVec2::new(f64::from(self.source.cx), f64::from(self.source.cy)));
                     [0, 1].map(|axis| (at[axis] / per_source[axis] - 0.5) as f32)
                 })
                 .collect()
         };
         let mut data = Vec::with_capacity(width as usize * height as usize * C);
         let mut upper = grid_row(0);
-        for first in (0..height).step_by(GRID as usize) {
-            let lower = grid_row(first + GRID);
-            for y in first..(first + GRID).min(height) {
-                let t = (y - first) as f32 / GRID as f32;
+        for first in (0..height).step_by(grid as usize) {
+            let lower = grid_row(first + grid);
+            for y in first..(first + grid).min(height) {
+                let t = (y - first) as f32 / grid as f32;
                 let mix = |i: usize, axis: usize| upper[i][axis] + (lower[i][axis] - upper[i][axis]) * t;
                 for column in 0..grid_columns as usize - 1 {
                     let start = [mix(column, 0), mix(column, 1)];
                     let end = [mix(column + 1, 0), mix(column + 1, 1)];
-                    let slope = [(end[0] - start[0]) / GRID as f32, (end[1] - start[1]) / GRID as f32];
-                    for i in 0..GRID.min(width - column as u32 * GRID) {
+                    let slope = [(end[0] - start[0]) / grid as f32, (end[1] - start[1]) / grid as f32];
+                    for i in 0..grid.min(width - column as u32 * grid) {
                         let at = [start[0] + slope[0] * i as f32, start[1] + slope[1] * i as f32];
-                        data.extend(sample::<C>(from, at));
+                        data.extend(sample::<C>(from, at, wraps));
                     }
                 }
             }
@@ -148,24 +217,21 @@ impl Undistortion {
             data,
         }
     }
-
-    /// Position in the photograph, pixels, of the centre of undistorted pixel `(x, y)`, each `size` pixels of the crop large.
-    fn source_position(&self, x: u32, y: u32, size: [f64; 2]) -> DVec2 {
-        distorted_pixel(
-            &self.source,
-            (f64::from(x) + 0.5) * size[0] + self.left as f64,
-            (f64::from(y) + 0.5) * size[1] + self.top as f64,
-        )
-    }
 }
 
-/// Bilinear, clamped to the image; with 4 channels colour is weighted by alpha.
-fn sample<const C: usize>(from: &Pixels, at: [f32; 2]) -> [u8; C] {
+/// Bilinear, clamped to the image, or with its left and right edge joined; with 4 channels colour is weighted by alpha.
+fn sample<const C: usize>(from: &Pixels, at: [f32; 2], wraps: bool) -> [u8; C] {
     let (last_x, last_y) = (from.width as usize - 1, from.height as usize - 1);
-    let x = at[0].clamp(0.0, last_x as f32);
+    let x = if wraps {
+        at[0].rem_euclid(from.width as f32)
+    } else {
+        at[0].clamp(0.0, last_x as f32)
+    };
     let y = at[1].clamp(0.0, last_y as f32);
-    let (x0, y0) = (x as usize, y as usize);
-    let (x1, y1) = ((x0 + 1).min(last_x), (y0 + 1).min(last_y));
+    // The remainder of a tiny negative number is the width itself.
+    let (x0, y0) = ((x as usize).min(last_x), y as usize);
+    let x1 = if wraps && x0 == last_x { 0 } else { (x0 + 1).min(last_x) };
+    let y1 = (y0 + 1).min(last_y);
     let (u, v) = (x - x0 as f32, y - y0 as f32);
     let pixel = |x: usize, y: usize| -> &[u8; C] {
         let start = (y * from.width as usize + x) * C;
@@ -252,21 +318,11 @@ fn plane_point(k: &Intrinsics, x: f64, y: f64) -> DVec2 {
     )
 }
 
-fn distorted_pixel(k: &Intrinsics, x: f64, y: f64) -> DVec2 {
-    let p = k.lens.distort(plane_point(k, x, y));
+fn pixel(k: &Intrinsics, p: DVec2) -> DVec2 {
     DVec2::new(
         f64::from(k.fx) * p.x + f64::from(k.cx),
         f64::from(k.fy) * p.y + f64::from(k.cy),
     )
-}
-
-/// Whether an undistorted pixel lies between the centres of the photograph's outermost pixels, before any fold of the lens.
-fn is_valid(k: &Intrinsics, reach: f64, x: f64, y: f64) -> bool {
-    if plane_point(k, x, y).length() >= reach {
-        return false;
-    }
-    let at = distorted_pixel(k, x, y);
-    (0.5..=f64::from(k.width) - 0.5).contains(&at.x) && (0.5..=f64::from(k.height) - 0.5).contains(&at.y)
 }
 
 /// The radius on the undistorted plane, at most `largest`, up to which the lens is monotonic. Beyond it a polynomial folds back
@@ -275,19 +331,24 @@ fn reach(lens: &Lens, largest: f64) -> f64 {
     let radial = match *lens {
         Lens::Pinhole => return f64::INFINITY,
         Lens::Opencv { k, .. } => Lens::Opencv { k, p: [0.0; 2] },
-        fisheye => fisheye,
+        Lens::Fisheye { k, .. } => Lens::fisheye(k),
+        other => other,
     };
+    monotonic(largest, |radius| radial.distort(DVec2::new(radius, 0.0)).x).unwrap_or(f64::INFINITY)
+}
+
+/// The largest of values up to `largest` up to which `of` grows; `None` if it always does.
+pub(crate) fn monotonic(largest: f64, of: impl Fn(f64) -> f64) -> Option<f64> {
     const STEPS: u32 = 2000;
     let mut before = 0.0;
     for i in 1..=STEPS {
-        let radius = largest * f64::from(i) / f64::from(STEPS);
-        let distorted = radial.distort(DVec2::new(radius, 0.0)).x;
-        if distorted.is_nan() || distorted <= before {
-            return largest * f64::from(i - 1) / f64::from(STEPS);
+        let value = of(largest * f64::from(i) / f64::from(STEPS));
+        if value.is_nan() || value <= before {
+            return Some(largest * f64::from(i - 1) / f64::from(STEPS));
         }
-        before = distorted;
+        before = value;
     }
-    f64::INFINITY
+    None
 }
 
 #[cfg(test)]
@@ -319,9 +380,7 @@ mod tests {
             k: [0.3, 0.1, 0.01, 0.25, 0.02, 0.0],
             p: [0.0, 0.001],
         },
-        Lens::Fisheye {
-            k: [0.02, -0.01, 0.003, -0.0005],
-        },
+        Lens::fisheye([0.02, -0.01, 0.003, -0.0005]),
     ];
 
     #[test]
@@ -329,15 +388,8 @@ mod tests {
         for lens in LENSES {
             let source = camera(lens);
             let plan = Undistortion::plan(&source).unwrap();
-            let valid = |x: i64, y: i64| {
-                is_valid(
-                    &source,
-                    f64::INFINITY,
-                    (x + plan.left) as f64 + 0.5,
-                    (y + plan.top) as f64 + 0.5,
-                )
-            };
-            let (w, h) = (i64::from(plan.width), i64::from(plan.height));
+            let valid = |x: i64, y: i64| plan.is_in_photograph(x as f64 + 0.5, y as f64 + 0.5);
+            let (w, h) = (i64::from(plan.pinhole.width), i64::from(plan.pinhole.height));
             assert!((0..h).all(|y| (0..w).all(|x| valid(x, y))), "{lens:?} {plan:?}");
             assert!(
                 (0..h).any(|y| !valid(-2, y)) && (0..h).any(|y| !valid(w + 1, y)),
@@ -413,7 +465,7 @@ mod tests {
             })
         };
         assert_eq!(Undistortion::plan(&outside), None);
-        let wild = camera(Lens::Fisheye { k: [f64::NAN; 4] });
+        let wild = camera(Lens::fisheye([f64::NAN; 4]));
         assert_eq!(Undistortion::plan(&wild), None);
     }
 
@@ -424,7 +476,7 @@ mod tests {
             fy: 100.0,
             cx: 160.0,
             cy: 120.0,
-            ..camera(Lens::Fisheye { k: [0.0; 4] })
+            ..camera(Lens::fisheye([0.0; 4]))
         };
         let pinhole = Undistortion::plan(&source).unwrap().pinhole();
         assert!(

@@ -360,12 +360,9 @@ fn errors_say_what_where_and_what_to_do() {
     assert!(error_of(root).contains("line 1"));
     fs::remove_file(root.join("transforms.json")).unwrap();
 
-    write_colmap_text(root, "THIN_PRISM_FISHEYE 8 8 1 1 1 1 0 0 0 0 0 0 0 0", &["00.png"]);
+    write_colmap_text(root, "EUCM 8 8 1 1 1 1 0 0", &["00.png"]);
     let error = error_of(root);
-    assert!(
-        error.contains("cameras.txt") && error.contains("THIN_PRISM_FISHEYE"),
-        "{error}"
-    );
+    assert!(error.contains("cameras.txt") && error.contains("EUCM"), "{error}");
     write_colmap_text(root, "PINHOLE 8 8 9 9 4 4", &["00.png", "01.png", "02.png"]);
     fs::write(root.join("sparse/0/images.txt"), "1 1 0 0 0 0 0 0 77 00.png\n\n").unwrap();
     assert!(error_of(root).contains("camera 77"));

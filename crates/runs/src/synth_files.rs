@@ -4,7 +4,7 @@
 //! ```text
 //! transforms_train.json  transforms_val.json  transforms_test.json
 //! train/r_000.png ..     RGBA, 8 bits, opaque
-//! depth/train/r_000.png  16 bits: distance along the optical axis = value * depth_scale, world units
+//! depth/train/r_000.png  16 bits: distance along the optical axis, or from the camera where the lens is wide, = value * depth_scale, world units
 //! normal/train/r_000.png 8 bits: world normal = value / 255 * 2 - 1, towards the camera
 //! points.ply             surface points with colours
 //! ```
@@ -13,7 +13,7 @@ use crate::RunError;
 use crate::folder::to_json;
 use glam::{Mat4, Vec3};
 use irradia_formats::{write_atomic, write_png, write_png_16, write_points_ply};
-use irradia_scene::{Camera, PointCloud};
+use irradia_scene::{Camera, Lens, PointCloud};
 use irradia_synth::{Capture, Part, SceneName, SynthFrame, SynthOptions};
 use serde_json::{Value, json};
 use std::path::Path;
@@ -88,13 +88,23 @@ pub fn write_synth_dataset(out: impl AsRef<Path>, options: &SynthOptions) -> Res
     write_points_ply(&out.join("points.ply"), &points)?;
     let [train, val, test] = [0, 1, 2].map(|part| frames[part].len() as u32);
     for (part, frames) in Part::ALL.into_iter().zip(frames) {
+        let mut shots = capture.shots().iter().filter(|shot| shot.part == part);
+        let k = shots.next().expect("every part has views").camera.intrinsics;
         let mut transforms = json!({
-            "camera_angle_x": capture.fov_x(),
-            "w": options.width,
-            "h": options.height,
+            "w": k.width,
+            "h": k.height,
             "depth_scale": depth_scale,
             "frames": frames,
         });
+        match k.lens {
+            Lens::Fisheye { .. } => {
+                transforms["camera_model"] = json!("OPENCV_FISHEYE");
+                transforms["fl_x"] = json!(k.fx);
+                transforms["fl_y"] = json!(k.fy);
+            }
+            Lens::Equirectangular => transforms["camera_model"] = json!("EQUIRECTANGULAR"),
+            _ => transforms["camera_angle_x"] = json!(capture.fov_x()),
+        }
         if part == Part::Train {
             transforms["ply_file_path"] = json!("points.ply");
         }
@@ -133,6 +143,7 @@ fn blender_matrix(camera: &Camera) -> [[f32; 4]; 4] {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use irradia_synth::SynthLens;
     use std::path::PathBuf;
 
     const SMALL: SynthOptions = SynthOptions {
@@ -141,6 +152,7 @@ mod tests {
         width: 24,
         height: 16,
         seed: 5,
+        lens: SynthLens::Pinhole,
     };
 
     fn all_files(folder: &Path) -> Vec<(PathBuf, Vec<u8>)> {

@@ -1,11 +1,13 @@
-use glam::DVec2;
+use glam::{DVec2, DVec3};
+use std::f64::consts::PI;
 
-/// Lens distortion, in COLMAP's and OpenCV's parameters.
+/// The mapping of a lens from directions to its plane, in COLMAP's and OpenCV's parameters. A pixel is `(fx, fy)` times a point of the plane
+/// plus the principal point.
 ///
-/// Both directions map the normalised image plane: `(x, y) = (X / Z, Y / Z)` of the OpenCV camera.
+/// Directions are those of the OpenCV camera: x right, y down, z forward.
 #[derive(Clone, Copy, Debug, PartialEq, Default)]
 pub enum Lens {
-    /// No distortion.
+    /// No distortion: the plane is that of `(X / Z, Y / Z)`.
     #[default]
     Pinhole,
     /// OpenCV's rational model (COLMAP `FULL_OPENCV`; `OPENCV`, `RADIAL` and `SIMPLE_RADIAL` by setting the rest to zero).
@@ -15,63 +17,145 @@ pub enum Lens {
         /// Tangential coefficients p1, p2.
         p: [f64; 2],
     },
-    /// OpenCV's fisheye model (Kannala and Brandt 2006; COLMAP `OPENCV_FISHEYE`), `theta_d = theta (1 + k1 theta^2 + ..)`.
+    /// OpenCV's fisheye model (Kannala and Brandt 2006; COLMAP `OPENCV_FISHEYE`), `theta_d = theta (1 + k1 theta^2 + ..)`, and with what COLMAP's
+    /// `THIN_PRISM_FISHEYE` adds.
     Fisheye {
-        /// Coefficients k1..k4.
+        /// Radial coefficients k1..k4.
         k: [f64; 4],
+        /// Tangential coefficients p1, p2.
+        p: [f64; 2],
+        /// Coefficients of a thin prism, sx1 and sy1.
+        s: [f64; 2],
     },
+    /// The field-of-view model (Devernay and Faugeras 2001; COLMAP `FOV`).
+    Fov {
+        /// The model's angle, radians.
+        omega: f64,
+    },
+    /// A panorama of all directions: longitude to the right of straight ahead, and latitude below the horizon, in radians.
+    Equirectangular,
 }
 
 impl Lens {
-    /// Maps the undistorted plane point `p` to the distorted plane.
-    pub fn distort(&self, p: DVec2) -> DVec2 {
+    /// A fisheye without tangential distortion or prism.
+    pub const fn fisheye(k: [f64; 4]) -> Self {
+        Lens::Fisheye {
+            k,
+            p: [0.0; 2],
+            s: [0.0; 2],
+        }
+    }
+
+    /// Whether the lens can show more than what is before the camera.
+    pub fn is_wide(&self) -> bool {
+        matches!(self, Lens::Fisheye { .. } | Lens::Equirectangular)
+    }
+
+    /// Whether every coefficient is finite.
+    pub fn is_finite(&self) -> bool {
+        let all = |values: &[f64]| values.iter().all(|v| v.is_finite());
         match self {
-            Lens::Pinhole => p,
-            Lens::Opencv { k, p: [p1, p2] } => {
-                let (x, y) = (p.x, p.y);
-                let r2 = x * x + y * y;
+            Lens::Pinhole | Lens::Equirectangular => true,
+            Lens::Opencv { k, p } => all(k) && all(p),
+            Lens::Fisheye { k, p, s } => all(k) && all(p) && all(s),
+            Lens::Fov { omega } => omega.is_finite(),
+        }
+    }
+
+    /// The plane's point of a direction of any length; `None` where the lens has none: behind the camera, except for wide lenses, which
+    /// lack at most the direction straight behind.
+    pub fn project(&self, direction: DVec3) -> Option<DVec2> {
+        let DVec3 { x, y, z } = direction;
+        match self {
+            Lens::Equirectangular => Some(DVec2::new(x.atan2(z), y.atan2(x.hypot(z)))),
+            Lens::Fisheye { .. } => {
+                let sine = x.hypot(y);
+                if sine > 1e-12 * z.abs() {
+                    Some(self.bend(DVec2::new(x, y) * (sine.atan2(z) / sine)))
+                } else {
+                    (z > 0.0).then(|| DVec2::new(x, y) / z)
+                }
+            }
+            _ => (z > 0.0).then(|| self.bend(DVec2::new(x, y) / z)),
+        }
+    }
+
+    /// The inverse of [`Lens::project`], of any length; `None` outside the region in which the lens is invertible.
+    pub fn direction(&self, point: DVec2) -> Option<DVec3> {
+        match self {
+            Lens::Equirectangular => {
+                let is_there = point.x.abs() <= PI && point.y.abs() <= 0.5 * PI;
+                let (sin, cos) = point.x.sin_cos();
+                let (down, level) = point.y.sin_cos();
+                is_there.then(|| DVec3::new(level * sin, down, level * cos))
+            }
+            Lens::Fisheye { .. } => {
+                let bent = self.unbend(point)?;
+                let theta = bent.length();
+                let sine = if theta > 1e-12 { theta.sin() / theta } else { 1.0 };
+                (theta <= PI).then(|| (bent * sine).extend(theta.cos()))
+            }
+            _ => Some(self.unbend(point)?.extend(1.0)),
+        }
+    }
+
+    /// Maps a point of the undistorted plane `(X / Z, Y / Z)` to the lens's plane.
+    pub fn distort(&self, p: DVec2) -> DVec2 {
+        self.project(p.extend(1.0)).expect("it is before the camera")
+    }
+
+    /// The inverse of [`Lens::distort`]; `None` where [`Lens::direction`] has none, or one that is not before the camera.
+    pub fn undistort(&self, distorted: DVec2) -> Option<DVec2> {
+        let direction = self.direction(distorted)?;
+        (direction.z > 0.0).then(|| direction.truncate() / direction.z)
+    }
+
+    /// The distortion on the plane on which the model defines it: of equal angles for fisheyes, else the undistorted plane.
+    fn bend(&self, p: DVec2) -> DVec2 {
+        let (x, y) = (p.x, p.y);
+        let r2 = p.length_squared();
+        // OpenCV's tangential part.
+        let tangential = |[p1, p2]: [f64; 2]| {
+            DVec2::new(
+                2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
+                p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
+            )
+        };
+        match *self {
+            Lens::Pinhole | Lens::Equirectangular => p,
+            Lens::Opencv { k, p: tangent } => {
                 let radial =
                     (1.0 + r2 * (k[0] + r2 * (k[1] + r2 * k[2]))) / (1.0 + r2 * (k[3] + r2 * (k[4] + r2 * k[5])));
-                DVec2::new(
-                    x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
-                    y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
-                )
+                p * radial + tangential(tangent)
             }
-            Lens::Fisheye { k } => {
-                let r = p.length();
-                if r < 1e-12 {
+            Lens::Fisheye { k, p: tangent, s } => {
+                let radial = 1.0 + r2 * (k[0] + r2 * (k[1] + r2 * (k[2] + r2 * k[3])));
+                p * radial + tangential(tangent) + DVec2::from(s) * r2
+            }
+            Lens::Fov { omega } => {
+                let r = r2.sqrt();
+                if r * omega.abs() < 1e-9 {
                     return p;
                 }
-                let theta = r.atan();
-                let t2 = theta * theta;
-                let theta_d = theta * (1.0 + t2 * (k[0] + t2 * (k[1] + t2 * (k[2] + t2 * k[3]))));
-                p * (theta_d / r)
+                p * ((2.0 * r * (0.5 * omega).tan()).atan() / (r * omega))
             }
         }
     }
 
-    /// The inverse of [`Lens::distort`] by Newton's method with a numeric Jacobian; `None` where it does not converge
-    /// (outside the region in which the model is invertible).
-    pub fn undistort(&self, distorted: DVec2) -> Option<DVec2> {
-        if *self == Lens::Pinhole {
-            return Some(distorted);
+    /// The inverse of [`Lens::bend`] by Newton's method with a numeric Jacobian; `None` where it does not converge.
+    fn unbend(&self, bent: DVec2) -> Option<DVec2> {
+        if matches!(self, Lens::Pinhole | Lens::Equirectangular) {
+            return Some(bent);
         }
-        let mut p = match self {
-            // A fisheye radius is an angle: its tangent is a far better initial guess than the angle itself.
-            Lens::Fisheye { .. } => {
-                let theta = distorted.length().min(1.5);
-                distorted * (theta.tan() / theta.max(1e-12))
-            }
-            _ => distorted,
-        };
+        let mut p = bent;
         const H: f64 = 1e-6;
         for _ in 0..50 {
-            let error = self.distort(p) - distorted;
+            let error = self.bend(p) - bent;
             if error.length() < 1e-10 {
                 return Some(p);
             }
-            let dx = (self.distort(p + DVec2::X * H) - self.distort(p - DVec2::X * H)) / (2.0 * H);
-            let dy = (self.distort(p + DVec2::Y * H) - self.distort(p - DVec2::Y * H)) / (2.0 * H);
+            let dx = (self.bend(p + DVec2::X * H) - self.bend(p - DVec2::X * H)) / (2.0 * H);
+            let dy = (self.bend(p + DVec2::Y * H) - self.bend(p - DVec2::Y * H)) / (2.0 * H);
             let det = dx.x * dy.y - dx.y * dy.x;
             if det.is_nan() || det <= 1e-9 {
                 return None;
@@ -89,22 +173,83 @@ impl Lens {
 mod tests {
     use super::*;
 
+    const LENSES: [Lens; 6] = [
+        Lens::Pinhole,
+        Lens::Opencv {
+            k: [0.0578, -0.0805, 0.01, 0.02, 0.0, 0.0],
+            p: [-0.00098, 0.00016],
+        },
+        Lens::fisheye([0.02, -0.01, 0.003, -0.0005]),
+        THIN_PRISM,
+        Lens::Fov { omega: 0.9 },
+        Lens::Equirectangular,
+    ];
+    const THIN_PRISM: Lens = Lens::Fisheye {
+        k: [0.02, -0.01, 0.003, -0.0005],
+        p: [0.001, -0.002],
+        s: [0.004, -0.003],
+    };
+
     #[test]
     fn undistort_inverts_distort() {
-        let lenses = [
-            Lens::Pinhole,
-            Lens::Opencv {
-                k: [0.0578, -0.0805, 0.01, 0.02, 0.0, 0.0],
-                p: [-0.00098, 0.00016],
-            },
-            Lens::Fisheye {
-                k: [0.02, -0.01, 0.003, -0.0005],
-            },
-        ];
-        for lens in lenses {
+        for lens in LENSES {
             for p in [DVec2::ZERO, DVec2::new(0.3, -0.2), DVec2::new(-0.5, 0.7)] {
                 let back = lens.undistort(lens.distort(p)).expect("converges");
                 assert!((back - p).length() < 1e-8, "{lens:?} {p} {back}");
+            }
+        }
+    }
+
+    #[test]
+    fn wide_lenses_see_behind_the_camera_and_others_do_not() {
+        let behind = DVec3::new(1.2, 0.4, -0.3);
+        for lens in LENSES {
+            assert_eq!(lens.project(behind).is_some(), lens.is_wide(), "{lens:?}");
+            if let Some(point) = lens.project(behind) {
+                let back = lens.direction(point).expect("converges");
+                assert!(back.normalize().distance(behind.normalize()) < 1e-8, "{lens:?} {back}");
+            }
+        }
+        assert_eq!(LENSES[2].project(DVec3::NEG_Z), None);
+    }
+
+    /// Pixels of focal lengths (100, 110) and principal point (200, 150), by COLMAP 4.2.1 (`pycolmap`, `Camera.img_from_cam`); for the panorama of
+    /// 400 x 300 pixels.
+    #[test]
+    fn points_are_where_colmap_has_them() {
+        let directions = [DVec3::new(0.3, -0.2, 1.0), DVec3::new(-0.9, 0.7, 0.6)];
+        let expected: [(Lens, [f64; 2], [[f64; 2]; 2]); 5] = [
+            (
+                Lens::fisheye([0.02, -0.01, 0.003, -0.0005]),
+                [100.0, 110.0],
+                [[228.85781962, 128.83759895], [113.07678809, 224.36763685]],
+            ),
+            (
+                THIN_PRISM,
+                [100.0, 110.0],
+                [[228.83755449, 128.84367849], [112.9042936, 224.45751556]],
+            ),
+            (
+                Lens::fisheye([0.0; 4]),
+                [100.0, 110.0],
+                [[228.79284507, 128.88524695], [114.24621077, 223.36713078]],
+            ),
+            (
+                Lens::Fov { omega: 0.9 },
+                [100.0, 110.0],
+                [[230.98847543, 127.27511802], [105.9762571, 230.44253559]],
+            ),
+            (
+                Lens::Equirectangular,
+                [200.0 / PI, 300.0 / PI],
+                [[218.55471582, 131.92583322], [137.43340836, 204.84822386]],
+            ),
+        ];
+        for (lens, focal, pixels) in expected {
+            for (direction, pixel) in directions.into_iter().zip(pixels) {
+                let at =
+                    lens.project(direction).expect("before the camera") * DVec2::from(focal) + DVec2::new(200.0, 150.0);
+                assert!(at.distance(pixel.into()) < 1e-7, "{lens:?} {at}");
             }
         }
     }

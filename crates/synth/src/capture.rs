@@ -1,10 +1,11 @@
 //! The views of a scene: cameras, frames, and points such as structure from motion produces.
 
 use crate::cameras::{Part, cameras};
+use crate::lens::SynthLens;
 use crate::scene::SynthScene;
 use crate::scenes::SceneName;
 use crate::shape::Ray;
-use crate::trace::SynthFrame;
+use crate::trace::{SynthFrame, pixel_ray};
 use glam::{Vec2, Vec3};
 use irradia_scene::{Camera, Dataset, Photo, PointCloud, Rng, View};
 use std::sync::Arc;
@@ -37,10 +38,13 @@ pub struct SynthOptions {
     /// Random seed of cameras, samples and points, and of layout and colours of all scenes but the demo: equal seeds give equal
     /// views.
     pub seed: u64,
+    /// The lens of the training and validation views. Held-out views are always by a pinhole, so that lenses can be compared, and of a size at
+    /// which they have as many pixels an angle.
+    pub lens: SynthLens,
 }
 
 impl Default for SynthOptions {
-    /// The demo scene, 40 views of 256 x 256, seed 0.
+    /// The demo scene, 40 views of 256 x 256 by a pinhole, seed 0.
     fn default() -> Self {
         Self {
             scene: SceneName::Demo,
@@ -48,6 +52,7 @@ impl Default for SynthOptions {
             width: 256,
             height: 256,
             seed: 0,
+            lens: SynthLens::Pinhole,
         }
     }
 }
@@ -104,6 +109,7 @@ impl Capture {
             width,
             height,
             seed,
+            lens,
         } = *options;
         if !(3..=1000).contains(&views) {
             return Err(SynthError::Views(views));
@@ -115,7 +121,12 @@ impl Capture {
         let mut shots: Vec<Shot> = Vec::new();
         for part in Part::ALL {
             let cameras = cameras(&rig, part, Self::count(views, part), width, height, seed);
-            for (number, camera) in (0..).zip(cameras) {
+            for (number, mut camera) in (0..).zip(cameras) {
+                let wide = lens.intrinsics(camera.intrinsics);
+                camera.intrinsics = match part {
+                    Part::Train | Part::Val => wide,
+                    Part::Test => camera.intrinsics.scaled(wide.fx / camera.intrinsics.fx),
+                };
                 let seed = seed.wrapping_mul(1_000_003).wrapping_add(shots.len() as u64);
                 shots.push(Shot {
                     part,
@@ -188,11 +199,8 @@ impl Capture {
                 (low, high) = (low.min(green), high.max(green));
             }
         }
-        let ray = Ray {
-            origin: camera.pose.position,
-            direction: camera.ray_direction(Vec2::new(x as f32 + 0.5, y as f32 + 0.5)),
-        };
-        let hit = self.scene.hit(&ray, camera.near);
+        let ray = pixel_ray(camera, Vec2::new(x as f32 + 0.5, y as f32 + 0.5));
+        let hit = ray.and_then(|ray| self.scene.hit(&ray, camera.near));
         frame.depth.pixel(x, y)[0] < FAR
             && high - low >= CONTRAST
             && hit.is_some_and(|hit| !hit.object.material.texture.is_emissive())
@@ -241,9 +249,15 @@ pub fn dataset(options: &SynthOptions) -> Result<Dataset, SynthError> {
 
 /// Adds the surface point under a pixel, with noise.
 fn add_point(points: &mut PointCloud, camera: &Camera, frame: &SynthFrame, [x, y]: [u32; 2], rng: &mut Rng) {
-    let direction = camera.ray_direction(Vec2::new(x as f32 + 0.5, y as f32 + 0.5));
+    let Some(Ray { direction, .. }) = pixel_ray(camera, Vec2::new(x as f32 + 0.5, y as f32 + 0.5)) else {
+        return;
+    };
     let depth = frame.depth.pixel(x, y)[0];
-    let distance = depth / direction.dot(camera.pose.rotation * Vec3::Z);
+    let distance = if camera.intrinsics.lens.is_wide() {
+        depth
+    } else {
+        depth / direction.dot(camera.pose.rotation * Vec3::Z)
+    };
     let error = Vec3::new(rng.normal(), rng.normal(), rng.normal()) * (POINT_ERROR * distance);
     points
         .positions
@@ -262,6 +276,7 @@ mod tests {
         width: 32,
         height: 32,
         seed: 5,
+        lens: SynthLens::Pinhole,
     };
 
     #[test]

@@ -23,6 +23,7 @@
 mod ambient;
 mod cameras;
 mod capture;
+mod lens;
 mod scene;
 mod scenes;
 mod shape;
@@ -32,6 +33,7 @@ mod trace;
 
 pub use cameras::{Part, Path, Rig};
 pub use capture::{Capture, Shot, SynthError, SynthOptions, dataset};
+pub use lens::{SynthLens, UnknownLens};
 pub use scene::{Cluster, Hit, Light, Material, Object, SynthScene, demo_scene};
 pub use scenes::{SceneName, UnknownScene};
 pub use shape::{Ray, Shape};

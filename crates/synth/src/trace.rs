@@ -2,6 +2,7 @@
 //! is analytic (`ambient`), since sampling it would dominate the noise.
 
 use crate::ambient;
+use crate::lens::direction;
 use crate::scene::{Hit, SynthScene};
 use crate::shape::Ray;
 use crate::sky;
@@ -27,7 +28,7 @@ const EXPOSURE: f32 = 0.46;
 pub struct SynthFrame {
     /// `[H, W, 3]` sRGB in \[0, 1\].
     pub color: Image,
-    /// Depth along the camera's +Z of the first hit through each pixel centre, `[H, W]`, world units.
+    /// Depth along the camera's +Z of the first hit through each pixel centre, `[H, W]`, world units; the distance where the lens is wide.
     pub depth: Image,
     /// Unit normals at the same points, facing the camera, `[H, W, 3]` world.
     pub normals: Image,
@@ -69,9 +70,12 @@ impl SynthScene {
                     let mut rng = Rng::new(seed, (y * row + x) as u64);
                     let corner = Vec2::new(x as f32, y as f32);
                     color[3 * x..3 * x + 3].copy_from_slice(&self.pixel(camera, corner, side, &mut rng).to_array());
-                    let ray = pixel_ray(camera, corner + 0.5);
+                    let Some(ray) = pixel_ray(camera, corner + 0.5) else {
+                        continue;
+                    };
                     if let Some(hit) = self.hit(&ray, camera.near) {
-                        depth[x] = hit.t * ray.direction.dot(forward);
+                        let is_wide = camera.intrinsics.lens.is_wide();
+                        depth[x] = hit.t * if is_wide { 1.0 } else { ray.direction.dot(forward) };
                         normals[3 * x..3 * x + 3].copy_from_slice(&hit.normal.to_array());
                     }
                 }
@@ -106,9 +110,10 @@ impl SynthScene {
             };
             let ray = pixel_ray(camera, corner + 0.5 + within(sample).map(tent) * FILTER);
             let [sun, mirror] = std::array::from_fn(|plane| within(strata[plane][sample as usize]));
-            let radiance = match self.hit(&ray, camera.near) {
-                Some(hit) => self.shade(&ray, &hit, sun, mirror),
-                None => sky::radiance(ray.direction),
+            let radiance = match ray.map(|ray| (ray, self.hit(&ray, camera.near))) {
+                Some((ray, Some(hit))) => self.shade(&ray, &hit, sun, mirror),
+                Some((ray, None)) => sky::radiance(ray.direction),
+                None => Vec3::ZERO,
             };
             let radiance = radiance.min(Vec3::splat(BRIGHTEST));
             sum += radiance;
@@ -197,12 +202,12 @@ impl SynthScene {
     }
 }
 
-/// The ray through pixel coordinates.
-fn pixel_ray(camera: &Camera, pixel: Vec2) -> Ray {
-    Ray {
+/// The ray through pixel coordinates; `None` outside the image circle of a fisheye.
+pub(crate) fn pixel_ray(camera: &Camera, pixel: Vec2) -> Option<Ray> {
+    Some(Ray {
         origin: camera.pose.position,
-        direction: camera.ray_direction(pixel),
-    }
+        direction: camera.pose.rotation * direction(&camera.intrinsics, pixel)?,
+    })
 }
 
 /// An area-preserving polar map from the unit square to the unit disc (cf. Shirley and Chiu 1997).
@@ -270,7 +275,7 @@ mod tests {
         for y in 0..48 {
             for x in 0..48 {
                 let pixel = Vec2::new(x as f32 + 0.5, y as f32 + 0.5);
-                let ray = pixel_ray(&camera, pixel);
+                let ray = pixel_ray(&camera, pixel).expect("a pinhole has all rays");
                 let hit = scene.hit(&ray, camera.near).expect("the backdrop closes the scene");
                 let (at, depth) = camera.project(hit.point).expect("in front");
                 assert!((at - pixel).length() < 1e-2, "{x} {y}");

@@ -1,23 +1,28 @@
 //! From declarations to a dataset: reads image headers, skips unusable views, adapts cameras to the actual image sizes,
-//! undistorts and downscales them.
+//! undistorts them or cuts them into faces, and downscales them.
 
 use super::declared::{Declared, DeclaredView};
 use super::split;
 use super::world::world_from_dataset;
 use super::{DEFAULT_MAX_SIDE, DatasetOptions};
 use crate::FormatError;
+use crate::faces::{Cut, image_circle};
 use crate::image_file::{Header, read_header};
 use crate::photo::PhotoFile;
 use crate::undistort::Undistortion;
+use glam::DQuat;
 use image::metadata::Orientation;
-use irradia_scene::{Camera, Dataset, Intrinsics, Lens, Similarity, View};
+use irradia_scene::{Camera, Dataset, Intrinsics, Lens, PointCloud, Similarity, View};
 use rayon::prelude::*;
+use std::path::Path;
 use std::sync::Arc;
 
 /// Minimum number of views of a scene.
 const MIN_VIEWS: usize = 3;
 /// Maximum number of names in a warning.
 const MAX_NAMES: usize = 20;
+/// Photographs of a camera in which its image circle is searched.
+const CIRCLE_SAMPLES: usize = 4;
 
 /// Why a view was skipped; each reason is one warning.
 #[derive(Clone, Copy, PartialEq, Eq)]
@@ -47,14 +52,26 @@ struct Probed {
     jpeg: bool,
     /// At the actual size of the upright image, lens included.
     source: Intrinsics,
-    /// Set for distorted cameras by [`plan_undistortion`].
-    undistortion: Option<Undistortion>,
+    /// Set for distorted cameras by [`plan_cuts`].
+    cut: Option<Cut>,
 }
 
 impl Probed {
-    /// The undistorted camera of the photograph, at its actual size.
+    /// The undistorted camera of the photograph at its actual size, or that of its largest face.
     fn undistorted(&self) -> Intrinsics {
-        self.undistortion.map_or(self.source, |plan| plan.pinhole())
+        match &self.cut {
+            None => self.source,
+            Some(Cut::Whole(plan)) => plan.pinhole(),
+            Some(Cut::Faces(faces)) => {
+                let cameras = faces.iter().map(|(_, plan)| plan.pinhole());
+                let largest = cameras.max_by_key(|k| u64::from(k.width) * u64::from(k.height));
+                largest.expect("a cut has faces")
+            }
+        }
+    }
+
+    fn is_cut_into_faces(&self) -> bool {
+        matches!(self.cut, Some(Cut::Faces(_)))
     }
 }
 
@@ -72,7 +89,7 @@ pub(super) fn assemble(declared: Declared, options: &DatasetOptions) -> Result<D
     let named = views.len();
 
     let mut probed: Vec<Result<Probed, Skipped>> = views.par_iter().map(|view| probe(view, ignores_exif)).collect();
-    plan_undistortion(&mut probed);
+    plan_cuts(&views, &mut probed);
     let reasons = skipped_warnings(&views, &probed);
     let usable: Vec<(DeclaredView, Probed)> = views
         .into_iter()
@@ -109,17 +126,30 @@ pub(super) fn assemble(declared: Declared, options: &DatasetOptions) -> Result<D
         .filter_map(|(view, _)| Some(view.pose?.position))
         .collect();
     let world = world_from_dataset(&positions);
-    let views = usable
-        .into_iter()
-        .filter_map(|(view, probed)| finish(view, &probed, downscale, max_side, &world))
-        .collect();
+    let points = points
+        .map(|points| points.in_world(&world))
+        .filter(|points| !points.is_empty());
+    warnings.extend(faces_warning(&usable));
+    let finishing = Finishing {
+        downscale,
+        max_side,
+        world_from_dataset: &world,
+        points: points.as_ref(),
+    };
+    // Photograph by photograph, so that the faces of one are held out together.
+    let mut views = Vec::with_capacity(usable.len());
+    let mut views_of = Vec::with_capacity(usable.len());
+    for (view, probed) in usable {
+        let first = views.len();
+        views.extend(finishing.views(view, &probed));
+        views_of.push(first..views.len());
+    }
+    let views_of = |photographs: Vec<usize>| photographs.into_iter().flat_map(|i| views_of[i].clone()).collect();
     Ok(Dataset {
         views,
-        train: indices.train,
-        test: indices.test,
-        points: points
-            .map(|points| points.in_world(&world))
-            .filter(|points| !points.is_empty()),
+        train: views_of(indices.train),
+        test: views_of(indices.test),
+        points,
         world_from_dataset: world,
         kind: kind.to_owned(),
         warnings,
@@ -135,39 +165,49 @@ fn probe(view: &DeclaredView, ignores_exif: bool) -> Result<Probed, Skipped> {
     let orientation = orientation_to_apply(&header, view.camera.size, ignores_exif);
     let (width, height) = oriented_size(&header, orientation);
     let source = view.camera.at_size(width, height);
-    if !source.is_valid() || !lens_is_finite(&source.lens) {
+    if !source.is_valid() || !source.lens.is_finite() {
         return Err(Skipped::NoCamera);
     }
     Ok(Probed {
         orientation,
         jpeg: header.jpeg,
         source,
-        undistortion: None,
+        cut: None,
     })
 }
 
-fn lens_is_finite(lens: &Lens) -> bool {
-    match lens {
-        Lens::Pinhole => true,
-        Lens::Opencv { k, p } => k.iter().chain(p).all(|v| v.is_finite()),
-        Lens::Fisheye { k } => k.iter().all(|v| v.is_finite()),
-    }
-}
-
-/// Plans the undistortion of every distinct distorted camera once, for all views that share it.
-fn plan_undistortion(probed: &mut [Result<Probed, Skipped>]) {
+/// Plans the pinhole images of every distinct distorted camera once, for all views that share it.
+fn plan_cuts(views: &[DeclaredView], probed: &mut [Result<Probed, Skipped>]) {
     let mut distinct: Vec<Intrinsics> = Vec::new();
     for view in probed.iter().flatten() {
         if view.source.lens != Lens::Pinhole && !distinct.contains(&view.source) {
             distinct.push(view.source);
         }
     }
-    let plans: Vec<Option<Undistortion>> = distinct.par_iter().map(Undistortion::plan).collect();
+    let circle = |source: &Intrinsics| {
+        let mut photographs: Vec<(&Path, Orientation)> = Vec::new();
+        for (view, probed) in views.iter().zip(probed.iter()) {
+            if let (Some(image), Ok(probed)) = (&view.image, probed)
+                && probed.source == *source
+            {
+                photographs.push((image, probed.orientation));
+            }
+        }
+        let every = photographs.len().div_ceil(CIRCLE_SAMPLES).max(1);
+        // A photograph that cannot be decoded is reported where it is loaded.
+        image_circle(source, photographs.into_iter().step_by(every))
+            .ok()
+            .flatten()
+    };
+    let plans: Vec<Option<Cut>> = distinct
+        .par_iter()
+        .map(|source| Cut::plan(source, || circle(source)))
+        .collect();
     for view in probed {
         let Ok(known) = view else { continue };
         if let Some(camera) = distinct.iter().position(|source| *source == known.source) {
-            match plans[camera] {
-                Some(plan) => known.undistortion = Some(plan),
+            match &plans[camera] {
+                Some(plan) => known.cut = Some(plan.clone()),
                 None => *view = Err(Skipped::NoCamera),
             }
         }
@@ -195,36 +235,84 @@ fn scaled_warning(usable: &[(DeclaredView, Probed)]) -> Option<String> {
     ))
 }
 
-fn finish(
-    view: DeclaredView,
-    probed: &Probed,
+/// The warning about photographs that are cut into faces.
+fn faces_warning(usable: &[(DeclaredView, Probed)]) -> Option<String> {
+    let cut = usable.iter().filter(|(_, probed)| probed.is_cut_into_faces()).count();
+    (cut > 0).then(|| {
+        format!(
+            "{cut} of {} photographs show more than one pinhole image can: each is cut into the faces of a cube, which are views of their \
+             own, such as NAME/front",
+            usable.len()
+        )
+    })
+}
+
+/// What turns a declared view into views.
+struct Finishing<'a> {
     downscale: f32,
     max_side: Option<u32>,
-    world_from_dataset: &Similarity,
-) -> Option<View> {
-    let undistorted = probed.undistorted();
-    let longer = undistorted.width.max(undistorted.height) as f32;
-    let smaller = max_side.map_or(downscale, |side| downscale.max(longer / side as f32));
-    let intrinsics = undistorted.scaled(1.0 / smaller);
-    let photo = PhotoFile {
-        image: view.image?,
-        mask: view.mask,
-        orientation: probed.orientation,
-        jpeg: probed.jpeg,
-        upright: (probed.source.width, probed.source.height),
-        undistortion: probed.undistortion,
-        size: (intrinsics.width, intrinsics.height),
-    };
-    Some(View {
-        name: view.name,
-        camera: Camera::new(view.pose?.in_world(world_from_dataset), intrinsics),
-        photo: Arc::new(photo),
-        depth_bounds: view
-            .depth_bounds
-            .and_then(|bounds| usable_bounds(bounds.map(|depth| depth * world_from_dataset.scale))),
-        time: view.time,
-        points_seen: view.points_seen,
-    })
+    world_from_dataset: &'a Similarity,
+    points: Option<&'a PointCloud>,
+}
+
+impl Finishing<'_> {
+    /// The view of a photograph, or one for each of its faces.
+    fn views(&self, view: DeclaredView, probed: &Probed) -> Vec<View> {
+        match &probed.cut {
+            None => self.view(&view, probed, None).into_iter().collect(),
+            Some(Cut::Whole(plan)) => self.view(&view, probed, Some(*plan)).into_iter().collect(),
+            Some(Cut::Faces(faces)) => faces
+                .iter()
+                .filter_map(|(name, plan)| {
+                    let mut face = self.view(&view, probed, Some(*plan))?;
+                    face.name = format!("{}/{name}", view.name);
+                    // Depths are along the axis of the photograph, not of the face.
+                    face.depth_bounds = None;
+                    face.points_seen.retain(|point| self.is_seen(&face.camera, *point));
+                    Some(face)
+                })
+                .collect(),
+        }
+    }
+
+    fn is_seen(&self, camera: &Camera, point: u32) -> bool {
+        let position = self.points.and_then(|points| points.positions.get(point as usize));
+        let k = &camera.intrinsics;
+        position
+            .and_then(|p| camera.project(*p))
+            .is_some_and(|(at, _)| (0.0..k.width as f32).contains(&at.x) && (0.0..k.height as f32).contains(&at.y))
+    }
+
+    /// The view of a photograph undistorted by `plan`.
+    fn view(&self, view: &DeclaredView, probed: &Probed, plan: Option<Undistortion>) -> Option<View> {
+        let undistorted = plan.map_or(probed.source, |plan| plan.pinhole());
+        let longer = undistorted.width.max(undistorted.height) as f32;
+        let smaller = self
+            .max_side
+            .map_or(self.downscale, |side| self.downscale.max(longer / side as f32));
+        let intrinsics = undistorted.scaled(1.0 / smaller);
+        let photo = PhotoFile {
+            image: view.image.clone()?,
+            mask: view.mask.clone(),
+            orientation: probed.orientation,
+            jpeg: probed.jpeg,
+            upright: (probed.source.width, probed.source.height),
+            undistortion: plan,
+            size: (intrinsics.width, intrinsics.height),
+        };
+        let mut pose = view.pose?;
+        pose.rotation *= plan.map_or(DQuat::IDENTITY, |plan| plan.turn());
+        Some(View {
+            name: view.name.clone(),
+            camera: Camera::new(pose.in_world(self.world_from_dataset), intrinsics),
+            photo: Arc::new(photo),
+            depth_bounds: view
+                .depth_bounds
+                .and_then(|bounds| usable_bounds(bounds.map(|depth| depth * self.world_from_dataset.scale))),
+            time: view.time,
+            points_seen: view.points_seen.clone(),
+        })
+    }
 }
 
 /// See [`super::read_dataset`] for the rule.

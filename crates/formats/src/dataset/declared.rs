@@ -3,6 +3,7 @@
 use super::files::relative_name;
 use glam::{DMat3, DQuat, DVec3};
 use irradia_scene::{Intrinsics, Lens, PointCloud, Pose, Similarity};
+use std::f64::consts::{PI, TAU};
 use std::path::{Path, PathBuf};
 
 pub(super) struct Declared {
@@ -141,9 +142,21 @@ pub(super) enum Focal {
     Pixels([f64; 2]),
     /// Horizontal and vertical field of view, radians; square pixels if one is `None`.
     Angles([Option<f64>; 2]),
+    /// That of a panorama, a whole turn wide and half a turn high.
+    Panorama,
 }
 
 impl DeclaredCamera {
+    /// That of equirectangular panoramas.
+    pub fn panorama() -> Self {
+        Self {
+            size: None,
+            focal: Focal::Panorama,
+            center: None,
+            lens: Lens::Equirectangular,
+        }
+    }
+
     /// The camera of an image file of `width` x `height` pixels.
     pub fn at_size(&self, width: u32, height: u32) -> Intrinsics {
         let real = [f64::from(width), f64::from(height)];
@@ -151,6 +164,7 @@ impl DeclaredCamera {
         let from_angle = |side: usize, angle: f64| 0.5 * declared[side] / (0.5 * angle).tan();
         let focal = match self.focal {
             Focal::Pixels(focal) => focal,
+            Focal::Panorama => [declared[0] / TAU, declared[1] / PI],
             Focal::Angles([Some(x), Some(y)]) => [from_angle(0, x), from_angle(1, y)],
             Focal::Angles([Some(x), None]) => [from_angle(0, x); 2],
             Focal::Angles([None, y]) => [from_angle(1, y.unwrap_or(f64::NAN)); 2],
@@ -174,8 +188,9 @@ pub(super) fn lens_or_pinhole(lens: Lens) -> Lens {
     let bends = match lens {
         Lens::Pinhole => false,
         Lens::Opencv { k, p } => k.iter().chain(&p).any(|v| *v != 0.0),
+        Lens::Fov { omega } => omega != 0.0,
         // The fisheye model distorts even with zeros.
-        Lens::Fisheye { .. } => true,
+        Lens::Fisheye { .. } | Lens::Equirectangular => true,
     };
     if bends { lens } else { Lens::Pinhole }
 }

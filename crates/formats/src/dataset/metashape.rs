@@ -68,8 +68,10 @@ pub(crate) fn parse_metashape(bytes: &[u8]) -> Result<Vec<MetashapeCamera>, Malf
     let chunk = document.child("chunk").ok_or_else(|| missing("chunk"))?;
     let mut sensors = HashMap::new();
     for sensor in chunk.descendants("sensor") {
-        // A sensor that took no aligned photograph has no calibration.
-        if let (Some(id), Some(calibration)) = (sensor.attribute("id"), calibration(sensor)) {
+        // A panorama needs no calibration, and a sensor that took no aligned photograph has none.
+        if let (Some(id), Some("spherical")) = (sensor.attribute("id"), sensor.attribute("type")) {
+            sensors.insert(id, DeclaredCamera::panorama());
+        } else if let (Some(id), Some(calibration)) = (sensor.attribute("id"), calibration(sensor)) {
             sensors.insert(id, intrinsics(sensor, calibration)?);
         }
     }
@@ -172,9 +174,7 @@ fn intrinsics(sensor: &Element, calibration: &Element) -> Result<DeclaredCamera,
                 "a sensor has a k4, which is not supported; optimise the cameras without it, or undistort the photographs".into(),
             ));
         }
-        "fisheye" | "equidistant_fisheye" => Lens::Fisheye {
-            k: [of("k1"), of("k2"), of("k3"), of("k4")],
-        },
+        "fisheye" | "equidistant_fisheye" => Lens::fisheye([of("k1"), of("k2"), of("k3"), of("k4")]),
         other => {
             return Err(Malformed(format!(
                 "the sensor type `{other}` is not supported; undistort the photographs as frame cameras"

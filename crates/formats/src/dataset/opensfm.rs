@@ -149,6 +149,9 @@ fn pose(shot: &Shot) -> Option<DeclaredPose> {
 }
 
 fn declared_camera(camera: &Camera) -> Result<DeclaredCamera, Malformed> {
+    if matches!(camera.projection_type.as_str(), "spherical" | "equirectangular") {
+        return Ok(DeclaredCamera::panorama());
+    }
     let Camera {
         k1, k2, k3, k4, p1, p2, ..
     } = *camera;
@@ -161,10 +164,10 @@ fn declared_camera(camera: &Camera) -> Result<DeclaredCamera, Malformed> {
             k: [k1, k2, k3, 0.0, 0.0, 0.0],
             p: [p1, p2],
         },
-        "fisheye" | "fisheye_opencv" => Lens::Fisheye { k: [k1, k2, k3, k4] },
+        "fisheye" | "fisheye_opencv" => Lens::fisheye([k1, k2, k3, k4]),
         other => {
             return Err(Malformed(format!(
-                "the projection type `{other}` is not supported; use perspective, brown or fisheye, or undistort the photographs"
+                "the projection type `{other}` is not supported; use perspective, brown, fisheye or spherical, or undistort the photographs"
             )));
         }
     };

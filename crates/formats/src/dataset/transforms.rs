@@ -143,6 +143,9 @@ impl CameraKeys {
     /// others, nerfstudio's files have it as a fourth radial coefficient that nerfstudio's undistortion rejects unless it is
     /// zero, and so does this.
     pub(super) fn camera(&self) -> Result<DeclaredCamera, Malformed> {
+        if self.camera_model.as_deref() == Some("EQUIRECTANGULAR") {
+            return Ok(DeclaredCamera::panorama());
+        }
         let focal = match (self.fl_x, self.fl_y) {
             (Some(x), y) => Focal::Pixels([x, y.unwrap_or(x)]),
             (None, Some(y)) => Focal::Pixels([y, y]),
@@ -164,7 +167,7 @@ impl CameraKeys {
             (_, model) => model.unwrap_or("OPENCV"),
         };
         let lens = match model {
-            "OPENCV_FISHEYE" => Lens::Fisheye { k },
+            "OPENCV_FISHEYE" => Lens::fisheye(k),
             "OPENCV" | "PINHOLE" | "SIMPLE_PINHOLE" | "SIMPLE_RADIAL" | "RADIAL" | "PERSPECTIVE" => {
                 if k[3] != 0.0 {
                     return Err(Malformed(format!(
@@ -180,7 +183,7 @@ impl CameraKeys {
             }
             other => {
                 return Err(Malformed(format!(
-                    "the camera model {other} is not supported; use PINHOLE, OPENCV or OPENCV_FISHEYE"
+                    "the camera model {other} is not supported; use PINHOLE, OPENCV, OPENCV_FISHEYE or EQUIRECTANGULAR"
                 )));
             }
         };
@@ -244,10 +247,17 @@ mod tests {
         assert!(error.contains("fl_x") && error.contains("camera_angle_x"), "{error}");
         let keys = CameraKeys {
             fl_x: Some(1.0),
+            camera_model: Some("ORTHOPHOTO".into()),
+            ..Default::default()
+        };
+        assert!(keys.camera().unwrap_err().to_string().contains("ORTHOPHOTO"));
+        let panorama = CameraKeys {
             camera_model: Some("EQUIRECTANGULAR".into()),
             ..Default::default()
         };
-        assert!(keys.camera().unwrap_err().to_string().contains("EQUIRECTANGULAR"));
+        let k = panorama.camera().unwrap().at_size(200, 100);
+        assert_eq!((k.lens, k.cx, k.cy), (Lens::Equirectangular, 100.0, 50.0));
+        assert!((k.fx - k.fy).abs() < 1e-5 && (k.fx - 100.0 / std::f32::consts::PI).abs() < 1e-4);
         let keys = CameraKeys {
             fl_x: Some(1.0),
             k4: Some(0.1),
@@ -258,12 +268,7 @@ mod tests {
             is_fisheye: Some(true),
             ..keys
         };
-        assert_eq!(
-            fisheye.camera().unwrap().lens,
-            Lens::Fisheye {
-                k: [0.0, 0.0, 0.0, 0.1]
-            }
-        );
+        assert_eq!(fisheye.camera().unwrap().lens, Lens::fisheye([0.0, 0.0, 0.0, 0.1]));
         let error = parse_transforms(br#"{"frames": [{"transform_matrix": []}]}"#)
             .unwrap_err()
             .to_string();

@@ -5,7 +5,7 @@ use super::render::parse_size;
 use super::{thread_count, train, use_threads};
 use crate::terminal::{note, say};
 use anyhow::Result;
-use irradia_runs::synth::{SceneName, SynthOptions};
+use irradia_runs::synth::{SceneName, SynthLens, SynthOptions};
 use irradia_runs::{TrainInput, write_synth_dataset};
 use std::path::PathBuf;
 use std::time::Instant;
@@ -45,6 +45,9 @@ pub struct SynthArgs {
     /// Scene: demo, room, shelf, outdoor or thin
     #[arg(long, value_name = "NAME", default_value_t = SceneName::Demo)]
     pub scene: SceneName,
+    /// Lens of the photographs to train on: pinhole, fisheye or equirectangular; held-out views are by a pinhole
+    #[arg(long, value_name = "NAME", default_value_t = SynthLens::Pinhole)]
+    pub lens: SynthLens,
 }
 
 pub fn run(args: &Args) -> Result<()> {
@@ -87,6 +90,7 @@ pub fn synth(args: &SynthArgs) -> Result<()> {
         width: args.size.0,
         height: args.size.1,
         seed: args.seed,
+        lens: args.lens,
     };
     let summary = write_synth_dataset(&args.out, &options)?;
     say(format_args!("{}: {summary}", args.out.display()))

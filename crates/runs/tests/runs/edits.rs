@@ -6,7 +6,7 @@ use irradia_edit::EditList;
 use irradia_runs::formats::{WriteOptions, read_splats, write_splats};
 use irradia_runs::prelude::*;
 use irradia_runs::scene::{GaussianCloud, Rng, sh};
-use irradia_runs::synth::{SceneName, dataset as traced};
+use irradia_runs::synth::{SceneName, SynthLens, dataset as traced};
 use irradia_runs::train::eval::{EvalOptions, Metrics};
 use irradia_runs::train::event::{Event, Observer, Signal};
 use irradia_runs::train::half_fit::HalfFit;
@@ -201,6 +201,7 @@ fn floaters_planted_in_a_trained_scene_are_removed() {
         width: 96,
         height: 72,
         seed: 2,
+        lens: SynthLens::Pinhole,
     };
     let data = traced(&options).expect("options");
     let request = input(folder.path(), "run", 300).check().expect("a request");

@@ -10,6 +10,7 @@ mod requests;
 mod scenes;
 mod snapshots;
 mod watched;
+mod wide;
 mod world;
 
 use irradia_runs::prelude::*;
@@ -23,6 +24,7 @@ const SMALL: SynthOptions = SynthOptions {
     width: 24,
     height: 16,
     seed: 1,
+    lens: irradia_runs::synth::SynthLens::Pinhole,
 };
 
 fn folder() -> TempDir {

@@ -18,6 +18,7 @@ const OPTIONS: SynthOptions = SynthOptions {
     width: 320,
     height: 240,
     seed: 3,
+    lens: irradia_runs::synth::SynthLens::Pinhole,
 };
 
 /// The training photographs of a ray-traced scene, and their true cameras by name.

@@ -136,6 +136,7 @@ mod tests {
             width: 40,
             height: 30,
             seed,
+            ..SynthOptions::default()
         }
     }
 

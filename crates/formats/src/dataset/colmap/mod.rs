@@ -13,6 +13,7 @@ use crate::{FormatError, Malformed};
 use glam::{DQuat, DVec3};
 use irradia_scene::Lens;
 use std::collections::HashMap;
+use std::f64::consts::{PI, TAU};
 use std::path::{Path, PathBuf};
 pub use write::{ColmapModel, PosedImage, TrackedPoint, write_colmap};
 
@@ -58,7 +59,7 @@ pub struct ColmapPoint {
 }
 
 /// The models by COLMAP's number, with their names and numbers of parameters (`models.h` of COLMAP).
-const MODELS: [(&str, usize); 11] = [
+const MODELS: [(&str, usize); 18] = [
     ("SIMPLE_PINHOLE", 3),
     ("PINHOLE", 4),
     ("SIMPLE_RADIAL", 4),
@@ -70,6 +71,13 @@ const MODELS: [(&str, usize); 11] = [
     ("SIMPLE_RADIAL_FISHEYE", 4),
     ("RADIAL_FISHEYE", 5),
     ("THIN_PRISM_FISHEYE", 12),
+    ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
+    ("SIMPLE_DIVISION", 4),
+    ("DIVISION", 5),
+    ("SIMPLE_FISHEYE", 3),
+    ("FISHEYE", 4),
+    ("EUCM", 6),
+    ("EQUIRECTANGULAR", 2),
 ];
 
 /// Models of one folder that are looked at.
@@ -271,11 +279,21 @@ fn intrinsics(camera: &ColmapCamera) -> Result<([f64; 2], [f64; 2], Lens), Malfo
         ("FULL_OPENCV", &[fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6]) => {
             ([fx, fy], [cx, cy], opencv([k1, k2, k3, k4, k5, k6], [p1, p2]))
         }
-        ("OPENCV_FISHEYE", &[fx, fy, cx, cy, k1, k2, k3, k4]) => {
-            ([fx, fy], [cx, cy], Lens::Fisheye { k: [k1, k2, k3, k4] })
+        ("OPENCV_FISHEYE", &[fx, fy, cx, cy, k1, k2, k3, k4]) => ([fx, fy], [cx, cy], Lens::fisheye([k1, k2, k3, k4])),
+        ("SIMPLE_FISHEYE", &[f, cx, cy]) => ([f, f], [cx, cy], Lens::fisheye([0.0; 4])),
+        ("FISHEYE", &[fx, fy, cx, cy]) => ([fx, fy], [cx, cy], Lens::fisheye([0.0; 4])),
+        ("SIMPLE_RADIAL_FISHEYE", &[f, cx, cy, k1]) => ([f, f], [cx, cy], Lens::fisheye([k1, 0.0, 0.0, 0.0])),
+        ("RADIAL_FISHEYE", &[f, cx, cy, k1, k2]) => ([f, f], [cx, cy], Lens::fisheye([k1, k2, 0.0, 0.0])),
+        ("THIN_PRISM_FISHEYE", &[fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, sx1, sy1]) => {
+            let lens = Lens::Fisheye {
+                k: [k1, k2, k3, k4],
+                p: [p1, p2],
+                s: [sx1, sy1],
+            };
+            ([fx, fy], [cx, cy], lens)
         }
-        ("SIMPLE_RADIAL_FISHEYE", &[f, cx, cy, k1]) => ([f, f], [cx, cy], Lens::Fisheye { k: [k1, 0.0, 0.0, 0.0] }),
-        ("RADIAL_FISHEYE", &[f, cx, cy, k1, k2]) => ([f, f], [cx, cy], Lens::Fisheye { k: [k1, k2, 0.0, 0.0] }),
+        ("FOV", &[fx, fy, cx, cy, omega]) => ([fx, fy], [cx, cy], Lens::Fov { omega }),
+        ("EQUIRECTANGULAR", &[w, h]) => ([w / TAU, h / PI], [0.5 * w, 0.5 * h], Lens::Equirectangular),
         (model, params) => {
             let count = MODELS.iter().find(|(name, _)| *name == model).map(|(_, count)| *count);
             return Err(Malformed(match count {
@@ -363,12 +381,7 @@ mod tests {
             }
         );
         let fisheye = camera("OPENCV_FISHEYE", &numbers[..8]).unwrap();
-        assert_eq!(
-            fisheye.lens,
-            Lens::Fisheye {
-                k: [5.0, 6.0, 7.0, 8.0]
-            }
-        );
+        assert_eq!(fisheye.lens, Lens::fisheye([5.0, 6.0, 7.0, 8.0]));
         let radial = camera("RADIAL", &numbers[..5]).unwrap();
         assert_eq!(
             (radial.focal, radial.center),
@@ -386,17 +399,29 @@ mod tests {
             Lens::Pinhole
         );
         assert_eq!(
-            camera("RADIAL_FISHEYE", &numbers[..5]).unwrap().lens,
+            camera("THIN_PRISM_FISHEYE", &numbers).unwrap().lens,
             Lens::Fisheye {
-                k: [4.0, 5.0, 0.0, 0.0]
+                k: [5.0, 6.0, 9.0, 10.0],
+                p: [7.0, 8.0],
+                s: [11.0, 12.0]
             }
+        );
+        let panorama = camera("EQUIRECTANGULAR", &[100.0, 80.0]).unwrap();
+        assert_eq!(panorama.lens, Lens::Equirectangular);
+        assert_eq!(
+            (panorama.focal, panorama.center),
+            (Focal::Pixels([100.0 / TAU, 80.0 / PI]), Some([50.0, 40.0]))
+        );
+        assert_eq!(
+            camera("RADIAL_FISHEYE", &numbers[..5]).unwrap().lens,
+            Lens::fisheye([4.0, 5.0, 0.0, 0.0])
         );
     }
 
     #[test]
     fn unknown_models_and_wrong_counts_are_named() {
-        let error = camera("FOV", &[1.0; 5]).unwrap_err().to_string();
-        assert!(error.contains("FOV") && error.contains("image_undistorter"), "{error}");
+        let error = camera("EUCM", &[1.0; 6]).unwrap_err().to_string();
+        assert!(error.contains("EUCM") && error.contains("image_undistorter"), "{error}");
         let error = camera("PINHOLE", &[1.0; 3]).unwrap_err().to_string();
         assert!(error.contains("has 3 parameters, not 4"), "{error}");
     }

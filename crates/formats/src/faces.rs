@@ -1,0 +1,331 @@
+//! Wide lenses: photographs that one pinhole image cannot show become several, the faces of a cube around the camera.
+//!
+//! A pinhole of 90 degrees stretches its borders to twice the size of its centre, one of 150 degrees to fifteen times, and beyond 180 there is none. Faces show
+//! the whole photograph at the resolution that it has, and whatever trains on pinholes trains on them.
+
+use crate::FormatError;
+use crate::Pixels;
+use crate::image_file::{Colour, decode};
+use crate::undistort::{Undistortion, monotonic};
+use glam::{DQuat, DVec2, DVec3};
+use image::metadata::Orientation;
+use irradia_scene::{Intrinsics, Lens, resize_area};
+use std::f64::consts::{FRAC_PI_2, PI};
+use std::path::Path;
+
+/// A photograph of a wide lens of which one pinhole image shows less than this is cut into faces.
+const SHOWN: f64 = 0.7;
+/// Samples of that along each side of the photograph.
+const SAMPLES: u32 = 48;
+/// Smallest side of a face relative to that of the cube: less is a strip that only costs time.
+const SMALLEST: f64 = 1.0 / 8.0;
+/// Longer side of the photographs in which the image circle is searched, pixels.
+const SIDE: u32 = 256;
+/// Values up to this, of 255, are the black around an image circle.
+const BLACK: u8 = 20;
+/// How far within the image circle a face ends, relative to its radius: the rim is dark and blurred.
+const RIM: f64 = 0.98;
+
+/// A side of the cube around a camera: what is added to the photograph's name, and the rotation from its axes to the photograph's.
+type Side = (&'static str, DQuat);
+
+/// The sides in the order of their names.
+fn sides() -> [Side; 6] {
+    [
+        ("back", DQuat::from_xyzw(0.0, 1.0, 0.0, 0.0)),
+        ("down", DQuat::from_rotation_x(-FRAC_PI_2)),
+        ("front", DQuat::IDENTITY),
+        ("left", DQuat::from_rotation_y(-FRAC_PI_2)),
+        ("right", DQuat::from_rotation_y(FRAC_PI_2)),
+        ("up", DQuat::from_rotation_x(FRAC_PI_2)),
+    ]
+}
+
+/// What pinhole images are made of the photographs of one camera.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) enum Cut {
+    /// One.
+    Whole(Undistortion),
+    /// Several, each with what is added to the photograph's name.
+    Faces(Vec<(&'static str, Undistortion)>),
+}
+
+impl Cut {
+    /// One image where it shows most of a photograph, else faces, of what is in the `circle` (radians from the axis) if there is one; `None` where
+    /// the lens leaves no image.
+    pub fn plan(source: &Intrinsics, circle: impl FnOnce() -> Option<f64>) -> Option<Self> {
+        let whole = (source.lens != Lens::Equirectangular)
+            .then(|| Undistortion::plan(source))
+            .flatten();
+        if !source.lens.is_wide() {
+            return whole.map(Cut::Whole);
+        }
+        let reach = reach(&source.lens);
+        if let Some(plan) = whole
+            && shown(source, reach, &plan) >= SHOWN
+        {
+            return Some(Cut::Whole(plan));
+        }
+        let reach = circle().map_or(reach, |circle| circle.min(reach));
+        let faces = faces(source, reach);
+        (!faces.is_empty()).then_some(Cut::Faces(faces))
+    }
+}
+
+/// The angle from the axis up to which the lens is monotonic, radians.
+fn reach(lens: &Lens) -> f64 {
+    match *lens {
+        Lens::Fisheye { k, .. } => {
+            let radial = Lens::fisheye(k);
+            let radius = |theta: f64| radial.project(DVec3::new(theta.sin(), 0.0, theta.cos()));
+            monotonic(PI - 1e-6, |theta| radius(theta).map_or(f64::NAN, |p| p.x)).unwrap_or(PI)
+        }
+        _ => PI,
+    }
+}
+
+/// The angle between a direction and the axis, radians.
+fn angle(direction: DVec3) -> f64 {
+    direction.truncate().length().atan2(direction.z)
+}
+
+/// The share of the photograph's pixels of which `plan`'s image shows what is there.
+fn shown(source: &Intrinsics, reach: f64, plan: &Undistortion) -> f64 {
+    let (mut all, mut seen) = (0u32, 0u32);
+    for row in 0..SAMPLES {
+        for column in 0..SAMPLES {
+            let at = [(column, source.width), (row, source.height)];
+            let [x, y] = at.map(|(i, side)| (f64::from(i) + 0.5) / f64::from(SAMPLES) * f64::from(side));
+            let direction = source.lens.direction(plane(source, x, y));
+            if direction.is_some_and(|direction| angle(direction) < reach) {
+                all += 1;
+                seen += u32::from(plan.shows(x, y));
+            }
+        }
+    }
+    f64::from(seen) / f64::from(all.max(1))
+}
+
+fn plane(k: &Intrinsics, x: f64, y: f64) -> DVec2 {
+    DVec2::new(
+        (x - f64::from(k.cx)) / f64::from(k.fx),
+        (y - f64::from(k.cy)) / f64::from(k.fy),
+    )
+}
+
+/// The sides of a cube, as far as the photograph shows what is within `reach` of its axis: with its own resolution at their centres.
+fn faces(source: &Intrinsics, reach: f64) -> Vec<(&'static str, Undistortion)> {
+    let focal = 0.5 * (source.fx + source.fy);
+    let side = (2.0 * focal).round().max(1.0) as u32;
+    let pinhole = Intrinsics::from_fov_x(side, side, FRAC_PI_2 as f32);
+    let face = |(name, turn): Side| {
+        // Behind a camera that does not see straight behind it, a face would have a hole.
+        if turn * DVec3::Z == DVec3::NEG_Z && reach < PI {
+            return None;
+        }
+        let plan = Undistortion::turned(source, pinhole, turn, |direction| angle(direction) < reach)?;
+        let k = plan.pinhole();
+        let is_large = f64::from(k.width.min(k.height)) >= SMALLEST * f64::from(side);
+        is_large.then_some((name, plan))
+    };
+    sides().into_iter().filter_map(face).collect()
+}
+
+/// The radius of the circle that a fisheye lens throws onto the sensor, as the angle from its axis in radians; `None` where the corners of
+/// the photographs are not black.
+///
+/// # Errors
+/// When a photograph cannot be read.
+pub(crate) fn image_circle<'a>(
+    source: &Intrinsics,
+    photographs: impl Iterator<Item = (&'a Path, Orientation)>,
+) -> Result<Option<f64>, FormatError> {
+    let (width, height) = small(source);
+    let mut brightest = vec![0u8; (width * height) as usize];
+    for (path, orientation) in photographs {
+        let pixels = decode(path, orientation, Colour::Keep)?;
+        for (most, pixel) in brightest.iter_mut().zip(values(&pixels, width, height)) {
+            *most = (*most).max(pixel);
+        }
+    }
+    Ok(circle(source, width, height, &brightest))
+}
+
+/// The size at which the circle is searched.
+fn small(source: &Intrinsics) -> (u32, u32) {
+    let k = source.scaled((SIDE as f32 / source.width.max(source.height) as f32).min(1.0));
+    (k.width, k.height)
+}
+
+/// The largest channel of each pixel of a smaller copy, 0 where it is transparent.
+fn values(from: &Pixels, width: u32, height: u32) -> Vec<u8> {
+    let channels = from.channels as usize;
+    let data = resize_area(&from.data, from.channels, [from.width, from.height], [width, height]);
+    let value = |pixel: &[u8]| match pixel {
+        [r, g, b, alpha] if *alpha >= 128 => *r.max(g).max(b),
+        [r, g, b] => *r.max(g).max(b),
+        [grey] => *grey,
+        _ => 0,
+    };
+    data.chunks_exact(channels).map(value).collect()
+}
+
+/// See [`image_circle`]; `brightest` are the largest values of each pixel of `width` x `height`.
+fn circle(source: &Intrinsics, width: u32, height: u32, brightest: &[u8]) -> Option<f64> {
+    let k = source.resized(width, height);
+    let corners = [0, width - 1, (height - 1) * width, height * width - 1];
+    if corners.iter().any(|at| brightest[*at as usize] > BLACK) {
+        return None;
+    }
+    // Rings of a pixel's width, from the outermost inwards: the first that is mostly not black.
+    let ring = 1.0 / f64::from(k.fx.min(k.fy));
+    let mut rings: Vec<[u32; 2]> = Vec::new();
+    for (at, value) in (0u32..).zip(brightest) {
+        let (x, y) = (f64::from(at % width) + 0.5, f64::from(at / width) + 0.5);
+        let index = (plane(&k, x, y).length() / ring) as usize;
+        rings.resize(rings.len().max(index + 1), [0; 2]);
+        rings[index][0] += 1;
+        rings[index][1] += u32::from(*value > BLACK);
+    }
+    let rim = rings.iter().rposition(|[all, lit]| *all > 0 && 2 * lit > *all)?;
+    let direction = k.lens.direction(DVec2::new(RIM * (rim as f64 + 0.5) * ring, 0.0))?;
+    Some(angle(direction))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn camera(lens: Lens, width: u32, height: u32, focal: [f64; 2]) -> Intrinsics {
+        Intrinsics {
+            width,
+            height,
+            fx: focal[0] as f32,
+            fy: focal[1] as f32,
+            cx: 0.5 * width as f32,
+            cy: 0.5 * height as f32,
+            lens,
+        }
+    }
+
+    fn panorama(width: u32) -> Intrinsics {
+        let focal = f64::from(width) / (2.0 * PI);
+        camera(Lens::Equirectangular, width, width / 2, [focal; 2])
+    }
+
+    /// The colour of a direction: smooth everywhere, different for each.
+    fn color(direction: DVec3) -> [f64; 3] {
+        let d = direction.normalize();
+        [d.x, d.y, d.z].map(|v| 128.0 + 90.0 * v)
+    }
+
+    /// What a lens sees of [`color`].
+    fn photograph(k: &Intrinsics) -> Pixels {
+        let mut data = Vec::new();
+        for y in 0..k.height {
+            for x in 0..k.width {
+                let direction = k.lens.direction(plane(k, f64::from(x) + 0.5, f64::from(y) + 0.5));
+                data.extend(direction.map_or([0.0; 3], color).map(|v| v.round() as u8));
+            }
+        }
+        Pixels {
+            width: k.width,
+            height: k.height,
+            channels: 3,
+            data,
+        }
+    }
+
+    fn cut(k: &Intrinsics) -> Vec<(&'static str, Undistortion)> {
+        match Cut::plan(k, || None).expect("a plan") {
+            Cut::Faces(faces) => faces,
+            Cut::Whole(whole) => panic!("{whole:?}"),
+        }
+    }
+
+    #[test]
+    fn faces_show_what_is_in_their_directions() {
+        for k in [
+            panorama(512),
+            camera(Lens::fisheye([0.01, 0.002, 0.0, 0.0]), 360, 360, [100.0, 102.0]),
+        ] {
+            let photo = photograph(&k);
+            for (name, plan) in cut(&k) {
+                let image = plan.apply(&photo);
+                let pinhole = plan.pinhole();
+                assert_eq!((image.width, image.height), (pinhole.width, pinhole.height));
+                let mut worst = 0f64;
+                for (at, pixel) in (0u32..).zip(image.data.chunks_exact(3)) {
+                    let (x, y) = (at % image.width, at / image.width);
+                    let ray = plane(&pinhole, f64::from(x) + 0.5, f64::from(y) + 0.5).extend(1.0);
+                    for (value, expected) in pixel.iter().zip(color(plan.turn() * ray)) {
+                        worst = worst.max((f64::from(*value) - expected).abs());
+                    }
+                }
+                // Roundings to 8 bits, and curvature between bilinear samples.
+                assert!(worst < 2.0, "{name} of {:?}: {worst}", k.lens);
+            }
+        }
+    }
+
+    #[test]
+    fn a_panorama_has_six_whole_faces() {
+        let faces = cut(&panorama(512));
+        let names: Vec<_> = faces.iter().map(|(name, _)| *name).collect();
+        assert_eq!(names, ["back", "down", "front", "left", "right", "up"]);
+        for (name, plan) in faces {
+            let k = plan.pinhole();
+            // 512 pixels around are 81.5 a radian.
+            assert!(
+                k.width.min(k.height) >= 161 && k.width.max(k.height) <= 163,
+                "{name} {k:?}"
+            );
+        }
+    }
+
+    #[test]
+    fn a_half_turn_has_a_front_and_half_of_four_sides() {
+        let k = camera(Lens::fisheye([0.0; 4]), 314, 314, [100.0; 2]);
+        // What is in the corners is more than a half turn away and in no photograph of such a lens.
+        let Some(Cut::Faces(faces)) = Cut::plan(&k, || Some(FRAC_PI_2)) else {
+            panic!("faces")
+        };
+        let sizes: Vec<_> = faces
+            .iter()
+            .map(|(name, plan)| (*name, plan.pinhole().width, plan.pinhole().height))
+            .collect();
+        for (name, width, height) in sizes {
+            let expected = match name {
+                "front" => [200, 200],
+                "left" | "right" => [100, 200],
+                "up" | "down" => [200, 100],
+                other => panic!("{other} {width}x{height}"),
+            };
+            assert!(
+                width.abs_diff(expected[0]) <= 4 && height.abs_diff(expected[1]) <= 4,
+                "{name} {width}x{height}"
+            );
+        }
+    }
+
+    #[test]
+    fn moderate_fisheyes_stay_one_image() {
+        let k = camera(Lens::fisheye([0.02, -0.01, 0.003, -0.0005]), 320, 240, [250.0; 2]);
+        assert!(matches!(Cut::plan(&k, || panic!("not asked for")), Some(Cut::Whole(_))));
+    }
+
+    #[test]
+    fn the_image_circle_is_found_and_full_frames_have_none() {
+        let k = camera(Lens::fisheye([0.0; 4]), 256, 192, [60.0; 2]);
+        let lit = |radius: f64| -> Vec<u8> {
+            let distance = |at: u32| DVec2::new(f64::from(at % 256) - 127.5, f64::from(at / 256) - 95.5).length();
+            (0..256 * 192)
+                .map(|at| if distance(at) < radius { 90 } else { 5 })
+                .collect()
+        };
+        let found = circle(&k, 256, 192, &lit(94.0)).expect("a circle");
+        assert!((found - RIM * 94.0 / 60.0).abs() < 0.02, "{found}");
+        assert_eq!(circle(&k, 256, 192, &lit(1000.0)), None);
+        assert_eq!(circle(&k, 256, 192, &lit(0.0)), None);
+    }
+}

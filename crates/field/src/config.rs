@@ -130,11 +130,11 @@ impl FieldConfig {
     }
 
     /// A field that adds to the colours of given points.
-    pub fn residual(net: NetShape, mirrored: bool) -> Self {
+    pub fn residual(net: NetShape, mirrored: bool, images: usize) -> Self {
         Self {
             net,
             sampler: Sampler::Given { mirrored },
-            images: 0,
+            images,
             background_degree: None,
         }
     }

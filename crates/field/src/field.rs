@@ -8,6 +8,9 @@ use crate::space::Space;
 use crate::tensors::{Tensors, fill, fill_one, named};
 use irradia_scene::Rng;
 
+/// Standard deviation of the first appearance codes of a residual field.
+const FIRST_CODE: f32 = 0.1;
+
 /// An invalid [`FieldConfig`] or list of tensors.
 #[derive(Debug, thiserror::Error)]
 pub enum FieldError {
@@ -82,13 +85,16 @@ impl Field {
         })
     }
 
-    /// A field for [`crate::residual_at`], initialised to add nothing to any colour.
+    /// A field for [`crate::residual_at`], initialised to add nothing to any colour; with random codes for `images` photographs, if its
+    /// network takes codes: of equal ones none would ever differ.
     ///
     /// # Errors
     /// When the configuration of its network is invalid.
-    pub fn residual(net: NetShape, mirrored: bool, space: Space, seed: u64) -> Result<Self, FieldError> {
-        let mut field = Self::new(FieldConfig::residual(net, mirrored), space, seed)?;
+    pub fn residual(net: NetShape, mirrored: bool, images: usize, space: Space, seed: u64) -> Result<Self, FieldError> {
+        let mut field = Self::new(FieldConfig::residual(net, mirrored, images), space, seed)?;
         field.nets[0].zero_color(&mut field.parameters[0]);
+        let mut rng = Rng::new(seed, 0xc0de);
+        field.codes.fill_with(|| FIRST_CODE * rng.normal());
         Ok(field)
     }
 

@@ -34,7 +34,7 @@ const WORLD: &str = "world.json";
 pub(crate) const PACES: &str = "pace.txt";
 
 /// The files of a run.
-const FILES: [&str; 16] = [
+const FILES: [&str; 17] = [
     "run.json",
     VIEWS,
     WORLD,
@@ -47,6 +47,7 @@ const FILES: [&str; 16] = [
     socket::FILES[0],
     socket::FILES[1],
     socket::FILES[2],
+    socket::FILES[4],
     SKY,
     "report.json",
     "report.html",

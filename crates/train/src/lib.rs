@@ -31,6 +31,7 @@ mod robust;
 mod run;
 pub mod schedule;
 pub mod socket;
+mod spacing;
 pub mod tensor_file;
 pub mod times;
 mod trainer;

@@ -3,6 +3,7 @@
 use crate::free_space::seen_depths;
 use crate::robust::median;
 use crate::trainer::train_cameras;
+use glam::Vec3;
 use irradia_scene::{Dataset, View};
 use irradia_splat::init;
 use rayon::prelude::*;
@@ -13,10 +14,15 @@ pub(crate) fn pixel_size(dataset: &Dataset) -> f32 {
     let size = |view: &usize| {
         let view = &dataset.views[*view];
         let camera = &view.camera;
-        let depth = typical_depth(dataset, view).unwrap_or_else(|| focus.distance(camera.pose.position));
+        let depth = depth_shown(dataset, view, focus);
         f64::from(depth.max(camera.near) / camera.intrinsics.fx.max(camera.intrinsics.fy))
     };
     median(dataset.train.par_iter().map(size).collect()) as f32
+}
+
+/// The median depth of the points that a view sees, else the geometric mean of its depth bounds, else the distance of the cameras' `focus`.
+pub(crate) fn depth_shown(dataset: &Dataset, view: &View, focus: Vec3) -> f32 {
+    typical_depth(dataset, view).unwrap_or_else(|| focus.distance(view.camera.pose.position))
 }
 
 /// The median depth of the points that a view sees, else the geometric mean of its depth bounds.
@@ -31,7 +37,6 @@ fn typical_depth(dataset: &Dataset, view: &View) -> Option<f32> {
 mod tests {
     use super::*;
     use crate::free_space::tests::dataset;
-    use glam::Vec3;
 
     #[test]
     fn a_pixel_is_as_large_as_at_the_points_else_between_the_bounds_else_at_the_focus() {

@@ -85,7 +85,9 @@ pub fn run(
         let due = plan(&trainer.recipe, &trainer.clock);
         forecast.observe(trainer, &due, limits.budget.is_some());
         if let Some(budget) = limits.budget {
-            trainer.pace = forecast.pace(trainer, budget - trainer.seconds);
+            trainer.pace = forecast
+                .pace(trainer, budget - trainer.seconds)
+                .max(trainer.least_pace());
         }
         if let Some(pace) = limits.paces.as_ref().and_then(|paces| paces.at(trainer.clock.step + 1)) {
             trainer.pace = pace;

@@ -115,6 +115,8 @@ pub(crate) const STREAM_INIT: u64 = 1;
 const STREAM_DENSIFY: u64 = 2;
 const STREAM_STEP: u64 = 5;
 
+/// A run of sparse photographs has at least one part in this many of the recipe's own steps.
+const LEAST_SPARSE: u64 = 5;
 /// Training views over which the convergence error is measured.
 const MEASURED_VIEWS: usize = 8;
 
@@ -291,14 +293,31 @@ impl Trainer {
 
     /// The recipe's components in the sockets of a step, untrained.
     pub(crate) fn first_sockets(&mut self) -> Result<Sockets, TrainError> {
-        // Only a residual field's space depends on transparency; photographs are not read for the others.
-        let transparent = self.recipe.residual.is_some() && self.transparent()?;
+        if self.engine.is_on_gpu() && self.recipe.appearance.take().is_some() && self.recipe.uses(Param::RateCodes) {
+            self.decisions
+                .push("the light of photographs is trained on the CPU only, and left out".into());
+        }
+        // Only the spaces of fields depend on transparency; photographs are not read for the others.
+        let fields = self.recipe.residual.is_some() || self.recipe.appearance.is_some();
+        let transparent = fields && self.transparent()?;
         Sockets::new(&self.recipe, &self.dataset, transparent, self.options.seed)
     }
 
     /// Whether photographs have alpha, judged by the first one.
     pub(crate) fn transparent(&mut self) -> Result<bool, TrainError> {
         Ok(self.photos.get(&self.dataset.train[..1], 1.0)?.alpha.is_some())
+    }
+
+    /// The least pace of a run without a given number of steps: the recipe's limit on visits, where photographs are sparse.
+    pub(crate) fn least_pace(&self) -> f64 {
+        match self.recipe.sparse_visits {
+            0 => 0.0,
+            visits => {
+                let total = self.recipe.total_steps();
+                let most = visits.saturating_mul(self.dataset.train.len() as u64);
+                total as f64 / most.max(total / LEAST_SPARSE).max(1) as f64
+            }
+        }
     }
 
     /// Number of steps of this run, as far as known.

@@ -24,11 +24,12 @@ pub struct ResidualQuery {
     pub direction: [f32; 3],
 }
 
-/// The colours that `field` adds at `queries`: sRGB, within -1..1; zeros outside the field.
-pub fn residual_at(field: &Field, queries: &[ResidualQuery]) -> Vec<[f32; 3]> {
+/// The colours that `field` adds at `queries` with the appearance code of `image`, or the mean code: sRGB, within -1..1; zeros outside the
+/// field.
+pub fn residual_at(field: &Field, queries: &[ResidualQuery], image: Option<u32>) -> Vec<[f32; 3]> {
     let (points, directions): (Vec<_>, Vec<_>) = queries.iter().map(|s| (s.point, s.direction)).unzip();
     let (_, inside) = units(field, &points);
-    color_at(field, &points, &directions, None)
+    color_at(field, &points, &directions, image)
         .into_iter()
         .zip(inside)
         .map(|(color, inside)| if inside { color.map(residual_of) } else { [0.0; 3] })
@@ -40,9 +41,15 @@ fn residual_of(color: f32) -> f32 {
     2.0 * color - 1.0
 }
 
-/// Takes one step of Adam, given the gradients `v_added` of what [`residual_at`] returned for `queries`. The points receive no
-/// gradient; only the rates of `options` are used.
-pub fn train_residual(state: &mut FieldState, queries: &[ResidualQuery], v_added: &[[f32; 3]], options: &StepOptions) {
+/// Takes one step of Adam, given the gradients `v_added` of the colours added at `queries`: the sum of what [`residual_at`] returned for each
+/// of the `images`, times its factor. The points receive no gradient; only the rates of `options` are used.
+pub fn train_residual(
+    state: &mut FieldState,
+    queries: &[ResidualQuery],
+    images: &[(Option<u32>, f32)],
+    v_added: &[[f32; 3]],
+    options: &StepOptions,
+) {
     assert_eq!(queries.len(), v_added.len(), "one gradient per query");
     descend(state, options, |level, field, _, workers| {
         let transposed = field.transposed();
@@ -53,8 +60,10 @@ pub fn train_residual(state: &mut FieldState, queries: &[ResidualQuery], v_added
         workers.par_iter_mut().enumerate().for_each(|(group, worker)| {
             worker.clear(field);
             for chunk in reached[n * group / GROUPS..n * (group + 1) / GROUPS].chunks(CHUNK) {
-                let points = chunk.iter().map(|i| (units[*i], queries[*i].direction, v_added[*i]));
-                worker.points(level, field, &transposed, points);
+                for (image, factor) in images {
+                    let point = |i: &usize| (units[*i], queries[*i].direction, v_added[*i].map(|v| v * factor));
+                    worker.points(level, field, &transposed, *image, chunk.iter().map(point));
+                }
             }
         });
         add_up(workers)
@@ -68,11 +77,13 @@ impl Worker {
         level: Level,
         field: &Field,
         transposed: &[NetParameters<f32>],
+        image: Option<u32>,
         points: impl ExactSizeIterator<Item = ([f32; 3], [f32; 3], [f32; 3])>,
     ) {
         let (net, parameters) = (&field.nets[0], &field.parameters[0]);
+        let count = points.len();
         let block = &mut self.block;
-        block.reset(points.len());
+        block.reset(count);
         let padded = block.panels() * PANEL;
         let rows = [
             (&mut block.directions, 3),
@@ -88,7 +99,7 @@ impl Worker {
             set3(&mut block.directions, i, direction);
             set3(&mut block.v_rgb, i, v_added.map(|v| 2.0 * v)); // The slope of [`residual_of`].
         }
-        block.fill_code(&field.code(None));
+        block.fill_code(&field.code(image));
         level.run(Density { net, parameters, block });
         level.run(Colors { net, parameters, block });
         level.run(Backward {
@@ -98,6 +109,13 @@ impl Worker {
             grads: &mut self.grads[0],
             with_color: true,
         });
+        let size = field.config.appearance();
+        for k in 0..image.map_or(0, |_| size) {
+            let sum: f32 = (0..count).map(|i| net.code_gradient(block, i, k)).sum();
+            if let Some(to) = image.and_then(|image| self.codes.get_mut(image as usize * size + k)) {
+                *to += sum;
+            }
+        }
         self.stored[0][0].extend_from_slice(&block.points);
         self.stored[0][1].extend_from_slice(&block.v_encoded);
     }

@@ -140,6 +140,7 @@ fn socket_occupants_resume_exactly() {
         "refine_poses=true",
         "params.rate_poses=0.001",
         "params.rate_sky=0.05",
+        "params.rate_codes=0.05",
     ]
     .map(str::to_owned);
     let recipe = Recipe::parse("shiny", Recipe::built_in("shiny").unwrap(), &overrides).unwrap();
@@ -150,7 +151,7 @@ fn socket_occupants_resume_exactly() {
     let bytes = to_bytes(&trainer);
     let mut again = read(&bytes).unwrap();
     let names: Vec<&str> = again.sockets.occupants().iter().map(|o| o.name()).collect();
-    assert_eq!(names, ["poses", "residual", "exposure", "sky"]);
+    assert_eq!(names, ["poses", "residual", "appearance", "exposure", "sky"]);
     let learnt = [&mut trainer, &mut again].map(|trainer| {
         trainer.step(&mut Vec::new()).unwrap();
         let occupants = trainer.sockets.occupants().into_iter();

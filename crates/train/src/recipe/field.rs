@@ -52,12 +52,13 @@ documented! {
 }
 
 impl ResidualKnobs {
-    pub(super) fn validate(&self) -> Result<(), String> {
+    /// `name` is that of the table, which has `images` photographs with appearance codes if any.
+    pub(super) fn validate(&self, name: &str, images: usize) -> Result<(), String> {
         if !(0.0..1.0).contains(&self.beta2) {
-            return Err("residual.beta2 must be between 0 and 1".into());
+            return Err(format!("{name}.beta2 must be between 0 and 1"));
         }
-        let checked = FieldConfig::residual(self.net, self.mirrored).check();
-        checked.map_err(|error| format!("residual: {error}"))
+        let checked = FieldConfig::residual(self.net, self.mirrored, images).check();
+        checked.map_err(|error| format!("{name}: {error}"))
     }
 }
 

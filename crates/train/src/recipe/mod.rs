@@ -92,6 +92,10 @@ documented! {
         /// length; 0: it always has its own length.
         #[serde(default, skip_serializing_if = "is_default")]
         pub visits: u64,
+        /// Steps for each training photograph that a run without a number of steps has at most, where photographs are sparse, but at least a fifth of
+        /// the recipe's own length; a budget that allows more is not used up. 0: no limit.
+        #[serde(default, skip_serializing_if = "is_default")]
+        pub sparse_visits: u64,
         /// Steps between evaluations of held-out views while training; at least 1.
         pub eval_every: u64,
         /// Steps between checkpoints; at least 1.
@@ -127,6 +131,10 @@ documented! {
         /// A field that adds to the splats' colours.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         pub residual: Option<ResidualKnobs>,
+        /// A field of position that adds what the light of each photograph changes, by a code for each; it acts where `rate_codes` is above 0, and is left
+        /// out on a GPU.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        pub appearance: Option<ResidualKnobs>,
         /// Parameters over the whole run; a stage may override them.
         pub params: Params,
         /// Parameters in place of those of `params` if the data show where space is empty: the dataset has points, or the photographs
@@ -139,6 +147,9 @@ documented! {
         /// The same, if the sky differs from photograph to photograph; `known_space` prevails.
         #[serde(default, skip_serializing_if = "Params::is_empty")]
         pub skies: Params,
+        /// The same, if adjacent photographs are more than 10 degrees apart, as seen from what they show; it prevails.
+        #[serde(default, skip_serializing_if = "Params::is_empty")]
+        pub sparse: Params,
         /// The stages, in order.
         pub stage: Vec<Stage>,
     }
@@ -433,7 +444,13 @@ impl Recipe {
             let mut paths = overrides.iter().filter_map(|given| given.split_once('='));
             paths.any(|(path, _)| path.trim().strip_prefix("params.") == Some(param.name()))
         };
-        for params in [&mut recipe.known_space, &mut recipe.cut_out, &mut recipe.skies] {
+        let conditional = [
+            &mut recipe.known_space,
+            &mut recipe.cut_out,
+            &mut recipe.skies,
+            &mut recipe.sparse,
+        ];
+        for params in conditional {
             params.retain(|param, _| !is_set(param));
         }
         recipe.complete_sockets();
@@ -502,6 +519,14 @@ impl Recipe {
         if self.max_splats == 0 || self.eval_every == 0 || self.checkpoint_every == 0 {
             return Err("max_splats, eval_every and checkpoint_every must be at least 1".into());
         }
+        let lengths = [
+            ("free_space", self.free_space),
+            ("extent_pixels", self.extent_pixels),
+            ("length_exponent", self.length_exponent),
+        ];
+        if let Some((name, value)) = lengths.iter().find(|(_, value)| !(value.is_finite() && *value >= 0.0)) {
+            return Err(format!("{name} is {value}: it must be 0 or more, and finite"));
+        }
         let opacities = [self.init.opacity, self.init.random_opacity.unwrap_or(self.init.opacity)];
         if opacities.iter().any(|opacity| !(*opacity > 0.0 && *opacity < 1.0)) || self.init.scale <= 0.0 {
             return Err("init.opacity and random_opacity must be between 0 and 1 and init.scale above 0".into());
@@ -509,8 +534,10 @@ impl Recipe {
         if let Some(field) = &self.field {
             field.validate()?;
         }
-        if let Some(residual) = &self.residual {
-            residual.validate()?;
+        for (name, knobs, images) in [("residual", &self.residual, 0), ("appearance", &self.appearance, 1)] {
+            if let Some(knobs) = knobs {
+                knobs.validate(name, images)?;
+            }
         }
         for (i, stage) in self.stage.iter().enumerate() {
             self.validate_order(i)?;
@@ -554,6 +581,7 @@ impl Recipe {
             ("known_space".to_owned(), &self.known_space),
             ("cut_out".to_owned(), &self.cut_out),
             ("skies".to_owned(), &self.skies),
+            ("sparse".to_owned(), &self.sparse),
         ];
         let stages = self
             .stage

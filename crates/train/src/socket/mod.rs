@@ -10,12 +10,14 @@
 //! runs (checkpoints, resume, files beside the scene) accesses occupants through [`Occupant`] alone, and rendering goes through
 //! [`Sockets`]: a new one is a file here, a field of [`Sockets`] and an arm in the method of its socket.
 
+mod appearance;
 mod exposure;
 mod per_view;
 mod poses;
 mod residual;
 mod sky;
 
+pub use appearance::Appearance;
 pub use exposure::Exposure;
 pub(crate) use per_view::PerViewAdam;
 pub use poses::PoseRefinement;
@@ -34,11 +36,12 @@ use irradia_splat::{Engine, Placement, RenderOptions};
 use rayon::prelude::*;
 
 /// Names of the files that occupants may write beside a scene.
-pub const FILES: [&str; 4] = [
+pub const FILES: [&str; 5] = [
     "poses.safetensors",
     "residual.safetensors",
     "exposure.safetensors",
     "sky.safetensors",
+    "appearance.safetensors",
 ];
 
 /// The planes of `frame` `[3, H, W]` in pieces of `length` pixels, for all threads.
@@ -75,6 +78,8 @@ pub struct Sockets {
     pub poses: Option<PoseRefinement>,
     /// At colour: a small field.
     pub residual: Option<Residual>,
+    /// At colour: the light of each photograph.
+    pub appearance: Option<Appearance>,
     /// After blending: each photograph's exposure.
     pub exposure: Option<Exposure>,
     /// After blending: the sky behind the splats.
@@ -91,15 +96,22 @@ impl Sockets {
     /// # Errors
     /// When the cameras determine no space for a residual field.
     pub fn new(recipe: &Recipe, dataset: &Dataset, transparent: bool, seed: u64) -> Result<Self, TrainError> {
+        let space = || {
+            let cameras: Vec<Camera> = dataset.train.iter().map(|i| dataset.views[*i].camera).collect();
+            Space::around(&cameras, !transparent).ok_or(TrainError::NoSpace)
+        };
         let residual = match &recipe.residual {
-            Some(knobs) => {
-                let cameras: Vec<Camera> = dataset.train.iter().map(|i| dataset.views[*i].camera).collect();
-                let space = Space::around(&cameras, !transparent).ok_or(TrainError::NoSpace)?;
-                Some(Residual::new(knobs, space, seed)?)
-            }
+            Some(knobs) => Some(Residual::new(knobs, space()?, seed)?),
             None => None,
         };
+        let appearance = match &recipe.appearance {
+            Some(knobs) if recipe.uses(Param::RateCodes) => {
+                Some(Appearance::new(knobs, dataset.views.len(), space()?, seed)?)
+            }
+            _ => None,
+        };
         Ok(Self {
+            appearance,
             poses: recipe.refine_poses.then(|| PoseRefinement::new(dataset)),
             residual,
             exposure: (recipe.exposure == Choice::Yes).then(|| Exposure::new(dataset.views.len(), &dataset.train)),
@@ -115,21 +127,34 @@ impl Sockets {
         let residual = self.residual.as_ref().map(|o| o as &dyn Occupant);
         let exposure = self.exposure.as_ref().map(|o| o as &dyn Occupant);
         let sky = self.sky.as_ref().map(|o| o as &dyn Occupant);
-        [poses, residual, exposure, sky].into_iter().flatten().collect()
+        let appearance = self.appearance.as_ref().map(|o| o as &dyn Occupant);
+        [poses, residual, appearance, exposure, sky]
+            .into_iter()
+            .flatten()
+            .collect()
     }
 
     /// All occupants, for restoring.
     pub fn occupants_mut(&mut self) -> Vec<&mut dyn Occupant> {
         let poses = self.poses.as_mut().map(|o| o as &mut dyn Occupant);
         let residual = self.residual.as_mut().map(|o| o as &mut dyn Occupant);
+        let appearance = self.appearance.as_mut().map(|o| o as &mut dyn Occupant);
         let exposure = self.exposure.as_mut().map(|o| o as &mut dyn Occupant);
         let sky = self.sky.as_mut().map(|o| o as &mut dyn Occupant);
-        [poses, residual, exposure, sky].into_iter().flatten().collect()
+        [poses, residual, appearance, exposure, sky]
+            .into_iter()
+            .flatten()
+            .collect()
     }
 
     /// Whether there are none: a step then is one of the splats alone.
     pub fn are_empty(&self) -> bool {
-        self.poses.is_none() && self.residual.is_none() && !self.are_after_blending()
+        self.poses.is_none() && !self.are_at_color() && !self.are_after_blending()
+    }
+
+    /// Whether there are any at colour.
+    pub fn are_at_color(&self) -> bool {
+        self.residual.is_some() || self.appearance.is_some()
     }
 
     /// Whether there are any after blending.
@@ -166,13 +191,25 @@ impl Sockets {
             ..*options
         };
         let options = if self.sky.is_some() { &over_black } else { options };
-        match self.residual.as_ref().filter(|residual| residual.acts(plan)) {
-            Some(residual) => {
-                let center = placement.camera.pose.position;
-                engine.project(placement, options);
-                engine.composite(&residual.colors(center, &engine.surfaces_in_view()));
-            }
-            None => engine.render(placement, options),
+        let residual = self.residual.as_ref().filter(|residual| residual.acts(plan));
+        let appearance = self.appearance.as_ref().filter(|appearance| appearance.acts(plan));
+        if residual.is_some() || appearance.is_some() {
+            let center = placement.camera.pose.position;
+            engine.project(placement, options);
+            let surfaces = engine.surfaces_in_view();
+            let reflected = residual.map(|residual| residual.colors(center, &surfaces));
+            let lit = appearance.map(|appearance| appearance.colors(view, center, &surfaces));
+            engine.composite(&match (reflected, lit) {
+                (Some(mut colors), Some(lit)) => {
+                    for (color, lit) in colors.iter_mut().zip(lit) {
+                        *color = std::array::from_fn(|c| color[c] + lit[c]);
+                    }
+                    colors
+                }
+                (colors, lit) => colors.or(lit).unwrap_or_default(),
+            });
+        } else {
+            engine.render(placement, options);
         }
         let mut color = engine.frame().color;
         if let Some(sky) = &self.sky {
@@ -234,9 +271,17 @@ impl Sockets {
         extent: f32,
         plan: &StepPlan,
     ) {
-        if let Some(residual) = self.residual.as_mut().filter(|residual| residual.acts(plan)) {
+        let residual = self.residual.as_mut().filter(|residual| residual.acts(plan));
+        let appearance = self.appearance.as_mut().filter(|appearance| appearance.acts(plan));
+        if residual.is_some() || appearance.is_some() {
             let (surfaces, v_colors) = engine.color_gradients();
-            residual.step(camera.pose.position, &surfaces, &v_colors, plan);
+            let center = camera.pose.position;
+            if let Some(residual) = residual {
+                residual.step(center, &surfaces, &v_colors, plan);
+            }
+            if let Some(appearance) = appearance {
+                appearance.step(view, center, &surfaces, &v_colors, plan);
+            }
         }
         if let (Some(poses), Some(gradient)) = (&mut self.poses, engine.camera_gradient()) {
             poses.step(view, camera, &gradient, plan.value(Param::RatePoses), extent);

@@ -22,11 +22,11 @@ pub struct Residual {
 
 /// The colours that `field` adds to `surfaces` seen from `center`, world.
 pub fn added_colors(field: &Field, center: Vec3, surfaces: &[Surface]) -> Vec<[f32; 3]> {
-    residual_at(field, &queries(field, center, surfaces))
+    residual_at(field, &queries(field, center, surfaces), None)
 }
 
 /// Queries of `field` for `surfaces` seen from `center`.
-fn queries(field: &Field, center: Vec3, surfaces: &[Surface]) -> Vec<ResidualQuery> {
+pub(super) fn queries(field: &Field, center: Vec3, surfaces: &[Surface]) -> Vec<ResidualQuery> {
     let mirrored = matches!(field.config.sampler, Sampler::Given { mirrored: true });
     let sight = |surface: &Surface| {
         let view = (Vec3::from(surface.mean) - center).normalize_or_zero();
@@ -50,7 +50,7 @@ impl Residual {
     /// # Errors
     /// When the field's configuration is invalid.
     pub fn new(knobs: &ResidualKnobs, space: Space, seed: u64) -> Result<Self, TrainError> {
-        let field = Field::residual(knobs.net, knobs.mirrored, space, seed ^ STREAM_RESIDUAL << 40)?;
+        let field = Field::residual(knobs.net, knobs.mirrored, 0, space, seed ^ STREAM_RESIDUAL << 40)?;
         Ok(Self {
             state: FieldState::new(field),
             beta2: knobs.beta2,
@@ -81,7 +81,7 @@ impl Residual {
             ..StepOptions::default()
         };
         let queries = queries(&self.state.field, center, surfaces);
-        train_residual(&mut self.state, &queries, v_colors, &options);
+        train_residual(&mut self.state, &queries, &[(None, 1.0)], v_colors, &options);
     }
 }
 

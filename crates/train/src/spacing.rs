@@ -1,0 +1,87 @@
+//! How far photographs are apart, as seen from what they show: what stands between sparse ones, only a few of them determine.
+
+use crate::pixel_size::depth_shown;
+use crate::robust::median;
+use crate::trainer::train_cameras;
+use glam::Vec3;
+use irradia_scene::{Camera, Dataset};
+use irradia_splat::init;
+use rayon::prelude::*;
+use std::f64::consts::PI;
+
+/// Cameras closer than this fraction of the depth are at the same place, as the faces of a panorama are.
+const SAME_PLACE: f32 = 1e-3;
+
+/// The angle, radians, between a training view's axis and the line from where it ends to the nearest other camera that sees this point: the median over
+/// views; half a turn for those of which no other sees it.
+pub(crate) fn spacing(dataset: &Dataset) -> f64 {
+    let cameras = train_cameras(dataset);
+    let focus = init::focus_point(&cameras);
+    let angle = |view: &usize| {
+        let view = &dataset.views[*view];
+        let pose = &view.camera.pose;
+        let depth = depth_shown(dataset, view, focus);
+        let shown = pose.world_from_camera(depth * Vec3::Z);
+        let others = cameras.iter().filter(|other| {
+            other.pose.position.distance(pose.position) > SAME_PLACE * depth && is_in_view(other, shown)
+        });
+        let angles = others.map(|other| f64::from((pose.position - shown).angle_between(other.pose.position - shown)));
+        angles.fold(PI, f64::min)
+    };
+    median(dataset.train.par_iter().map(angle).collect())
+}
+
+fn is_in_view(camera: &Camera, point: Vec3) -> bool {
+    let k = &camera.intrinsics;
+    camera
+        .project(point)
+        .is_some_and(|(at, _)| (0.0..k.width as f32).contains(&at.x) && (0.0..k.height as f32).contains(&at.y))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::free_space::tests::dataset;
+    use irradia_scene::Pose;
+    use std::f32::consts::TAU;
+
+    /// `count` cameras on a circle around the origin, evenly over `turn`, each looking across it.
+    fn around(count: usize, turn: f32) -> Dataset {
+        let mut data = dataset(0, None);
+        let view = data.views[0].clone();
+        let place = |i: usize| {
+            let angle = turn * i as f32 / count as f32;
+            let mut view = view.clone();
+            view.camera.pose = Pose::look_at(3.0 * Vec3::new(angle.cos(), angle.sin(), 0.0), Vec3::ZERO, Vec3::Z);
+            view
+        };
+        data.views = (0..count).map(place).collect();
+        data.train = (0..count).collect();
+        data
+    }
+
+    #[test]
+    fn the_angle_is_that_between_adjacent_cameras() {
+        for (count, turn) in [(12, TAU), (36, TAU), (10, 0.5)] {
+            let expected = f64::from(turn) / count as f64;
+            let found = spacing(&around(count, turn));
+            assert!((found - expected).abs() < 0.02 * expected, "{found} {expected}");
+        }
+    }
+
+    #[test]
+    fn cameras_at_the_same_place_and_those_that_look_elsewhere_do_not_count() {
+        let mut data = around(12, TAU);
+        let faces = data.views.to_vec();
+        data.views.extend(faces.into_iter().map(|mut view| {
+            let pose = view.camera.pose;
+            view.camera.pose = Pose::look_at(pose.position, 2.0 * pose.position, Vec3::Z);
+            view
+        }));
+        let expected = f64::from(TAU) / 12.0;
+        assert!((spacing(&data) - expected).abs() < 0.02 * expected);
+        // Of what is outside, no other camera sees what one looks at.
+        data.train = (12..24).step_by(2).collect();
+        assert_eq!(spacing(&data), PI);
+    }
+}

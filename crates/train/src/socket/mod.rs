@@ -11,6 +11,7 @@
 //! [`Sockets`]: a new one is a file here, a field of [`Sockets`] and an arm in the method of its socket.
 
 mod appearance;
+mod color_field;
 mod exposure;
 mod per_view;
 mod poses;

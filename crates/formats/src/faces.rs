@@ -6,7 +6,7 @@
 use crate::FormatError;
 use crate::Pixels;
 use crate::image_file::{Colour, decode};
-use crate::undistort::{Undistortion, monotonic};
+use crate::undistort::{Undistortion, monotonic, plane_point};
 use glam::{DQuat, DVec2, DVec3};
 use image::metadata::Orientation;
 use irradia_scene::{Intrinsics, Lens, resize_area};
@@ -96,7 +96,7 @@ fn shown(source: &Intrinsics, reach: f64, plan: &Undistortion) -> f64 {
         for column in 0..SAMPLES {
             let at = [(column, source.width), (row, source.height)];
             let [x, y] = at.map(|(i, side)| (f64::from(i) + 0.5) / f64::from(SAMPLES) * f64::from(side));
-            let direction = source.lens.direction(plane(source, x, y));
+            let direction = source.lens.direction(plane_point(source, x, y));
             if direction.is_some_and(|direction| angle(direction) < reach) {
                 all += 1;
                 seen += u32::from(plan.shows(x, y));
@@ -104,13 +104,6 @@ fn shown(source: &Intrinsics, reach: f64, plan: &Undistortion) -> f64 {
         }
     }
     f64::from(seen) / f64::from(all.max(1))
-}
-
-fn plane(k: &Intrinsics, x: f64, y: f64) -> DVec2 {
-    DVec2::new(
-        (x - f64::from(k.cx)) / f64::from(k.fx),
-        (y - f64::from(k.cy)) / f64::from(k.fy),
-    )
 }
 
 /// The sides of a cube, as far as the photograph shows what is within `reach` of its axis: with its own resolution at their centres.
@@ -182,7 +175,7 @@ fn circle(source: &Intrinsics, width: u32, height: u32, brightest: &[u8]) -> Opt
     let mut rings: Vec<[u32; 2]> = Vec::new();
     for (at, value) in (0u32..).zip(brightest) {
         let (x, y) = (f64::from(at % width) + 0.5, f64::from(at / width) + 0.5);
-        let index = (plane(&k, x, y).length() / ring) as usize;
+        let index = (plane_point(&k, x, y).length() / ring) as usize;
         rings.resize(rings.len().max(index + 1), [0; 2]);
         rings[index][0] += 1;
         rings[index][1] += u32::from(*value > BLACK);
@@ -224,7 +217,7 @@ mod tests {
         let mut data = Vec::new();
         for y in 0..k.height {
             for x in 0..k.width {
-                let direction = k.lens.direction(plane(k, f64::from(x) + 0.5, f64::from(y) + 0.5));
+                let direction = k.lens.direction(plane_point(k, f64::from(x) + 0.5, f64::from(y) + 0.5));
                 data.extend(direction.map_or([0.0; 3], color).map(|v| v.round() as u8));
             }
         }
@@ -257,7 +250,7 @@ mod tests {
                 let mut worst = 0f64;
                 for (at, pixel) in (0u32..).zip(image.data.chunks_exact(3)) {
                     let (x, y) = (at % image.width, at / image.width);
-                    let ray = plane(&pinhole, f64::from(x) + 0.5, f64::from(y) + 0.5).extend(1.0);
+                    let ray = plane_point(&pinhole, f64::from(x) + 0.5, f64::from(y) + 0.5).extend(1.0);
                     for (value, expected) in pixel.iter().zip(color(plan.turn() * ray)) {
                         worst = worst.max((f64::from(*value) - expected).abs());
                     }

@@ -126,7 +126,7 @@ impl Undistortion {
         self.turn
     }
 
-    /// Where the centre of the photograph's pixel `(x, y)`, if the lens has a direction for it, lies in the results: inside or not.
+    /// Whether the results show what is at the position `(x, y)` in the photograph, pixels.
     pub fn shows(&self, x: f64, y: f64) -> bool {
         let direction = self.source.lens.direction(plane_point(&self.source, x, y));
         let ray = direction.map(|direction| self.turn.inverse() * direction);
@@ -311,7 +311,8 @@ impl Crop {
     }
 }
 
-fn plane_point(k: &Intrinsics, x: f64, y: f64) -> DVec2 {
+/// The point of the lens's plane at a pixel position.
+pub(crate) fn plane_point(k: &Intrinsics, x: f64, y: f64) -> DVec2 {
     DVec2::new(
         (x - f64::from(k.cx)) / f64::from(k.fx),
         (y - f64::from(k.cy)) / f64::from(k.fy),

@@ -99,6 +99,13 @@ impl Camera {
         (p.z > self.near).then(|| (Vec2::new(k.fx * p.x / p.z + k.cx, k.fy * p.y / p.z + k.cy), p.z))
     }
 
+    /// Whether a world point is beyond the near plane and within the image, ignoring the lens and what may hide it.
+    pub fn sees(&self, world: Vec3) -> bool {
+        let k = &self.intrinsics;
+        self.project(world)
+            .is_some_and(|(at, _)| (0.0..k.width as f32).contains(&at.x) && (0.0..k.height as f32).contains(&at.y))
+    }
+
     /// Unit direction in the world of the ray through pixel coordinates `(x, y)`, ignoring the lens.
     pub fn ray_direction(&self, pixel: Vec2) -> Vec3 {
         let k = &self.intrinsics;

@@ -5,7 +5,7 @@ use crate::lens::SynthLens;
 use crate::scene::SynthScene;
 use crate::scenes::SceneName;
 use crate::shape::Ray;
-use crate::trace::{SynthFrame, pixel_ray};
+use crate::trace::{SynthFrame, depth_per_distance, pixel_ray};
 use glam::{Vec2, Vec3};
 use irradia_scene::{Camera, Dataset, Photo, PointCloud, Rng, View};
 use std::sync::Arc;
@@ -253,11 +253,7 @@ fn add_point(points: &mut PointCloud, camera: &Camera, frame: &SynthFrame, [x, y
         return;
     };
     let depth = frame.depth.pixel(x, y)[0];
-    let distance = if camera.intrinsics.lens.is_wide() {
-        depth
-    } else {
-        depth / direction.dot(camera.pose.rotation * Vec3::Z)
-    };
+    let distance = depth / depth_per_distance(camera, direction);
     let error = Vec3::new(rng.normal(), rng.normal(), rng.normal()) * (POINT_ERROR * distance);
     points
         .positions

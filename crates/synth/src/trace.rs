@@ -57,7 +57,6 @@ impl SynthScene {
             normals: Image::zeros(width, height, 3),
         };
         let row = width as usize;
-        let forward = camera.pose.rotation * Vec3::Z;
         let rows = frame
             .color
             .data
@@ -74,8 +73,7 @@ impl SynthScene {
                         continue;
                     };
                     if let Some(hit) = self.hit(&ray, camera.near) {
-                        let is_wide = camera.intrinsics.lens.is_wide();
-                        depth[x] = hit.t * if is_wide { 1.0 } else { ray.direction.dot(forward) };
+                        depth[x] = hit.t * depth_per_distance(camera, ray.direction);
                         normals[3 * x..3 * x + 3].copy_from_slice(&hit.normal.to_array());
                     }
                 }
@@ -199,6 +197,15 @@ impl SynthScene {
         // Without a shadow ray: 0.7 is the assumed fraction of sunlit surfaces.
         let sunlit = 0.7 * hit.normal.dot(light.sun).max(0.0);
         color * (light.sun_light * sunlit + ambient::open(light, &hit))
+    }
+}
+
+/// What the depth of [`SynthFrame`] is to a distance of 1 along the unit `direction`.
+pub(crate) fn depth_per_distance(camera: &Camera, direction: Vec3) -> f32 {
+    if camera.intrinsics.lens.is_wide() {
+        1.0
+    } else {
+        direction.dot(camera.pose.rotation * Vec3::Z)
     }
 }
 

@@ -4,7 +4,7 @@ use crate::pixel_size::depth_shown;
 use crate::robust::median;
 use crate::trainer::train_cameras;
 use glam::Vec3;
-use irradia_scene::{Camera, Dataset};
+use irradia_scene::Dataset;
 use irradia_splat::init;
 use rayon::prelude::*;
 use std::f64::consts::PI;
@@ -22,20 +22,13 @@ pub(crate) fn spacing(dataset: &Dataset) -> f64 {
         let pose = &view.camera.pose;
         let depth = depth_shown(dataset, view, focus);
         let shown = pose.world_from_camera(depth * Vec3::Z);
-        let others = cameras.iter().filter(|other| {
-            other.pose.position.distance(pose.position) > SAME_PLACE * depth && is_in_view(other, shown)
-        });
+        let others = cameras
+            .iter()
+            .filter(|other| other.pose.position.distance(pose.position) > SAME_PLACE * depth && other.sees(shown));
         let angles = others.map(|other| f64::from((pose.position - shown).angle_between(other.pose.position - shown)));
         angles.fold(PI, f64::min)
     };
     median(dataset.train.par_iter().map(angle).collect())
-}
-
-fn is_in_view(camera: &Camera, point: Vec3) -> bool {
-    let k = &camera.intrinsics;
-    camera
-        .project(point)
-        .is_some_and(|(at, _)| (0.0..k.width as f32).contains(&at.x) && (0.0..k.height as f32).contains(&at.y))
 }
 
 #[cfg(test)]

@@ -293,12 +293,13 @@ impl Trainer {
 
     /// The recipe's components in the sockets of a step, untrained.
     pub(crate) fn first_sockets(&mut self) -> Result<Sockets, TrainError> {
-        if self.engine.is_on_gpu() && self.recipe.appearance.take().is_some() && self.recipe.uses(Param::RateCodes) {
+        if self.engine.is_on_gpu() && self.recipe.light().is_some() {
+            self.recipe.appearance = None;
             self.decisions
                 .push("the light of photographs is trained on the CPU only, and left out".into());
         }
         // Only the spaces of fields depend on transparency; photographs are not read for the others.
-        let fields = self.recipe.residual.is_some() || self.recipe.appearance.is_some();
+        let fields = self.recipe.residual.is_some() || self.recipe.light().is_some();
         let transparent = fields && self.transparent()?;
         Sockets::new(&self.recipe, &self.dataset, transparent, self.options.seed)
     }

@@ -277,10 +277,7 @@ impl Finishing<'_> {
 
     fn is_seen(&self, camera: &Camera, point: u32) -> bool {
         let position = self.points.and_then(|points| points.positions.get(point as usize));
-        let k = &camera.intrinsics;
-        position
-            .and_then(|p| camera.project(*p))
-            .is_some_and(|(at, _)| (0.0..k.width as f32).contains(&at.x) && (0.0..k.height as f32).contains(&at.y))
+        position.is_some_and(|position| camera.sees(*position))
     }
 
     /// The view of a photograph undistorted by `plan`.

@@ -501,6 +501,11 @@ impl Recipe {
             .any(|knob| *knob != Knob::Const(0.0))
     }
 
+    /// The field of the light of photographs, if it acts.
+    pub(crate) fn light(&self) -> Option<&ResidualKnobs> {
+        self.appearance.as_ref().filter(|_| self.uses(Param::RateCodes))
+    }
+
     /// Takes `param` out of all stages: it has its default.
     pub fn unset(&mut self, param: Param) {
         let params = std::iter::once(&mut self.params).chain(self.stage.iter_mut().map(|stage| &mut stage.params));

@@ -2,11 +2,9 @@
 //! appearance code (NeRF-W, Martin-Brualla et al. 2021; for splats WildGaussians, Kulhanek et al. 2024), less what it outputs for the mean code: in
 //! the mean light, which held-out views and exported scenes have, it adds nothing.
 
-use super::Occupant;
 use super::color_field::ColorField;
 use crate::recipe::{Param, ResidualKnobs};
 use crate::schedule::StepPlan;
-use crate::tensor_file::{NamedTensor, TensorSource};
 use crate::trainer::TrainError;
 use glam::Vec3;
 use irradia_field::Space;
@@ -17,7 +15,7 @@ const STREAM_APPEARANCE: u64 = 9;
 
 /// The light of photographs in training.
 #[derive(Clone)]
-pub struct Appearance(ColorField);
+pub struct Appearance(pub(super) ColorField);
 
 /// What is added in the light of `view`.
 fn terms(view: usize) -> [(Option<u32>, f32); 2] {
@@ -30,7 +28,7 @@ impl Appearance {
     /// # Errors
     /// When the field's configuration is invalid.
     pub fn new(knobs: &ResidualKnobs, views: usize, space: Space, seed: u64) -> Result<Self, TrainError> {
-        ColorField::new(knobs, views, space, seed ^ STREAM_APPEARANCE << 40).map(Self)
+        ColorField::new("appearance", knobs, views, space, seed ^ STREAM_APPEARANCE << 40).map(Self)
     }
 
     /// Whether it adds to the frame of `plan`. Once it has begun it stays active.
@@ -46,23 +44,5 @@ impl Appearance {
     /// The vector-Jacobian product of [`Self::colors`] and a step of Adam, given the gradients of the colours.
     pub fn step(&mut self, view: usize, center: Vec3, surfaces: &[Surface], v_colors: &[[f32; 3]], plan: &StepPlan) {
         self.0.step(&terms(view), center, surfaces, v_colors, plan);
-    }
-}
-
-impl Occupant for Appearance {
-    fn name(&self) -> &'static str {
-        "appearance"
-    }
-
-    fn tensors(&self) -> Vec<NamedTensor> {
-        self.0.tensors()
-    }
-
-    fn restore(&mut self, tensors: TensorSource) -> Result<(), String> {
-        self.0.restore(tensors)
-    }
-
-    fn export(&self) -> Option<Vec<u8>> {
-        self.0.export()
     }
 }

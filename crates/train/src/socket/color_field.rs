@@ -1,5 +1,6 @@
 //! A small field that adds to the splats' colours, by position and viewing direction: what both occupants of the socket at colour are.
 
+use super::Occupant;
 use crate::field_file;
 use crate::recipe::{Param, ResidualKnobs};
 use crate::schedule::StepPlan;
@@ -15,15 +16,23 @@ pub(super) type Terms<'a> = &'a [(Option<u32>, f32)];
 /// A field in training.
 #[derive(Clone)]
 pub(super) struct ColorField {
+    name: &'static str,
     state: FieldState,
     beta2: f32,
 }
 
 impl ColorField {
-    /// A field in `space` with codes for `images` photographs, if its network takes codes, that adds nothing yet.
-    pub fn new(knobs: &ResidualKnobs, images: usize, space: Space, seed: u64) -> Result<Self, TrainError> {
+    /// A field in `space` with codes for `images` photographs, if its network takes codes, that adds nothing yet; `name` is the occupant's.
+    pub fn new(
+        name: &'static str,
+        knobs: &ResidualKnobs,
+        images: usize,
+        space: Space,
+        seed: u64,
+    ) -> Result<Self, TrainError> {
         let field = Field::residual(knobs.net, knobs.mirrored, images, space, seed)?;
         Ok(Self {
+            name,
             state: FieldState::new(field),
             beta2: knobs.beta2,
         })
@@ -51,18 +60,24 @@ impl ColorField {
         let queries = queries(&self.state.field, center, surfaces);
         train_residual(&mut self.state, &queries, terms, v_colors, &options);
     }
+}
 
-    pub fn tensors(&self) -> Vec<NamedTensor> {
+impl Occupant for ColorField {
+    fn name(&self) -> &'static str {
+        self.name
+    }
+
+    fn tensors(&self) -> Vec<NamedTensor> {
         field_file::state_tensors(&self.state)
     }
 
-    pub fn restore(&mut self, tensors: TensorSource) -> Result<(), String> {
+    fn restore(&mut self, tensors: TensorSource) -> Result<(), String> {
         let Field { config, space, .. } = &self.state.field;
         self.state = field_file::state_from(config.clone(), *space, tensors)?;
         Ok(())
     }
 
-    pub fn export(&self) -> Option<Vec<u8>> {
+    fn export(&self) -> Option<Vec<u8>> {
         self.learnt().map(field_file::to_bytes)
     }
 }

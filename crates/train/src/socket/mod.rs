@@ -105,11 +105,9 @@ impl Sockets {
             Some(knobs) => Some(Residual::new(knobs, space()?, seed)?),
             None => None,
         };
-        let appearance = match &recipe.appearance {
-            Some(knobs) if recipe.uses(Param::RateCodes) => {
-                Some(Appearance::new(knobs, dataset.views.len(), space()?, seed)?)
-            }
-            _ => None,
+        let appearance = match recipe.light() {
+            Some(knobs) => Some(Appearance::new(knobs, dataset.views.len(), space()?, seed)?),
+            None => None,
         };
         Ok(Self {
             appearance,
@@ -125,10 +123,10 @@ impl Sockets {
     /// All occupants, for saving.
     pub fn occupants(&self) -> Vec<&dyn Occupant> {
         let poses = self.poses.as_ref().map(|o| o as &dyn Occupant);
-        let residual = self.residual.as_ref().map(|o| o as &dyn Occupant);
+        let residual = self.residual.as_ref().map(|o| &o.0 as &dyn Occupant);
         let exposure = self.exposure.as_ref().map(|o| o as &dyn Occupant);
         let sky = self.sky.as_ref().map(|o| o as &dyn Occupant);
-        let appearance = self.appearance.as_ref().map(|o| o as &dyn Occupant);
+        let appearance = self.appearance.as_ref().map(|o| &o.0 as &dyn Occupant);
         [poses, residual, appearance, exposure, sky]
             .into_iter()
             .flatten()
@@ -138,8 +136,8 @@ impl Sockets {
     /// All occupants, for restoring.
     pub fn occupants_mut(&mut self) -> Vec<&mut dyn Occupant> {
         let poses = self.poses.as_mut().map(|o| o as &mut dyn Occupant);
-        let residual = self.residual.as_mut().map(|o| o as &mut dyn Occupant);
-        let appearance = self.appearance.as_mut().map(|o| o as &mut dyn Occupant);
+        let residual = self.residual.as_mut().map(|o| &mut o.0 as &mut dyn Occupant);
+        let appearance = self.appearance.as_mut().map(|o| &mut o.0 as &mut dyn Occupant);
         let exposure = self.exposure.as_mut().map(|o| o as &mut dyn Occupant);
         let sky = self.sky.as_mut().map(|o| o as &mut dyn Occupant);
         [poses, residual, appearance, exposure, sky]

@@ -1,10 +1,8 @@
 //! At colour: a small field that adds to the splats' colours, by position and viewing direction.
 
-use super::Occupant;
 use super::color_field::{self, ColorField, Terms};
 use crate::recipe::{Param, ResidualKnobs};
 use crate::schedule::StepPlan;
-use crate::tensor_file::{NamedTensor, TensorSource};
 use crate::trainer::TrainError;
 use glam::Vec3;
 use irradia_field::{Field, Space};
@@ -17,7 +15,7 @@ const TERMS: Terms = &[(None, 1.0)];
 
 /// A residual field in training.
 #[derive(Clone)]
-pub struct Residual(ColorField);
+pub struct Residual(pub(super) ColorField);
 
 /// The colours that `field` adds to `surfaces` seen from `center`, world.
 pub fn added_colors(field: &Field, center: Vec3, surfaces: &[Surface]) -> Vec<[f32; 3]> {
@@ -30,7 +28,7 @@ impl Residual {
     /// # Errors
     /// When the field's configuration is invalid.
     pub fn new(knobs: &ResidualKnobs, space: Space, seed: u64) -> Result<Self, TrainError> {
-        ColorField::new(knobs, 0, space, seed ^ STREAM_RESIDUAL << 40).map(Self)
+        ColorField::new("residual", knobs, 0, space, seed ^ STREAM_RESIDUAL << 40).map(Self)
     }
 
     /// Whether it adds to the frame of `plan`. Once it has begun it stays active.
@@ -51,23 +49,5 @@ impl Residual {
     /// The vector-Jacobian product of [`Self::colors`] and a step of Adam, given the gradients of the colours.
     pub fn step(&mut self, center: Vec3, surfaces: &[Surface], v_colors: &[[f32; 3]], plan: &StepPlan) {
         self.0.step(TERMS, center, surfaces, v_colors, plan);
-    }
-}
-
-impl Occupant for Residual {
-    fn name(&self) -> &'static str {
-        "residual"
-    }
-
-    fn tensors(&self) -> Vec<NamedTensor> {
-        self.0.tensors()
-    }
-
-    fn restore(&mut self, tensors: TensorSource) -> Result<(), String> {
-        self.0.restore(tensors)
-    }
-
-    fn export(&self) -> Option<Vec<u8>> {
-        self.0.export()
     }
 }

@@ -157,6 +157,7 @@ test("an address holds the camera", async () => {
   await page.keyboard.press("u");
   await until(page, () => location.hash.startsWith("#p="));
   const address = await page.evaluate(() => location.href);
+  assert.match(address, /#p=/);
   const other = await open(browser, address, { width: 500, height: 400 });
   const [here, there] = [await get(page, "camera"), await get(other.page, "camera")];
   assert.ok(here.position.every((v, i) => Math.abs(v - there.position[i]) < 1e-4));

@@ -52,7 +52,11 @@ export async function looksAsDrawn(page, scene, screenshot, { settled, zoom }) {
   const dragged = await camera();
   await zoom();
   // The page may see the wheel later than the browser took it.
-  while ((await camera()) === dragged) await new Promise((resolve) => setTimeout(resolve, 20));
+  const end = Date.now() + 120000;
+  while ((await camera()) === dragged) {
+    assert.ok(Date.now() < end, "the page never saw the wheel");
+    await new Promise((resolve) => setTimeout(resolve, 20));
+  }
   await settled();
   const second = await shown(page);
   assert.ok(psnr(first, second) < 30, "the drag did not change the picture");

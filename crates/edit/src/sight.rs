@@ -42,13 +42,9 @@ impl Depths {
 
     /// The depth that the picture shows in the direction of a point, and the point's own; `None` if it is outside the picture.
     pub fn at(&self, point: Vec3) -> Option<[f32; 2]> {
-        let (pixel, depth) = self.camera.project(point)?;
-        let k = &self.camera.intrinsics;
-        let inside = pixel.x >= 0.0 && pixel.y >= 0.0 && pixel.x < k.width as f32 && pixel.y < k.height as f32;
-        inside.then(|| {
-            let at = pixel.y as usize * k.width as usize + pixel.x as usize;
-            [self.depth[at], depth]
-        })
+        let (pixel, depth) = self.camera.sees(point)?;
+        let at = pixel.y as usize * self.camera.intrinsics.width as usize + pixel.x as usize;
+        Some([self.depth[at], depth])
     }
 }
 

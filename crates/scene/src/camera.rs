@@ -99,11 +99,11 @@ impl Camera {
         (p.z > self.near).then(|| (Vec2::new(k.fx * p.x / p.z + k.cx, k.fy * p.y / p.z + k.cy), p.z))
     }
 
-    /// Whether a world point is beyond the near plane and within the image, ignoring the lens and what may hide it.
-    pub fn sees(&self, world: Vec3) -> bool {
+    /// As [`Self::project`], but `None` outside the image as well; what may hide the point is ignored.
+    pub fn sees(&self, world: Vec3) -> Option<(Vec2, f32)> {
         let k = &self.intrinsics;
         self.project(world)
-            .is_some_and(|(at, _)| (0.0..k.width as f32).contains(&at.x) && (0.0..k.height as f32).contains(&at.y))
+            .filter(|(at, _)| (0.0..k.width as f32).contains(&at.x) && (0.0..k.height as f32).contains(&at.y))
     }
 
     /// Unit direction in the world of the ray through pixel coordinates `(x, y)`, ignoring the lens.

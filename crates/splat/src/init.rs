@@ -166,7 +166,7 @@ impl Candidate {
         if self.is_outside {
             return;
         }
-        if let Some(pixel) = sees(camera, self.point) {
+        if let Some((pixel, _)) = camera.sees(self.point) {
             match content(pixel) {
                 PixelClass::Color(color) => {
                     self.seen += 1;
@@ -185,13 +185,6 @@ impl Candidate {
         }
         Some((self.seen, self.sum.map(|s| (s / self.seen.max(1)) as u8)))
     }
-}
-
-/// The pixel onto which `camera` projects `point`, if inside the image.
-fn sees(camera: &Camera, point: Vec3) -> Option<Vec2> {
-    let k = &camera.intrinsics;
-    let (p, _) = camera.project(point)?;
-    (p.x >= 0.0 && p.y >= 0.0 && p.x < k.width as f32 && p.y < k.height as f32).then_some(p)
 }
 
 /// The point nearest to all optical axes, in the least-squares sense, moved in front of the cameras if the axes are parallel

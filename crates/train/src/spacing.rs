@@ -22,9 +22,9 @@ pub(crate) fn spacing(dataset: &Dataset) -> f64 {
         let pose = &view.camera.pose;
         let depth = depth_shown(dataset, view, focus);
         let shown = pose.world_from_camera(depth * Vec3::Z);
-        let others = cameras
-            .iter()
-            .filter(|other| other.pose.position.distance(pose.position) > SAME_PLACE * depth && other.sees(shown));
+        let others = cameras.iter().filter(|other| {
+            other.pose.position.distance(pose.position) > SAME_PLACE * depth && other.sees(shown).is_some()
+        });
         let angles = others.map(|other| f64::from((pose.position - shown).angle_between(other.pose.position - shown)));
         angles.fold(PI, f64::min)
     };

@@ -277,7 +277,7 @@ impl Finishing<'_> {
 
     fn is_seen(&self, camera: &Camera, point: u32) -> bool {
         let position = self.points.and_then(|points| points.positions.get(point as usize));
-        position.is_some_and(|position| camera.sees(*position))
+        position.and_then(|position| camera.sees(*position)).is_some()
     }
 
     /// The view of a photograph undistorted by `plan`.

@@ -72,6 +72,21 @@ impl Cut {
     }
 }
 
+/// The whole faces of a panorama.
+pub(crate) fn panorama_faces(width: u32, height: u32) -> Vec<(&'static str, Undistortion)> {
+    let focal = (f64::from(width) / (2.0 * PI)) as f32;
+    let source = Intrinsics {
+        width,
+        height,
+        fx: focal,
+        fy: (f64::from(height) / PI) as f32,
+        cx: 0.5 * width as f32,
+        cy: 0.5 * height as f32,
+        lens: Lens::Equirectangular,
+    };
+    faces(&source, PI)
+}
+
 /// The angle from the axis up to which the lens is monotonic, radians.
 fn reach(lens: &Lens) -> f64 {
     match *lens {

@@ -34,7 +34,10 @@ pub use describe::{Description, Kind, describe, detect};
 pub use error::{FormatError, Malformed};
 pub use image_file::{Pixels, read_image, write_png, write_png_16};
 pub use pack::gzip;
-pub use photos::{CameraTags, PhotoEntry, PhotoFolder, has_photos, read_photo_folder};
+pub use photos::{
+    CameraTags, PanoramaFace, PhotoEntry, PhotoFolder, find_panoramas, has_photos, read_photo_folder,
+    read_photo_folders,
+};
 pub use points_ply::{read_points_ply, write_points_ply};
 pub use splats::{
     Quality, SogDetail, SplatFile, SplatFormat, SpzVersion, WriteOptions, encode_splats, is_sog_folder, parse_splats,

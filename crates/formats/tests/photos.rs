@@ -1,7 +1,9 @@
 //! Folders of photographs without poses.
 
 use irradia_formats::{ColmapCamera, ColmapImage, ColmapModel, PosedImage, write_colmap};
-use irradia_formats::{DatasetOptions, has_photos, read_dataset, read_photo_folder};
+use irradia_formats::{
+    DatasetOptions, find_panoramas, has_photos, read_dataset, read_photo_folder, read_photo_folders,
+};
 use std::fs;
 use std::path::Path;
 
@@ -148,4 +150,91 @@ fn photographs_are_as_read_dataset_decodes_them() {
         );
         assert!(pixels.data == own.data, "{}", photo.name);
     }
+}
+
+/// What an equirectangular camera sees of a world of patches, from directions.
+fn panorama(width: u32) -> image::RgbImage {
+    use std::f32::consts::{PI, TAU};
+    let height = width / 2;
+    image::RgbImage::from_fn(width, height, |x, y| {
+        let (longitude, latitude) = (
+            (x as f32 + 0.5) / width as f32 * TAU - PI,
+            (y as f32 + 0.5) / height as f32 * PI - 0.5 * PI,
+        );
+        let d = [
+            latitude.cos() * longitude.sin(),
+            latitude.sin(),
+            latitude.cos() * longitude.cos(),
+        ];
+        image::Rgb([0, 1, 2].map(|c| (128.0 + 60.0 * d[c] + 60.0 * (7.0 * d[c] + 3.0 * d[(c + 1) % 3]).sin()) as u8))
+    })
+}
+
+#[test]
+fn panoramas_are_found_and_cut_into_faces() {
+    let folder = tempfile::tempdir().unwrap();
+    let root = folder.path();
+    let round = panorama(1024);
+    round.save(root.join("a.png")).unwrap();
+    // Of the same shape, but no panoramas: a crop, a small one, an object before white.
+    image::imageops::crop_imm(&round, 100, 100, 600, 300)
+        .to_image()
+        .save(root.join("b.png"))
+        .unwrap();
+    image::imageops::thumbnail(&round, 400, 200)
+        .save(root.join("c.png"))
+        .unwrap();
+    let object = image::RgbImage::from_fn(800, 400, |x, y| match (x.abs_diff(400) < 150, y.abs_diff(200) < 120) {
+        (true, true) => *round.get_pixel(x, y),
+        _ => image::Rgb([250; 3]),
+    });
+    object.save(root.join("d.png")).unwrap();
+    let photos = read_photo_folder(root).unwrap().photos;
+    assert_eq!(find_panoramas(&photos), [true, false, false, false]);
+
+    let out = root.join("faces");
+    let faces = photos[0].cut_panorama(&out).unwrap();
+    let names: Vec<&str> = faces.iter().map(|face| face.name.as_str()).collect();
+    assert_eq!(
+        names,
+        [
+            "a_back.jpg",
+            "a_down.jpg",
+            "a_front.jpg",
+            "a_left.jpg",
+            "a_right.jpg",
+            "a_up.jpg"
+        ]
+    );
+    // A face's middle looks along its axis: the front at the panorama's middle, the right a quarter further.
+    for (face, x) in [(&faces[2], 512), (&faces[4], 768), (&faces[3], 256)] {
+        let picture = image::open(out.join("images").join(&face.name)).unwrap().into_rgb8();
+        assert_eq!(
+            (picture.width(), picture.height()),
+            (face.camera.width, face.camera.height)
+        );
+        let (here, there) = (
+            picture.get_pixel(picture.width() / 2, picture.height() / 2),
+            round.get_pixel(x, 256),
+        );
+        let apart = here.0.iter().zip(there.0).map(|(a, b)| a.abs_diff(b)).max().unwrap();
+        assert!(apart < 8, "{}: {here:?} {there:?}", face.name);
+    }
+}
+
+#[test]
+fn folders_are_read_together_and_names_stay_apart() {
+    let root = tempfile::tempdir().unwrap();
+    let [first, second] = ["first", "second"].map(|name| root.path().join(name));
+    for (folder, red) in [(&first, 10), (&second, 90)] {
+        fs::create_dir(folder).unwrap();
+        picture(40, 30, red).save(folder.join("1.png")).unwrap();
+    }
+    picture(40, 30, 200).save(second.join("2.png")).unwrap();
+    fs::copy(first.join("1.png"), second.join("3.png")).unwrap();
+    let found = read_photo_folders(&[first, second]).unwrap();
+    let names: Vec<&str> = found.photos.iter().map(|photo| photo.name.as_str()).collect();
+    assert_eq!(names, ["2.png", "3.png", "second_1.png"]);
+    assert_eq!(found.left_out.len(), 1);
+    assert!(found.left_out[0].0 == "first_1.png" && found.left_out[0].1.contains("copy of 3.png"));
 }

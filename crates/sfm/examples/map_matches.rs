@@ -41,6 +41,8 @@ fn main() {
             group: 0,
             focal_prior_px: (focal > 0.0).then_some(focal),
             up: None,
+            camera: None,
+            mount: None,
         });
         let keypoints = (0..file.u32())
             .map(|_| Keypoint {

@@ -5,10 +5,13 @@ mod world;
 use glam::{DQuat, DVec3};
 use irradia_scene::Rng;
 use irradia_sfm::Features;
+use irradia_sfm::geometry::camera::DCamera;
 use irradia_sfm::geometry::pose::DPose;
 use irradia_sfm::map::{
-    Distance, Known, MapOptions, Model, PairKind, Reason, Reconstruction, agreement, extend, reconstruct, to_distances,
+    Distance, Known, MapOptions, Model, Mount, PairKind, Reason, Reconstruction, agreement, extend, reconstruct,
+    to_distances,
 };
+use std::f64::consts::{FRAC_PI_2, PI};
 use world::{World, around};
 
 #[test]
@@ -74,6 +77,78 @@ fn photographs_are_registered_into_a_known_model_that_stays_as_it_is() {
     }
     let focal = model.cameras[1].expect("registered").focal();
     assert!((focal / 870.0 - 1.0).abs() < 0.02, "{focal}");
+}
+
+/// Panoramas on a walk through a room, each as the six faces of a cube, with a known camera.
+fn panoramas(count: usize, points: usize) -> World {
+    let face = DCamera::centered(600, 600, 300.0);
+    let turns = [
+        DQuat::IDENTITY,
+        DQuat::from_rotation_y(FRAC_PI_2),
+        DQuat::from_rotation_y(PI),
+        DQuat::from_rotation_y(-FRAC_PI_2),
+        DQuat::from_rotation_x(FRAC_PI_2),
+        DQuat::from_rotation_x(-FRAC_PI_2),
+    ];
+    let mut poses = Vec::new();
+    for i in 0..count {
+        let at = i as f64 / count as f64;
+        let eye = DVec3::new(3.0 * at - 1.5, (4.0 * at).sin(), 0.2 * (9.0 * at).cos());
+        let rig = world::look(eye, eye + DVec3::new((2.0 * at).cos(), (2.0 * at).sin(), 0.1));
+        poses.extend(turns.map(|turn| DPose {
+            rotation: rig.rotation * turn,
+            ..rig
+        }));
+    }
+    let mut rng = Rng::new(31, 0);
+    let mut uniform = |range: f64| range * f64::from(rng.range(-1.0, 1.0));
+    let walls: Vec<(DVec3, DVec3)> = (0..points)
+        .map(|i| {
+            let side = if i % 2 == 0 { 1.0 } else { -1.0 };
+            let (a, b) = (uniform(1.0), uniform(1.0));
+            match i % 10 {
+                0..4 => (DVec3::new(4.0 * side, 3.0 * a, 1.5 * b), DVec3::X * -side),
+                4..8 => (DVec3::new(4.0 * a, 3.0 * side, 1.5 * b), DVec3::Y * -side),
+                _ => (DVec3::new(4.0 * a, 3.0 * b, 1.5 * side), DVec3::Z * -side),
+            }
+        })
+        .collect();
+    let mut world = World::seen_by(face, poses, &walls, 0, 0.5, 0.2, 32);
+    for (i, photo) in world.photos.iter_mut().enumerate() {
+        photo.camera = Some(face);
+        photo.focal_prior_px = Some(300.0);
+        photo.up = Some(turns[i % 6].inverse() * DVec3::NEG_Y);
+        photo.mount = Some(Mount {
+            rig: i / 6,
+            rotation: turns[i % 6],
+        });
+    }
+    world
+}
+
+#[test]
+fn photographs_of_a_rig_have_one_place_and_their_turns() {
+    let world = panoramas(8, 1500);
+    let result = world.map();
+    let model = &result.models[0];
+    assert_eq!(model.registered(), 48);
+    assert_eq!(model.cameras[0], world.photos[0].camera);
+    assert!(world.auc(model, 1.0) > 90.0, "{}", world.auc(model, 1.0));
+    let mut alone = world;
+    for faces in model.poses.chunks(6) {
+        let faces: Vec<DPose> = faces.iter().map(|pose| pose.expect("registered")).collect();
+        for (face, photo) in faces.iter().zip(&alone.photos) {
+            let mount = photo.mount.expect("on a rig").rotation;
+            assert_eq!(face.position, faces[0].position);
+            assert!((face.rotation * DVec3::ONE - faces[0].rotation * mount * DVec3::ONE).length() < 1e-9);
+        }
+    }
+    // Common places are what makes them accurate.
+    let auc = alone.auc(model, 1.0);
+    alone.photos.iter_mut().for_each(|photo| photo.mount = None);
+    let apart = alone.map();
+    let of_alone = alone.auc(&apart.models[0], 1.0);
+    assert!(auc > of_alone, "{auc} {of_alone}");
 }
 
 #[test]

@@ -1,6 +1,7 @@
 //! A folder of photographs without poses: which there are, and what took them.
 
 mod exif;
+mod panorama;
 
 use crate::dataset::{Masks, is_image_name, list_files, oriented_size, turned_as_stored};
 use crate::error::read_file;
@@ -9,8 +10,9 @@ use crate::{FormatError, Pixels};
 pub use exif::{CameraTags, parse_camera_tags};
 use image::metadata::Orientation;
 use irradia_scene::resize_area;
+pub use panorama::{PanoramaFace, find_panoramas};
 use rayon::prelude::*;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashMap};
 use std::path::{Path, PathBuf};
 
 /// Extensions of photographs that are not read.
@@ -115,18 +117,45 @@ impl PhotoFolder {
 /// # Errors
 /// When the folder cannot be read.
 pub fn read_photo_folder(folder: &Path) -> Result<PhotoFolder, FormatError> {
-    let mut files = list_pictures(folder)?;
-    if files.is_empty() && folder.join("images").is_dir() {
-        files = list_pictures(&folder.join("images"))?;
-    }
-    let masks = Masks::beside(folder, "images");
-    let entries: Vec<(String, Result<PhotoEntry, String>)> = files
-        .into_par_iter()
-        .map(|path| {
+    read_photo_folders(&[folder])
+}
+
+/// As [`read_photo_folder`], of several folders: photographs of the same name get that of their folder before it.
+///
+/// # Errors
+/// When a folder cannot be read.
+pub fn read_photo_folders(folders: &[impl AsRef<Path>]) -> Result<PhotoFolder, FormatError> {
+    let mut files: Vec<(PathBuf, String, Option<PathBuf>)> = Vec::new();
+    for folder in folders.iter().map(AsRef::as_ref) {
+        let mut here = list_pictures(folder)?;
+        if here.is_empty() && folder.join("images").is_dir() {
+            here = list_pictures(&folder.join("images"))?;
+        }
+        let masks = Masks::beside(folder, "images");
+        files.extend(here.into_iter().map(|path| {
             let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
             let mask = masks.as_ref().and_then(|masks| masks.of(&name));
-            let entry = read_entry(&path, &name, mask);
-            (name, entry)
+            (path, name, mask)
+        }));
+    }
+    let mut known: HashMap<String, usize> = HashMap::new();
+    for (_, name, _) in &files {
+        *known.entry(name.clone()).or_default() += 1;
+    }
+    for (path, name, _) in files.iter_mut().filter(|(_, name, _)| known[name] > 1) {
+        let folder = path.parent().and_then(Path::file_name).unwrap_or_default();
+        *name = format!("{}_{name}", folder.to_string_lossy());
+    }
+    files.sort_by(|a, b| a.1.cmp(&b.1));
+    let entries: Vec<(String, Result<PhotoEntry, String>)> = files
+        .par_iter()
+        .enumerate()
+        .map(|(i, (path, name, mask))| {
+            let entry = match i > 0 && files[i - 1].1 == *name {
+                true => Err("another photograph has this name: rename it".to_owned()),
+                false => read_entry(path, name, mask.clone()),
+            };
+            (name.clone(), entry)
         })
         .collect();
     let mut found = PhotoFolder::default();

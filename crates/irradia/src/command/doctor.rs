@@ -10,8 +10,9 @@ use std::path::PathBuf;
 
 #[derive(clap::Args)]
 pub struct Args {
-    /// Folder of photographs (JPEG, PNG, WebP, TIFF)
-    pub photos: PathBuf,
+    /// Folders of photographs (JPEG, PNG, WebP, TIFF) and of films, or films; films and panoramas need --out
+    #[arg(required = true)]
+    pub photos: Vec<PathBuf>,
     /// Folder for doctor.html, with small pictures, and doctor.json; nothing is written when absent. Features and matches are kept
     /// there too: irradia pose with the same folder reuses them
     #[arg(long, value_name = "FOLDER")]
@@ -26,8 +27,11 @@ pub struct Args {
 
 pub fn run(args: &Args) -> Result<()> {
     use_threads(args.threads)?;
-    let mut input = DoctorInput::new(&args.photos);
-    input.out.clone_from(&args.out);
+    let mut input = DoctorInput {
+        photos: args.photos.clone(),
+        out: args.out.clone(),
+        ..DoctorInput::new("")
+    };
     input.max_features = args.max_features.unwrap_or(input.max_features);
     let report = with_progress(|progress| doctor(&input, progress)).map_err(by_option)?;
     tell_findings(&report.findings, |line| say(line))?;

@@ -6,8 +6,10 @@ use crate::terminal::{note, say};
 use anyhow::Result;
 use clap::builder::RangedU64ValueParser;
 use indicatif::{ProgressBar, ProgressStyle};
-use irradia_runs::formats::{DatasetFormat, has_photos};
-use irradia_runs::{Finding, KnownDistance, Mapper, PoseInput, PoseProgress, PoseReport, TrainInput, is_film, pose};
+use irradia_runs::formats::DatasetFormat;
+use irradia_runs::{
+    Finding, KnownDistance, Mapper, PoseInput, PoseProgress, PoseReport, TrainInput, is_capture, is_film, pose,
+};
 use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
@@ -22,8 +24,10 @@ const LINE_EVERY: Duration = Duration::from_secs(5);
 
 #[derive(clap::Args)]
 pub struct Args {
-    /// Folder of photographs (JPEG, PNG, WebP, TIFF; masks, if any, in its folder masks), or a film, which needs ffmpeg
-    pub photos: PathBuf,
+    /// Folders of photographs (JPEG, PNG, WebP, TIFF; masks, if any, in their folders masks) and of films, or films, which need ffmpeg;
+    /// panoramas of the whole sphere (equirectangular) are recognised and cut into faces
+    #[arg(required = true)]
+    pub photos: Vec<PathBuf>,
     /// Folder for the dataset: the photographs and their poses in COLMAP's format. Features and matches are kept there too, and reused
     #[arg(long, value_name = "DATA", required_unless_present = "into")]
     pub out: Option<PathBuf>,
@@ -77,7 +81,10 @@ pub fn run(args: &Args) -> Result<()> {
     use_threads(args.threads)?;
     let data = args.into.as_ref().or(args.out.as_ref());
     let data = data.expect("clap requires one of them");
-    let mut input = PoseInput::new(&args.photos, data);
+    let mut input = PoseInput {
+        photos: args.photos.clone(),
+        ..PoseInput::new("", data)
+    };
     input.into = args.into.is_some();
     input.distances.clone_from(&args.distance);
     input.mapper = args.poses.into();
@@ -92,7 +99,7 @@ pub fn run(args: &Args) -> Result<()> {
 
 /// Whether `data` has photographs and no poses.
 pub fn is_unposed(data: &Path) -> bool {
-    is_film(data) || (data.is_dir() && DatasetFormat::recognise(data).is_none() && has_photos(data))
+    is_film(data) || (data.is_dir() && DatasetFormat::recognise(data).is_none() && is_capture(data))
 }
 
 /// Poses the photographs of `input` into the folder `posed` of its run, and makes that its dataset.

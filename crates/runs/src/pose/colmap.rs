@@ -1,6 +1,7 @@
 //! Poses by COLMAP, where it is asked for: whichever version is on the path, whose options are taken from its own help.
 
-use super::{LeftOutPhoto, PoseInput, PoseProgress, PoseReport, is_film, output};
+use super::capture::Capture;
+use super::{LeftOutPhoto, PoseInput, PoseProgress, PoseReport, joined, output};
 use crate::RunError;
 use irradia_formats::{PhotoFolder, read_colmap_poses};
 use std::fs;
@@ -13,9 +14,10 @@ const EXHAUSTIVE: usize = 300;
 /// Runs COLMAP's features, matching and mapper on the photographs of `folder`, and leaves its models in `sparse` of the dataset.
 pub(super) fn run(
     input: &PoseInput,
-    folder: &PhotoFolder,
+    capture: &Capture,
     progress: &(dyn Fn(PoseProgress) + Sync),
 ) -> Result<PoseReport, RunError> {
+    let folder = &capture.folder;
     let colmap = Colmap::find(&input.colmap)?;
     let out = &input.out;
     let images = out.join("images");
@@ -51,7 +53,7 @@ pub(super) fn run(
     extract.run()?;
 
     stage("matches");
-    let in_order = is_film(&input.photos) || folder.photos.len() > EXHAUSTIVE;
+    let in_order = capture.has_films || folder.photos.len() > EXHAUSTIVE;
     let mut matching = colmap.command(if in_order {
         "sequential_matcher"
     } else {
@@ -70,7 +72,7 @@ pub(super) fn run(
         let why = mapped.err().map_or(String::new(), |error| format!(" ({error})"));
         return Err(RunError::Refused(format!(
             "{}: COLMAP found no model{why}; try without --poses colmap, or see irradia doctor",
-            input.photos.display()
+            joined(&input.photos)
         )));
     }
     mapped?;

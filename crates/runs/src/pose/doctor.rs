@@ -1,10 +1,11 @@
 //! The capture doctor on files: `doctor.json`, and `doctor.html` with small pictures and a plan.
 
+use super::capture::Capture;
 use super::stages::Work;
-use super::{PoseProgress, check_enough, photo_infos};
+use super::{PoseProgress, check_enough};
 use crate::RunError;
 use crate::folder::to_json;
-use irradia_formats::{PhotoFolder, read_photo_folder, write_atomic, write_png};
+use irradia_formats::{PhotoFolder, write_atomic, write_png};
 use irradia_scene::resize_area;
 use irradia_sfm::PairMatches;
 use irradia_sfm::doctor::{Diagnosis, Evidence, diagnose, shots};
@@ -33,8 +34,8 @@ const PLAN_POINTS: usize = 2000;
 /// A request for a diagnosis.
 #[derive(Clone, Debug, PartialEq)]
 pub struct DoctorInput {
-    /// A folder of photographs.
-    pub photos: PathBuf,
+    /// Folders of photographs and films, and films; these need `out`.
+    pub photos: Vec<PathBuf>,
     /// Where the report, features and matches are written, if anywhere.
     pub out: Option<PathBuf>,
     /// The most features of a photograph, at least 1.
@@ -45,7 +46,7 @@ impl DoctorInput {
     /// With the usual options; nothing is written.
     pub fn new(photos: impl Into<PathBuf>) -> Self {
         Self {
-            photos: photos.into(),
+            photos: vec![photos.into()],
             out: None,
             max_features: Sift::default().max_features,
         }
@@ -111,15 +112,16 @@ pub fn doctor(input: &DoctorInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> 
     if input.max_features == 0 {
         return Err(RunError::setting("max_features", 0, "must be 1 or more"));
     }
-    let folder = read_photo_folder(&input.photos)?;
-    check_enough(&input.photos, &folder)?;
     if let Some(out) = &input.out {
         fs::create_dir_all(out).map_err(RunError::io("create", out))?;
     }
-    let mut work = Work::new(input.max_features, input.out.as_deref(), &folder, progress);
+    let capture = Capture::read(&input.photos, input.out.as_deref(), progress)?;
+    let folder = &capture.folder;
+    check_enough(&input.photos, folder)?;
+    let mut work = Work::new(input.max_features, input.out.as_deref(), folder, progress);
     work.find_features()?;
     let pairs = work.match_pairs(&PairOptions::default())?;
-    let infos = photo_infos(&folder, work.photos());
+    let infos = capture.infos(work.photos());
     let (cameras, verified) = verify(&infos, work.features(), &pairs, &MapOptions::default(), &mut |_| ());
     let found = Reconstruction {
         pairs: verified,
@@ -127,10 +129,10 @@ pub fn doctor(input: &DoctorInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> 
         ..Reconstruction::default()
     };
     let mut report = examine(&work, &infos, &pairs, &found);
-    add_unreadable(&mut report, &folder, &work);
+    add_unreadable(&mut report, folder, &work);
     report.seconds = started.elapsed().as_secs_f64();
     if let Some(out) = &input.out {
-        write(out, &folder, &work, &report)?;
+        write(out, folder, &work, &report)?;
     }
     Ok(report)
 }

@@ -1,4 +1,4 @@
-//! The frames of a film that are worth posing: the sharpest of each window, windows being equal in motion.
+//! The frames of films that are worth posing: the sharpest of each window, windows being equal in motion.
 
 use super::PoseProgress;
 use crate::RunError;
@@ -15,12 +15,14 @@ use std::process::{Command, Stdio};
 
 /// Extensions of films.
 const FILMS: [&str; 8] = ["mp4", "mov", "m4v", "mkv", "webm", "avi", "mpg", "mpeg"];
-/// Frames chosen, unless the film has fewer.
+/// Frames chosen of all films, unless they have fewer.
 const FRAMES: [usize; 2] = [100, 300];
 /// Motion between chosen frames, in widths of the picture: two thirds of a picture and more stay in view for several frames.
 const SPACING: f64 = 0.05;
 /// Motion of a frame whose features match none of those before.
 const LOST: f64 = 0.1;
+/// Frames of each film, if it has so many.
+const LEAST: usize = 10;
 /// Pixels across the frames in which motion and sharpness are measured.
 const WIDTH: u32 = 320;
 /// Frames that are measured in parallel.
@@ -34,53 +36,102 @@ pub fn is_film(path: &Path) -> bool {
     extension.is_some_and(|e| FILMS.contains(&e.as_str())) && path.is_file()
 }
 
-/// Which frames were chosen, to reuse them: `frames.json`.
+/// The record of what was chosen, beside the frames.
+const RECORD: &str = "frames.json";
+
+/// Which frames of a film were chosen, to reuse them.
 #[derive(Debug, PartialEq, Serialize, Deserialize)]
 struct Chosen {
     film: PathBuf,
     bytes: u64,
     modified: Option<std::time::SystemTime>,
+    /// What the frames' names begin with.
+    stem: String,
     frames: Vec<usize>,
 }
 
-/// Writes the chosen frames of `film` as JPEG into `images` of `out`, unless an earlier call did. Returns their folder.
-pub(super) fn frames(film: &Path, out: &Path, progress: &(dyn Fn(PoseProgress) + Sync)) -> Result<PathBuf, RunError> {
-    let images = out.join("images");
-    let record = out.join("frames.json");
-    let metadata = fs::metadata(film).map_err(RunError::io("read", film))?;
-    let mut chosen = Chosen {
-        film: std::path::absolute(film).unwrap_or_else(|_| film.to_owned()),
-        bytes: metadata.len(),
-        modified: metadata.modified().ok(),
-        frames: Vec::new(),
-    };
-    let known: Option<Chosen> = fs::read(&record)
+impl Chosen {
+    fn name(&self, frame: usize) -> String {
+        format!("{}_{frame:06}.jpg", self.stem)
+    }
+}
+
+/// Writes the chosen frames of `films` as JPEG into `folder`, unless an earlier call did.
+pub(super) fn frames(
+    films: &[PathBuf],
+    folder: &Path,
+    progress: &(dyn Fn(PoseProgress) + Sync),
+) -> Result<(), RunError> {
+    let record = folder.join(RECORD);
+    let mut chosen = films.iter().map(|film| of_file(film)).collect::<Result<Vec<_>, _>>()?;
+    for i in 0..chosen.len() {
+        // Films of several folders may have one name.
+        if chosen[..i].iter().any(|other| other.stem == chosen[i].stem) {
+            chosen[i].stem = format!("{}_{}", chosen[i].stem, i + 1);
+        }
+    }
+    let known: Option<Vec<Chosen>> = fs::read(&record)
         .ok()
         .and_then(|bytes| serde_json::from_slice(&bytes).ok());
-    if let Some(known) = known {
-        chosen.frames.clone_from(&known.frames);
-        if known == chosen && chosen.frames.iter().all(|frame| images.join(name(*frame)).is_file()) {
-            return Ok(images);
+    if let Some(known) = known.filter(|known| known.len() == chosen.len()) {
+        for (chosen, known) in chosen.iter_mut().zip(&known) {
+            chosen.frames.clone_from(&known.frames);
+        }
+        let mut names = chosen
+            .iter()
+            .flat_map(|film| film.frames.iter().map(|frame| film.name(*frame)));
+        if known == chosen && names.all(|name| folder.join(name).is_file()) {
+            return Ok(());
         }
     }
     progress(PoseProgress::Stage { name: "frames", of: 0 });
-    let looked_at = look(film, progress)?;
-    if looked_at.is_empty() {
-        return Err(RunError::Refused(format!("{}: the film has no frames", film.display())));
+    let mut before = 0;
+    let mut measured = Vec::new();
+    for film in films {
+        let frames = measure(film, before, progress)?;
+        if frames.is_empty() {
+            return Err(RunError::Refused(format!("{}: the film has no frames", film.display())));
+        }
+        before += frames.len();
+        measured.push(frames);
     }
-    chosen.frames = choose(&looked_at);
     // Frames of an earlier choice must not be taken for photographs.
-    if images.exists() && record.exists() {
-        fs::remove_dir_all(&images).map_err(RunError::io("clear", &images))?;
+    if folder.exists() {
+        fs::remove_dir_all(folder).map_err(RunError::io("clear", folder))?;
     }
-    fs::create_dir_all(&images).map_err(RunError::io("create", &images))?;
-    extract(film, &images, &chosen.frames)?;
+    fs::create_dir_all(folder).map_err(RunError::io("create", folder))?;
+    for ((chosen, frames), wanted) in chosen.iter_mut().zip(&measured).zip(shares(&measured)) {
+        chosen.frames = choose(frames, wanted);
+        extract(chosen, folder)?;
+    }
     write_atomic(&record, |file| file.write_all(&crate::folder::to_json(&chosen)))?;
-    Ok(images)
+    Ok(())
 }
 
-fn name(frame: usize) -> String {
-    format!("frame_{frame:06}.jpg")
+/// A film of which nothing is chosen yet.
+fn of_file(film: &Path) -> Result<Chosen, RunError> {
+    let metadata = fs::metadata(film).map_err(RunError::io("read", film))?;
+    Ok(Chosen {
+        film: std::path::absolute(film).unwrap_or_else(|_| film.to_owned()),
+        bytes: metadata.len(),
+        modified: metadata.modified().ok(),
+        stem: film.file_stem().unwrap_or_default().to_string_lossy().into_owned(),
+        frames: Vec::new(),
+    })
+}
+
+/// How many frames of each film are chosen: of all films as many as their motion asks for, in proportion to each film's.
+fn shares(films: &[Vec<Frame>]) -> Vec<usize> {
+    let motion = |frames: &Vec<Frame>| frames.iter().map(|frame| frame.motion).sum::<f64>();
+    let total: f64 = films.iter().map(motion).sum();
+    let wanted = ((total / SPACING) as usize).clamp(FRAMES[0], FRAMES[1]);
+    let share = |frames: &Vec<Frame>| match total > 0.0 {
+        true => motion(frames) / total,
+        // Cameras that stand still.
+        false => 1.0 / films.len() as f64,
+    };
+    let count = |frames| ((share(frames) * wanted as f64).round() as usize).max(LEAST);
+    films.iter().map(count).collect()
 }
 
 /// What is measured of a frame.
@@ -92,8 +143,8 @@ struct Frame {
     sharpness: f64,
 }
 
-/// Measures all frames of a film, at a reduced size.
-fn look(film: &Path, progress: &(dyn Fn(PoseProgress) + Sync)) -> Result<Vec<Frame>, RunError> {
+/// Measures all frames of a film, at a reduced size; `before` frames of other films were measured before it.
+fn measure(film: &Path, before: usize, progress: &(dyn Fn(PoseProgress) + Sync)) -> Result<Vec<Frame>, RunError> {
     let mut child = Command::new("ffmpeg")
         .args(["-loglevel", "error", "-i"])
         .arg(film)
@@ -118,7 +169,7 @@ fn look(film: &Path, progress: &(dyn Fn(PoseProgress) + Sync)) -> Result<Vec<Fra
         ..Sift::default()
     };
     let mut frames = Vec::new();
-    let mut before: Option<Features> = None;
+    let mut last: Option<Features> = None;
     loop {
         let batch: Vec<Picture> = std::iter::from_fn(|| read_picture(&mut pictures)).take(BATCH).collect();
         if batch.is_empty() {
@@ -128,7 +179,7 @@ fn look(film: &Path, progress: &(dyn Fn(PoseProgress) + Sync)) -> Result<Vec<Fra
             .par_iter()
             .map(|picture| (sift.extract(&picture.photo()), picture.sharpness()))
             .collect();
-        let earlier: Vec<Option<&Features>> = std::iter::once(before.as_ref())
+        let earlier: Vec<Option<&Features>> = std::iter::once(last.as_ref())
             .chain(seen.iter().map(|(features, _)| Some(features)))
             .collect();
         let motions: Vec<f64> = seen
@@ -140,8 +191,8 @@ fn look(film: &Path, progress: &(dyn Fn(PoseProgress) + Sync)) -> Result<Vec<Fra
             motion: *motion,
             sharpness: *sharpness,
         }));
-        before = seen.into_iter().next_back().map(|(features, _)| features);
-        progress(PoseProgress::Done(frames.len()));
+        last = seen.into_iter().next_back().map(|(features, _)| features);
+        progress(PoseProgress::Done(before + frames.len()));
     }
     let status = child.wait().map_err(RunError::io("read", film))?;
     let said = said.join().unwrap_or_default();
@@ -239,10 +290,9 @@ fn motion(before: &Features, after: &Features) -> f64 {
     f64::from(distances[distances.len() / 2]) / f64::from(WIDTH)
 }
 
-/// The sharpest frame of each of a number of windows that are equal in motion.
-fn choose(frames: &[Frame]) -> Vec<usize> {
+/// The sharpest frame of each of `wanted` windows that are equal in motion.
+fn choose(frames: &[Frame], wanted: usize) -> Vec<usize> {
     let total: f64 = frames.iter().map(|frame| frame.motion).sum();
-    let wanted = ((total / SPACING) as usize).clamp(FRAMES[0], FRAMES[1]);
     if frames.len() <= wanted {
         return (0..frames.len()).collect();
     }
@@ -264,28 +314,32 @@ fn choose(frames: &[Frame]) -> Vec<usize> {
     best.into_iter().flatten().collect()
 }
 
-/// Writes the frames with the numbers `frames`, ascending, under their names.
-fn extract(film: &Path, images: &Path, frames: &[usize]) -> Result<(), RunError> {
-    let chosen: Vec<String> = frames.iter().map(|frame| format!("eq(n,{frame})")).collect();
+/// Writes the chosen frames, ascending, under their names.
+fn extract(chosen: &Chosen, folder: &Path) -> Result<(), RunError> {
+    let film = &chosen.film;
+    let numbers: Vec<String> = chosen.frames.iter().map(|frame| format!("eq(n,{frame})")).collect();
     let output = Command::new("ffmpeg")
         .args(["-loglevel", "error", "-y", "-i"])
         .arg(film)
         .args([
             "-vf",
-            &format!("select='{}'", chosen.join("+")),
+            &format!("select='{}'", numbers.join("+")),
             "-fps_mode",
             "passthrough",
         ])
         .args(["-q:v", "2", "-start_number", "0"])
-        .arg(images.join("chosen_%06d.jpg"))
+        .arg(folder.join("chosen_%06d.jpg"))
         .stdin(Stdio::null())
         .output()
         .map_err(|error| no_ffmpeg(film, &error))?;
     if !output.status.success() {
         return Err(unreadable(film, &String::from_utf8_lossy(&output.stderr)));
     }
-    for (i, frame) in frames.iter().enumerate() {
-        let (from, to) = (images.join(format!("chosen_{i:06}.jpg")), images.join(name(*frame)));
+    for (i, frame) in chosen.frames.iter().enumerate() {
+        let (from, to) = (
+            folder.join(format!("chosen_{i:06}.jpg")),
+            folder.join(chosen.name(*frame)),
+        );
         fs::rename(&from, &to).map_err(RunError::io("write", &to))?;
     }
     Ok(())
@@ -303,7 +357,7 @@ mod tests {
             sharpness: if i % 3 == 1 { 2.0 } else { 1.0 },
         };
         let frames: Vec<Frame> = (0..900).map(frame).collect();
-        let chosen = choose(&frames);
+        let chosen = choose(&frames, 300);
         assert!((290..=300).contains(&chosen.len()), "{}", chosen.len());
         assert!(
             chosen.iter().filter(|i| **i < 300).count() <= 1,
@@ -312,8 +366,11 @@ mod tests {
         let sharp = chosen.iter().filter(|i| **i % 3 == 1).count();
         assert!(sharp * 3 > chosen.len(), "{sharp}");
         let still: Vec<Frame> = frames[..300].to_vec();
-        assert_eq!(choose(&still).len(), 100);
-        assert_eq!(choose(&frames[..40]).len(), 40);
+        assert_eq!(choose(&still, 100).len(), 100);
+        assert_eq!(choose(&frames[..40], 100).len(), 40);
+        // A minute of walking and a second of standing still share what both ask for.
+        assert_eq!(shares(&[frames, still.clone()]), [300, LEAST]);
+        assert_eq!(shares(&[still.clone(), still]), [50, 50]);
     }
 
     #[test]

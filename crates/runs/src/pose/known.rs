@@ -1,6 +1,5 @@
 //! The dataset to which photographs are added.
 
-use super::is_film;
 use crate::RunError;
 use glam::{DQuat, DVec3};
 use irradia_formats::{ColmapCamera, ColmapImage, PhotoFolder, read_colmap_poses, read_photo_folder};
@@ -29,13 +28,7 @@ impl KnownPoses {
     }
 
     /// The dataset's photographs and those of `more`, by name.
-    pub fn with(&self, more: &Path) -> Result<PhotoFolder, RunError> {
-        if is_film(more) {
-            return Err(RunError::Refused(format!(
-                "{}: frames of a film are not added to a dataset: save them as photographs in a folder first",
-                more.display()
-            )));
-        }
+    pub fn with(&self, more: PhotoFolder) -> Result<PhotoFolder, RunError> {
         let mut folder = read_photo_folder(&self.data.join("images"))?;
         let present = |name: &&String| folder.photos.iter().any(|photo| photo.name == **name);
         if let Some(name) = self.images.keys().filter(|name| !present(name)).min() {
@@ -44,7 +37,6 @@ impl KnownPoses {
                 self.data.display()
             )));
         }
-        let more = read_photo_folder(more)?;
         let before = folder.photos.len();
         folder.left_out.extend(more.left_out);
         for photo in more.photos {

@@ -1,13 +1,15 @@
-//! Photographs or a film in, a posed dataset out.
+//! Photographs and films in, a posed dataset out.
 //!
 //! ```text
-//! images/          the posed photographs: links to the originals where the file system allows, else copies; frames of a film
+//! images/          the posed photographs: links to the originals where the file system allows, else copies
+//! frames/, faces/  frames of films and faces of panoramas, which images/ links to
 //! sparse/0/*.bin   cameras, poses and points with tracks, in COLMAP's format; further models in sparse/1, ..
 //! pose.json        what happened: numbers, times, and each photograph left out with its reason
 //! doctor.html      what is wrong with the capture, and where to take further photographs; doctor.json and doctor/*.png belong to it
 //! features.bin     features and matches, which are reused as long as photographs do not change
 //! ```
 
+mod capture;
 mod colmap;
 mod doctor;
 mod film;
@@ -19,7 +21,8 @@ mod store;
 
 use crate::RunError;
 use crate::folder::to_json;
-use irradia_formats::{PhotoFolder, read_photo_folder, write_atomic};
+use capture::Capture;
+use irradia_formats::{PhotoFolder, write_atomic};
 use irradia_sfm::doctor::Kind;
 use irradia_sfm::features::Sift;
 use irradia_sfm::map::{MapOptions, PhotoInfo, Progress, Reconstruction, extend, reconstruct};
@@ -30,6 +33,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
+pub use capture::is_capture;
 pub use doctor::{DoctorInput, DoctorReport, Finding, doctor};
 pub use film::is_film;
 
@@ -43,8 +47,8 @@ const REPORT: &str = "pose.json";
 /// A request for poses.
 #[derive(Clone, Debug, PartialEq)]
 pub struct PoseInput {
-    /// A folder of photographs, or a film.
-    pub photos: PathBuf,
+    /// Folders of photographs and films, and films; what a folder without any holds in its folders.
+    pub photos: Vec<PathBuf>,
     /// The folder of the dataset; created if missing.
     pub out: PathBuf,
     /// Whether the photographs are added to the dataset in `out`, in COLMAP's format, whose poses and cameras stay as they are.
@@ -65,7 +69,7 @@ impl PoseInput {
     /// With the usual options.
     pub fn new(photos: impl Into<PathBuf>, out: impl Into<PathBuf>) -> Self {
         Self {
-            photos: photos.into(),
+            photos: vec![photos.into()],
             out: out.into(),
             into: false,
             distances: Vec::new(),
@@ -195,7 +199,7 @@ pub struct ScaleReport {
 /// Time of a stage.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct StageReport {
-    /// `photographs`, `frames`, `features`, `matches`, `poses`, `doctor`, `writing` or `colmap`.
+    /// `photographs` (with frames of films and faces of panoramas), `features`, `matches`, `poses`, `doctor`, `writing` or `colmap`.
     pub name: &'static str,
     /// Wall time.
     pub seconds: f64,
@@ -230,17 +234,20 @@ pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Resu
     };
     fs::create_dir_all(out).map_err(RunError::io("create", out))?;
     let mut clock = Clock::new();
-    let folder = if let Some(known) = &known {
-        known.with(&input.photos)?
-    } else if is_film(&input.photos) {
-        let frames = film::frames(&input.photos, out, progress)?;
-        clock.end("frames");
-        read_photo_folder(&frames)?
-    } else {
-        read_photo_folder(&input.photos)?
-    };
-    check_enough(&input.photos, &folder)?;
-    place::check(&input.distances, &folder)?;
+    let mut capture = Capture::read(&input.photos, Some(out), progress)?;
+    if let Some(known) = &known {
+        if capture.has_panoramas() {
+            return Err(RunError::setting(
+                "into",
+                out.display(),
+                "takes no panoramas: pose all photographs anew, with --out",
+            ));
+        }
+        capture.folder = known.with(capture.folder)?;
+    }
+    let folder = &capture.folder;
+    check_enough(&input.photos, folder)?;
+    place::check(&input.distances, folder)?;
     clock.end("photographs");
     if input.mapper == Mapper::Colmap {
         if !input.distances.is_empty() {
@@ -257,7 +264,7 @@ pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Resu
                 "adds nothing to a dataset: leave --into or --poses colmap out",
             ));
         }
-        let mut report = colmap::run(input, &folder, progress)?;
+        let mut report = colmap::run(input, &capture, progress)?;
         clock.end("colmap");
         report.stages = clock.stages;
         report.seconds = started.elapsed().as_secs_f64();
@@ -265,11 +272,11 @@ pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Resu
         return Ok(report);
     }
 
-    let mut work = Work::new(input.max_features, Some(out), &folder, progress);
+    let mut work = Work::new(input.max_features, Some(out), folder, progress);
     work.find_features()?;
     clock.end("features");
     let pair_options = PairOptions {
-        successors: if is_film(&input.photos) { FILM_SUCCESSORS } else { 0 },
+        successors: if capture.has_films { FILM_SUCCESSORS } else { 0 },
         ..PairOptions::default()
     };
     let pairs = work.match_pairs(&pair_options)?;
@@ -279,7 +286,7 @@ pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Resu
         name: "poses",
         of: work.photos().len(),
     });
-    let mut infos = photo_infos(&folder, work.photos());
+    let mut infos = capture.infos(work.photos());
     let mut tell = |event| {
         if let Progress::Registered { photos, .. } = event {
             progress(PoseProgress::Done(photos));
@@ -297,14 +304,14 @@ pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Resu
     let scale = match reconstruction.models.first_mut() {
         // What is known keeps its unit.
         Some(model) if is_new => {
-            let by_places = place::scale(&folder, &work, model, progress);
+            let by_places = place::scale(folder, &work, model, progress);
             place::scale_by_distances(&input.distances, &infos, model)?.or(by_places)
         }
         _ => None,
     };
     clock.end("poses");
     let examined = doctor::examine(&work, &infos, &pairs, &reconstruction);
-    doctor::write(out, &folder, &work, &examined)?;
+    doctor::write(out, folder, &work, &examined)?;
     clock.end("doctor");
     if reconstruction.models.is_empty() {
         return Err(RunError::Refused(no_model(
@@ -314,10 +321,10 @@ pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Resu
             &examined,
         )));
     }
-    output::write(out, &folder, &work, &infos, &reconstruction)?;
+    output::write(out, folder, &work, &infos, &reconstruction)?;
     clock.end("writing");
 
-    let mut report = output::report(&folder, &work, &infos, &reconstruction);
+    let mut report = output::report(folder, &work, &infos, &reconstruction);
     report.findings = examined.findings;
     report.scale = scale;
     report.pairs = pairs.len();
@@ -342,7 +349,7 @@ fn check_free(out: &Path) -> Result<(), RunError> {
     }
 }
 
-fn check_enough(path: &Path, folder: &PhotoFolder) -> Result<(), RunError> {
+fn check_enough(paths: &[PathBuf], folder: &PhotoFolder) -> Result<(), RunError> {
     if folder.photos.len() >= MIN_PHOTOS {
         return Ok(());
     }
@@ -354,39 +361,19 @@ fn check_enough(path: &Path, folder: &PhotoFolder) -> Result<(), RunError> {
         .collect();
     Err(RunError::Refused(format!(
         "{}: {} readable photographs, at least {MIN_PHOTOS} of different views are needed{reasons}",
-        path.display(),
+        joined(paths),
         folder.photos.len()
     )))
 }
 
-/// What the mapper is told of the photographs `used`, indices of the folder's.
-fn photo_infos(folder: &PhotoFolder, used: &[usize]) -> Vec<PhotoInfo> {
-    let groups = folder.groups();
-    // Groups are numbered from 0 without gaps, also where photographs could not be decoded.
-    let mut numbers: Vec<usize> = Vec::new();
-    used.iter()
-        .map(|i| {
-            let photo = &folder.photos[*i];
-            let known = numbers.iter().position(|group| *group == groups[*i]);
-            let group = known.unwrap_or_else(|| {
-                numbers.push(groups[*i]);
-                numbers.len() - 1
-            });
-            let [right, down] = photo.up.map(f64::from);
-            PhotoInfo {
-                name: photo.name.clone(),
-                width: photo.width,
-                height: photo.height,
-                group,
-                focal_prior_px: photo.focal_px(),
-                up: Some(glam::DVec3::new(right, down, 0.0)),
-            }
-        })
-        .collect()
+/// Paths for a message.
+fn joined(paths: &[PathBuf]) -> String {
+    let paths: Vec<String> = paths.iter().map(|path| path.display().to_string()).collect();
+    paths.join(", ")
 }
 
 /// Why nothing could be posed: what the doctor says of the whole, else the first photograph's reason.
-fn no_model(path: &Path, photos: &[PhotoInfo], found: &Reconstruction, examined: &DoctorReport) -> String {
+fn no_model(paths: &[PathBuf], photos: &[PhotoInfo], found: &Reconstruction, examined: &DoctorReport) -> String {
     let of_all = examined
         .findings
         .iter()
@@ -399,7 +386,7 @@ fn no_model(path: &Path, photos: &[PhotoInfo], found: &Reconstruction, examined:
     format!(
         "{}: no three of {} photographs could be posed together{first}; take more photographs that overlap by two thirds, from \
          different places",
-        path.display(),
+        joined(paths),
         photos.len()
     )
 }

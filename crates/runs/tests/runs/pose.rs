@@ -290,6 +290,76 @@ fn photographs_of_two_scenes_a_copy_and_a_text_file_have_one_clear_outcome() {
 }
 
 #[test]
+fn panoramas_in_folders_are_posed_by_their_faces() {
+    let folder = tempfile::tempdir().unwrap();
+    let options = SynthOptions {
+        scene: irradia_runs::synth::SceneName::Demo,
+        views: 14,
+        width: 768,
+        height: 384,
+        lens: irradia_runs::synth::SynthLens::Equirectangular,
+        ..OPTIONS
+    };
+    let capture = Capture::new(&options).unwrap();
+    let scene = options.scene.build(options.seed).0;
+    let mut truth: Vec<(String, Camera)> = Vec::new();
+    for (i, shot) in capture
+        .shots()
+        .iter()
+        .filter(|shot| shot.part == Part::Train)
+        .enumerate()
+    {
+        let (part, stem) = (["first", "second"][i % 2], format!("{i:02}"));
+        let part = folder.path().join("photos").join(part);
+        fs::create_dir_all(&part).unwrap();
+        let [width, height] = [shot.camera.intrinsics.width, shot.camera.intrinsics.height];
+        let frame = scene.trace(&shot.camera, 4, i as u64);
+        write_png(&part.join(format!("{stem}.png")), width, height, 4, &frame.rgba()).unwrap();
+        truth.push((stem, shot.camera));
+    }
+    let (photos, out) = (folder.path().join("photos"), folder.path().join("data"));
+    let report = quietly(&PoseInput::new(&photos, &out)).unwrap();
+    assert_eq!(report.photos, 6 * truth.len());
+    assert_eq!(report.registered, report.photos, "{report:#?}");
+    let dataset = read_dataset(&out, &DatasetOptions::default()).unwrap();
+    let front = |stem: &str| {
+        let mut views = dataset.views.iter();
+        views
+            .find(|view| view.name.contains(&format!("{stem}_front")))
+            .unwrap()
+            .camera
+            .pose
+    };
+    for pair in truth.windows(2) {
+        let [found, known] = [
+            [&pair[0].0, &pair[1].0].map(|stem| front(stem).rotation),
+            [&pair[0].1, &pair[1].1].map(|camera| camera.pose.rotation),
+        ]
+        .map(|[a, b]| a.inverse() * b);
+        let apart = found.angle_between(known).to_degrees();
+        assert!(apart < 0.5, "{} and {}: {apart} degrees", pair[0].0, pair[1].0);
+    }
+    // Faces are where their panorama is.
+    let of = |side: &str| {
+        let name = format!("00_{side}");
+        let mut views = dataset.views.iter();
+        views
+            .find(|view| view.name.contains(&name))
+            .unwrap()
+            .camera
+            .pose
+            .position
+    };
+    assert!(of("front").distance(of("up")) < 1e-5);
+    // They are added to nothing.
+    let into = PoseInput {
+        into: true,
+        ..PoseInput::new(&photos, &out)
+    };
+    assert!(quietly(&into).unwrap_err().to_string().contains("panoramas"));
+}
+
+#[test]
 fn photographs_are_added_to_a_dataset_whose_poses_stay() {
     let folder = tempfile::tempdir().unwrap();
     let at = |name: &str| folder.path().join(name);

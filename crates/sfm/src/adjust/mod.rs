@@ -13,7 +13,7 @@ pub use loss::Loss;
 
 use crate::geometry::camera::{DCamera, PARAMETERS};
 use crate::geometry::pose::DPose;
-use glam::{DVec2, DVec3};
+use glam::{DMat3, DQuat, DVec2, DVec3};
 use rayon::prelude::*;
 use schur::Linearization;
 
@@ -114,11 +114,33 @@ impl Belief {
     }
 }
 
+/// A photograph: a camera at a pose, or mounted on a rig that has the pose.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct View {
+    /// Index of the pose.
+    pub pose: u32,
+    /// Index of the camera.
+    pub camera: u32,
+    /// Rotation of the camera's axes into those of the pose.
+    pub mount: DQuat,
+}
+
+impl View {
+    /// A camera that has the pose itself.
+    pub fn new(pose: u32, camera: u32) -> Self {
+        Self {
+            pose,
+            camera,
+            mount: DQuat::IDENTITY,
+        }
+    }
+}
+
 /// A point's projection in one photograph.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Observation {
-    /// Index of the pose.
-    pub pose: u32,
+    /// Index of the view.
+    pub view: u32,
     /// Measured place, pixels.
     pub at: DVec2,
 }
@@ -132,8 +154,8 @@ pub struct Problem {
     pub poses: Vec<DPose>,
     /// `[P]` whether a pose is held.
     pub held_poses: Vec<bool>,
-    /// `[P]` the camera of each pose.
-    pub camera_of: Vec<u32>,
+    /// Photographs.
+    pub views: Vec<View>,
     /// `[N]` points.
     pub points: Vec<DVec3>,
     /// `[N]` whether a point is held.
@@ -221,6 +243,11 @@ impl Problem {
         report
     }
 
+    /// The pose of an observation.
+    fn pose_of(&self, observation: usize) -> usize {
+        self.views[self.observations[observation].view as usize].pose as usize
+    }
+
     fn state(&self) -> State {
         State {
             cameras: self.cameras.iter().map(|c| c.camera).collect(),
@@ -238,12 +265,14 @@ impl Problem {
                 let mut sum = 0.0;
                 for i in points {
                     for observation in &self.observations[self.starts[i] as usize..self.starts[i + 1] as usize] {
-                        let (rotation, position, camera) = &views[observation.pose as usize];
-                        let p = *rotation * (state.points[i] - *position);
+                        let view = &views[observation.view as usize];
+                        let p = view.rotation * (state.points[i] - view.position);
                         if p.z <= BEHIND {
                             return f64::INFINITY;
                         }
-                        sum += loss.evaluate((camera.pixel(p) - observation.at).length_squared()).0;
+                        sum += loss
+                            .evaluate((view.camera.pixel(p) - observation.at).length_squared())
+                            .0;
                     }
                 }
                 sum
@@ -287,14 +316,28 @@ struct State {
     points: Vec<DVec3>,
 }
 
+/// A view at the present values.
+struct ViewNow {
+    /// From world to camera axes.
+    rotation: DMat3,
+    position: DVec3,
+    /// From camera axes to those of the pose.
+    mount: DMat3,
+    camera: DCamera,
+}
+
 impl State {
-    /// Each pose as rotation from world to camera, centre, and intrinsics.
-    fn views(&self, problem: &Problem) -> Vec<(glam::DMat3, DVec3, DCamera)> {
-        self.poses
-            .iter()
-            .zip(&problem.camera_of)
-            .map(|(pose, camera)| (pose.camera_rotation(), pose.position, self.cameras[*camera as usize]))
-            .collect()
+    fn views(&self, problem: &Problem) -> Vec<ViewNow> {
+        let now = |view: &View| {
+            let pose = &self.poses[view.pose as usize];
+            ViewNow {
+                rotation: DMat3::from_quat(view.mount.inverse()) * pose.camera_rotation(),
+                position: pose.position,
+                mount: DMat3::from_quat(view.mount),
+                camera: self.cameras[view.camera as usize],
+            }
+        };
+        problem.views.iter().map(now).collect()
     }
 }
 

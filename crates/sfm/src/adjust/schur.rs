@@ -5,7 +5,7 @@
 //! slope; per point V = sum B^T B + damping; per point and block W = A^T B or K^T B.
 
 use super::cholesky::{Symmetric, conjugate_gradients};
-use super::{BEHIND, DIRECT_LIMIT, Loss, Problem, State};
+use super::{BEHIND, DIRECT_LIMIT, Loss, Problem, State, View};
 use crate::geometry::camera::PARAMETERS;
 use glam::{DMat3, DVec3};
 use irradia_compute::simd::{Kernel, Lanes, Level, Simd};
@@ -79,7 +79,7 @@ impl Linearization {
         let seen = {
             let mut seen = vec![false; problem.cameras.len()];
             for observation in &problem.observations {
-                seen[problem.camera_of[observation.pose as usize] as usize] = true;
+                seen[problem.views[observation.view as usize].camera as usize] = true;
             }
             seen
         };
@@ -98,12 +98,13 @@ impl Linearization {
         for i in 0..problem.points.len() {
             let first = groups.len();
             for o in problem.starts[i]..problem.starts[i + 1] {
-                let pose = problem.observations[o as usize].pose as usize;
+                let View { pose, camera, .. } = problem.views[problem.observations[o as usize].view as usize];
                 point_of.push(i as u32);
-                if pose_block[pose] != NONE {
-                    of_pose[pose_block[pose] as usize].push(o);
+                let block = pose_block[pose as usize];
+                if block != NONE {
+                    of_pose[block as usize].push(o);
                 }
-                let camera = camera_block[problem.camera_of[pose] as usize];
+                let camera = camera_block[camera as usize];
                 camera_of_row.push(camera);
                 if camera != NONE && !groups[first..].contains(&camera) {
                     of_camera[camera as usize].push((groups.len() as u32, i as u32));
@@ -169,28 +170,28 @@ impl Linearization {
                     let here = group_starts[i] as usize..group_starts[i + 1] as usize;
                     for o in problem.starts[i]..problem.starts[i + 1] {
                         let observation = &problem.observations[o as usize];
-                        let (rotation, position, camera) = &views[observation.pose as usize];
+                        let view = &views[observation.view as usize];
                         let at = (o - first_row) as usize;
-                        let p = *rotation * (state.points[i] - *position);
+                        let p = view.rotation * (state.points[i] - view.position);
                         if p.z <= BEHIND {
                             rows[at] = EMPTY;
                             w[at] = [[0.0; POSE]; 3];
                             cost = f64::INFINITY;
                             continue;
                         }
-                        let projection = camera.project(p);
+                        let projection = view.camera.project(p);
                         let r = projection.at - observation.at;
                         let (rho, slope) = loss.evaluate(r.length_squared());
                         cost += rho;
                         let root = slope.sqrt();
                         let row = &mut rows[at];
                         row.r = (r * root).to_array();
-                        let (mask, ratio) = columns[problem.camera_of[observation.pose as usize] as usize];
+                        let (mask, ratio) = columns[problem.views[observation.view as usize].camera as usize];
                         for e in 0..2 {
                             let by = projection.by_point[e] * root;
-                            // d camera point / d turn is the cross product turn x p; / d point is the rotation.
-                            let turn = p.cross(by);
-                            let point = rotation.transpose() * by;
+                            // d camera point / d turn is the cross product turn x p, in the pose's axes; / d point is the rotation.
+                            let turn = view.mount * p.cross(by);
+                            let point = view.rotation.transpose() * by;
                             row.a[e] = [turn.x, turn.y, turn.z, -point.x, -point.y, -point.z];
                             row.b[e] = point.to_array();
                             for c in 0..PARAMETERS {
@@ -425,7 +426,7 @@ impl Linearization {
                 let (v, gradient) = &self.v[i];
                 let mut right = *gradient;
                 for o in problem.starts[i] as usize..problem.starts[i + 1] as usize {
-                    let block = self.pose_block[problem.observations[o].pose as usize];
+                    let block = self.pose_block[problem.pose_of(o)];
                     if block != NONE {
                         let x = &reduced[POSE * block as usize..][..POSE];
                         right += DVec3::from_array(self.w[o].map(|w| w.iter().zip(x).map(|(w, x)| w * x).sum()));
@@ -577,7 +578,7 @@ impl Kernel for PoseRows<'_> {
                 reduced[i] -= y[0][i] * g.x + y[1][i] * g.y + y[2][i] * g.z;
             }
             for other in problem.starts[point] as usize..problem.starts[point + 1] as usize {
-                let block = of.pose_block[problem.observations[other].pose as usize];
+                let block = of.pose_block[problem.pose_of(other)];
                 if block != NONE && block as usize >= pose {
                     subtract_product(&y, &of.w[other], &mut poses[block as usize - pose]);
                 }

@@ -24,7 +24,7 @@ fn world(poses: usize, points: usize, cameras: usize, noise: f64, seed: u64) -> 
             position: DVec3::new(6.0 * angle.sin(), normal(0.5), -6.0 * angle.cos()),
         });
         exact.held_poses.push(false);
-        exact.camera_of.push((i % cameras) as u32);
+        exact.views.push(View::new(i as u32, (i % cameras) as u32));
     }
     exact.starts.push(0);
     for _ in 0..points {
@@ -34,7 +34,7 @@ fn world(poses: usize, points: usize, cameras: usize, noise: f64, seed: u64) -> 
             let at = exact.cameras[i % cameras].camera.pixel(p);
             if p.z > 0.5 && normal(1.0) < 0.8 {
                 let at = at + DVec2::new(normal(noise), normal(noise));
-                exact.observations.push(Observation { pose: i as u32, at });
+                exact.observations.push(Observation { view: i as u32, at });
             }
         }
         exact.points.push(point);
@@ -265,6 +265,40 @@ fn the_final_cost_is_that_of_an_independent_solver() {
     }
 }
 
+#[test]
+fn cameras_on_a_rig_move_with_it() {
+    // The same cameras, two to a pose: each second one is mounted on the one before it.
+    let (exact, mut problem) = world(8, 60, 1, 0.0, 5);
+    for i in (0..8).step_by(2) {
+        let [first, second] = [exact.poses[i], exact.poses[i + 1]];
+        // Where the rig is, with the axes of each of its cameras.
+        for (view, pose) in [(i, first), (i + 1, second)] {
+            problem.views[view] = View {
+                mount: first.rotation.inverse() * pose.rotation,
+                ..View::new(i as u32, 0)
+            };
+            let seen = DPose {
+                position: first.position,
+                ..pose
+            };
+            for point in 0..problem.points.len() {
+                for o in exact.starts[point]..exact.starts[point + 1] {
+                    let observation = &mut problem.observations[o as usize];
+                    if observation.view as usize == view {
+                        let p = seen.camera_from_world(exact.points[point]);
+                        observation.at = exact.cameras[0].camera.pixel(p);
+                    }
+                }
+            }
+        }
+    }
+    let report = problem.solve(&PRECISE);
+    assert!(report.initial_cost > 1e3 && report.final_cost < 1e-12, "{report:?}");
+    let turned = |pose: &DPose| exact.poses[0].rotation.inverse() * pose.rotation;
+    let relative = |poses: &[DPose]| turned(&poses[0]).inverse() * turned(&poses[2]);
+    assert!(relative(&problem.poses).angle_between(relative(&exact.poses)) < 1e-6);
+}
+
 /// Six cameras and twenty points from formulas, with errors of up to 0.7 px and some of 5 px.
 fn formulas() -> Problem {
     let truth = DCamera {
@@ -279,7 +313,7 @@ fn formulas() -> Problem {
             position: DVec3::new(6.0 * angle.sin(), 0.3 * (3.0 * f64::from(i)).cos(), -6.0 * angle.cos()),
         });
         problem.held_poses.push(false);
-        problem.camera_of.push(0);
+        problem.views.push(View::new(i as u32, 0));
     }
     problem.starts.push(0);
     let mut k = 0;
@@ -296,7 +330,7 @@ fn formulas() -> Problem {
             k += 1;
             let wrong = if k % 17 == 0 { 5.0 } else { 0.0 };
             let at = truth.pixel(pose.camera_from_world(point)) + error + DVec2::new(wrong, 0.0);
-            problem.observations.push(Observation { pose: i as u32, at });
+            problem.observations.push(Observation { view: i as u32, at });
         }
         problem.points.push(point);
         problem.held_points.push(false);

@@ -28,7 +28,7 @@ const FEATURES_BY_MEDIAN: f64 = 0.1;
 /// The photographs that show most of what `photo` shows.
 fn neighbours(evidence: &Evidence, graph: &Graph, photo: usize) -> Vec<usize> {
     let mut found: Vec<usize> = graph.partners[photo].iter().take(NEIGHBOURS).map(|p| p.0).collect();
-    if found.len() < IN_ORDER {
+    if found.len() < IN_ORDER && !graph.is_on_rig(photo) {
         let n = evidence.photos.len();
         let around = photo.saturating_sub(IN_ORDER)..(photo + IN_ORDER + 1).min(n);
         for other in around.filter(|other| *other != photo) {
@@ -122,7 +122,7 @@ pub(super) fn exposure(evidence: &Evidence, graph: &Graph) -> Vec<Diagnosis> {
                 fraction: own.black.into(),
                 bright: false,
             });
-        } else if stops.is_none() {
+        } else if stops.is_none() && !graph.is_on_rig(photo) {
             // Without matches, the brightness of the whole picture is all there is.
             let neighbours = neighbours(evidence, graph, photo);
             let brightness = |p: usize| f64::from(evidence.appearances[p].brightness.max(0.002));
@@ -141,12 +141,12 @@ pub(super) fn exposure(evidence: &Evidence, graph: &Graph) -> Vec<Diagnosis> {
 }
 
 /// Photographs with little texture.
-pub(super) fn few_features(evidence: &Evidence) -> Vec<Diagnosis> {
+pub(super) fn few_features(evidence: &Evidence, graph: &Graph) -> Vec<Diagnosis> {
     let counts: Vec<usize> = evidence.features.iter().map(|f| f.keypoints.len()).collect();
     let median = median(counts.iter().map(|c| *c as f64).collect()).unwrap_or(0.0);
     let least = (FEATURES_BY_MEDIAN * median).max(FEATURES as f64);
     (0..counts.len())
-        .filter(|photo| (counts[*photo] as f64) < least)
+        .filter(|photo| (counts[*photo] as f64) < least && !graph.is_on_rig(*photo))
         .map(|photo| Diagnosis::FewFeatures {
             photo,
             features: counts[photo],

@@ -55,6 +55,10 @@ pub struct Evidence<'a> {
 struct Graph {
     /// `[photos]` partner and index of the pair, those with most matches first.
     partners: Vec<Vec<(usize, usize)>>,
+    /// Photographs by the rig that they are on.
+    rigs: BTreeMap<usize, Vec<usize>>,
+    /// `[photos]` the rig of each, if it is on one.
+    rig_of: Vec<Option<usize>>,
 }
 
 /// Matches of a pair that holds photographs together. COLMAP accepts 15, of which chance alone reaches up to 20 among thousands of pairs.
@@ -62,8 +66,9 @@ const HOLDS: usize = 25;
 
 impl Graph {
     /// Of the pairs with at least `matches` matches.
-    fn new(photos: usize, pairs: &[VerifiedPair], matches: usize) -> Self {
-        let mut partners = vec![Vec::new(); photos];
+    fn new(evidence: &Evidence, matches: usize) -> Self {
+        let pairs = evidence.pairs;
+        let mut partners = vec![Vec::new(); evidence.photos.len()];
         for (i, pair) in pairs
             .iter()
             .enumerate()
@@ -76,7 +81,26 @@ impl Graph {
         for partners in &mut partners {
             partners.sort_by_key(|(photo, i)| (std::cmp::Reverse(pairs[*i].matches.len()), *photo));
         }
-        Self { partners }
+        let rig_of: Vec<Option<usize>> = evidence.photos.iter().map(|p| p.mount.map(|mount| mount.rig)).collect();
+        let mut rigs: BTreeMap<usize, Vec<usize>> = BTreeMap::new();
+        for (photo, rig) in rig_of.iter().enumerate() {
+            if let Some(rig) = rig {
+                rigs.entry(*rig).or_default().push(photo);
+            }
+        }
+        Self { partners, rigs, rig_of }
+    }
+
+    /// Whether a photograph is on a rig: what is beside it there makes up for what it lacks.
+    fn is_on_rig(&self, photo: usize) -> bool {
+        self.rig_of[photo].is_some()
+    }
+
+    /// The partners of a photograph, and those on its rig.
+    fn linked(&self, photo: usize) -> impl Iterator<Item = usize> {
+        let rig = self.rig_of[photo].map(|rig| &self.rigs[&rig]);
+        let partners = self.partners[photo].iter().map(|p| p.0);
+        partners.chain(rig.into_iter().flatten().copied())
     }
 
     /// Photographs in connected parts, largest first.
@@ -91,10 +115,10 @@ impl Graph {
             part_of[start] = parts.len();
             let mut next = 0;
             while next < part.len() {
-                for (other, _) in &self.partners[part[next]] {
-                    if part_of[*other] == usize::MAX {
-                        part_of[*other] = parts.len();
-                        part.push(*other);
+                for other in self.linked(part[next]) {
+                    if part_of[other] == usize::MAX {
+                        part_of[other] = parts.len();
+                        part.push(other);
                     }
                 }
                 next += 1;
@@ -123,7 +147,7 @@ pub fn diagnose(evidence: &Evidence) -> Vec<Diagnosis> {
     if n == 0 {
         return Vec::new();
     }
-    let graph = Graph::new(n, evidence.pairs, HOLDS);
+    let graph = Graph::new(evidence, HOLDS);
     let still = motion::stands_still(evidence);
     // Pairs on a turntable seem taken from one place.
     let twice = if still.is_empty() {
@@ -140,7 +164,7 @@ pub fn diagnose(evidence: &Evidence) -> Vec<Diagnosis> {
     let looks = [
         looks::blurred(evidence, &graph),
         looks::exposure(evidence, &graph),
-        looks::few_features(evidence),
+        looks::few_features(evidence, &graph),
     ]
     .concat();
     let lens = [

@@ -23,10 +23,13 @@ pub(super) fn overlap(evidence: &Evidence, graph: &Graph) -> Vec<Diagnosis> {
     if n < CAPTURE {
         return found;
     }
-    found.extend(weak_links(graph));
+    // Panoramas are linked by one another's faces, whose pairs alone would be bridges.
+    if graph.rigs.is_empty() {
+        found.extend(weak_links(graph));
+    }
     for photo in 0..n {
         let partners: Vec<usize> = graph.partners[photo].iter().map(|p| p.0).collect();
-        if partners.len() < PARTNERS {
+        if partners.len() < PARTNERS && !graph.is_on_rig(photo) {
             found.push(Diagnosis::FewPartners { photo, partners });
         }
     }
@@ -135,6 +138,7 @@ impl Search<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use std::collections::BTreeMap;
 
     fn graph(photos: usize, pairs: &[[usize; 2]]) -> Graph {
         let mut partners = vec![Vec::new(); photos];
@@ -142,7 +146,11 @@ mod tests {
             partners[*a].push((*b, i));
             partners[*b].push((*a, i));
         }
-        Graph { partners }
+        Graph {
+            partners,
+            rigs: BTreeMap::new(),
+            rig_of: vec![None; photos],
+        }
     }
 
     /// All pairs among `photos`.

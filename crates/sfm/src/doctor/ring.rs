@@ -84,6 +84,8 @@ fn azimuths(evidence: &Evidence, graph: &Graph, turns: &[Option<DQuat>]) -> Vec<
     let level = DQuat::from_rotation_arc(up, DVec3::Z);
     let mut seen: Vec<(f64, usize)> = rotations
         .into_iter()
+        // Faces of panoramas look everywhere.
+        .filter(|(photo, _)| !graph.is_on_rig(*photo))
         .filter_map(|(photo, rotation)| {
             let forward = level * (rotation * DVec3::Z);
             (forward.truncate().length() > LEVEL)

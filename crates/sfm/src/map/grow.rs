@@ -86,12 +86,12 @@ impl Working<'_> {
     /// Places the two photographs of a seed and their points; `false` if too few remain.
     fn start(&mut self, pair: &VerifiedPair) -> bool {
         let [a, b] = pair.photos.map(|p| p as usize);
-        self.poses[a] = Some(DPose::IDENTITY);
-        self.poses[b] = Some(DPose::from_camera_from_world(
-            pair.motion.rotation,
-            pair.motion.translation,
-        ));
-        let tracks = self.tracks_of(a);
+        self.place(a, DPose::IDENTITY);
+        self.place(
+            b,
+            DPose::from_camera_from_world(pair.motion.rotation, pair.motion.translation),
+        );
+        let tracks = self.tracks_of_rig(a);
         self.triangulate(&tracks);
         self.adjust_all(Extent::Growing);
         let points = self.with_points();
@@ -119,7 +119,7 @@ impl Working<'_> {
                 continue;
             };
             settled = false;
-            let tracks = self.tracks_of(photo);
+            let tracks = self.tracks_of_rig(photo);
             self.triangulate(&tracks);
             let growth = self.options.global_growth;
             let (photos, points) = (self.registered(), self.point_count());
@@ -158,7 +158,7 @@ impl Working<'_> {
         }
         for photo in 0..self.poses.len() {
             let lost = self.poses[photo].is_some() && self.used_in(photo) < self.options.min_inliers;
-            if lost && !self.held_poses[photo] && self.registered() > 2 {
+            if lost && !self.held_poses[photo] && self.registered() > 2 * self.rigs[photo].len() {
                 self.deregister(photo);
             }
         }
@@ -246,7 +246,7 @@ impl Working<'_> {
         if found.inliers < self.options.min_registration_inliers || (found.inliers as f64) < ratio * seen.len() as f64 {
             return false;
         }
-        self.poses[photo] = Some(found.model);
+        self.place(photo, found.model);
         for (o, inlier) in seen.iter().zip(problem.inliers(&found.model)) {
             self.used[*o as usize] = inlier;
         }

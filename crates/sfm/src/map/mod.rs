@@ -26,8 +26,8 @@ pub(crate) use finish::up;
 pub use focal::Source;
 pub use metric::{Metric, to_metres};
 pub use types::{
-    Known, LeftOut, MapOptions, Model, ModelPoint, PairKind, PhotoInfo, Progress, Reason, Reconstruction, VerifiedPair,
-    Zoom,
+    Known, LeftOut, MapOptions, Model, ModelPoint, Mount, PairKind, PhotoInfo, Progress, Reason, Reconstruction,
+    VerifiedPair, Zoom,
 };
 pub use verify::{Cameras, verify};
 
@@ -53,7 +53,7 @@ pub fn reconstruct(
     progress: &mut dyn FnMut(Progress),
 ) -> Reconstruction {
     assert_eq!(photos.len(), features.len(), "one set of features a photograph");
-    let mut found = mapped(photos, features, pairs, &[], options, progress);
+    let mut found = mapped(photos, features, pairs, &known_cameras(photos), options, progress);
     let mut grouped = photos.to_vec();
     while found.zooms.len() < MOST_ZOOMS {
         let Some(zoom) = found.models.first().and_then(|m| zoom::find(&grouped, features, m)) else {
@@ -85,6 +85,16 @@ pub fn reconstruct(
         }
     }
     found
+}
+
+/// `[groups]` the cameras that are known exactly.
+fn known_cameras(photos: &[PhotoInfo]) -> Vec<Option<(DCamera, Source)>> {
+    let groups = photos.iter().map(|photo| photo.group + 1).max().unwrap_or(0);
+    let mut cameras = vec![None; groups];
+    for photo in photos {
+        cameras[photo.group] = photo.camera.map(|camera| (camera, Source::Prior));
+    }
+    cameras
 }
 
 /// As [`reconstruct`], with the groups as they are and the cameras of some of them.

@@ -7,8 +7,9 @@ use super::verify::Cameras;
 use crate::geometry::camera::DCamera;
 use crate::geometry::pose::DPose;
 use crate::geometry::triangulate::Sight;
-use glam::{DVec2, DVec3};
+use glam::{DQuat, DVec2, DVec3};
 use rayon::prelude::*;
+use std::collections::BTreeMap;
 
 /// A growing model.
 #[derive(Clone)]
@@ -23,6 +24,8 @@ pub(super) struct Working<'a> {
     pub sources: Vec<Source>,
     /// `[groups]` focal lengths that are held because no value is better than another.
     pub focal_held: Vec<bool>,
+    /// `[photos]` the photographs on the same rig, or the photograph alone.
+    pub rigs: Vec<Vec<usize>>,
     /// `[photos]` and `[groups]` what was known before mapping: poses and cameras that stay as they are.
     pub held_poses: Vec<bool>,
     pub held_cameras: Vec<bool>,
@@ -47,6 +50,7 @@ impl<'a> Working<'a> {
             first_focals: cameras.iter().map(|c| c.0.focal()).collect(),
             sources: cameras.iter().map(|c| c.1).collect(),
             focal_held: vec![false; cameras.len()],
+            rigs: rigs(photos),
             held_poses: vec![false; photos.len()],
             held_cameras: vec![false; cameras.len()],
             plane: Vec::new(),
@@ -54,8 +58,41 @@ impl<'a> Working<'a> {
             points: vec![None; tracks.len()],
             used: vec![false; tracks.observations.len()],
         };
+        for photo in photos.iter().filter(|photo| photo.camera.is_some()) {
+            model.held_cameras[photo.group] = true;
+        }
         model.undistort();
         model
+    }
+
+    /// Places a photograph, and those on its rig.
+    pub fn place(&mut self, photo: usize, pose: DPose) {
+        for i in 0..self.rigs[photo].len() {
+            let other = self.rigs[photo][i];
+            self.poses[other] = Some(DPose {
+                rotation: pose.rotation * self.mount(photo).inverse() * self.mount(other),
+                ..pose
+            });
+        }
+    }
+
+    /// Places a rig, that of the photograph `leader`, by its own pose.
+    pub fn place_rig(&mut self, leader: usize, pose: DPose) {
+        let rotation = pose.rotation * self.mount(leader);
+        self.place(leader, DPose { rotation, ..pose });
+    }
+
+    /// The rotation of a photograph's axes into those of its rig.
+    pub fn mount(&self, photo: usize) -> DQuat {
+        self.photos[photo].mount.map_or(DQuat::IDENTITY, |mount| mount.rotation)
+    }
+
+    /// Tracks that photographs of the rig of `photo` show.
+    pub fn tracks_of_rig(&self, photo: usize) -> Vec<usize> {
+        let mut tracks: Vec<usize> = self.rigs[photo].iter().flat_map(|p| self.tracks_of(*p)).collect();
+        tracks.sort_unstable();
+        tracks.dedup();
+        tracks
     }
 
     /// Photographs and cameras that are known, with the points that they see.
@@ -112,12 +149,10 @@ impl<'a> Working<'a> {
         self.points.iter().flatten().count()
     }
 
-    /// Observations of a photograph that belong to points.
+    /// Observations of a photograph, and of those on its rig, that belong to points.
     pub fn used_in(&self, photo: usize) -> usize {
-        self.tracks.of_photo[photo]
-            .iter()
-            .filter(|o| self.used[**o as usize])
-            .count()
+        let observations = self.rigs[photo].iter().flat_map(|p| &self.tracks.of_photo[*p]);
+        observations.filter(|o| self.used[**o as usize]).count()
     }
 
     /// Removes a point.
@@ -126,8 +161,14 @@ impl<'a> Working<'a> {
         self.used[self.tracks.range(track)].fill(false);
     }
 
-    /// Takes a photograph's pose away, and the points that are then seen less than twice.
+    /// Takes the pose of a photograph and of those on its rig away, and the points that are then seen less than twice.
     pub fn deregister(&mut self, photo: usize) {
+        for i in 0..self.rigs[photo].len() {
+            self.take_pose(self.rigs[photo][i]);
+        }
+    }
+
+    fn take_pose(&mut self, photo: usize) {
         self.poses[photo] = None;
         for i in 0..self.tracks.of_photo[photo].len() {
             let observation = self.tracks.of_photo[photo][i];
@@ -153,4 +194,19 @@ impl<'a> Working<'a> {
         }
         sum / count.max(1) as f64
     }
+}
+
+/// `[photos]` the photographs on the same rig, or the photograph alone.
+fn rigs(photos: &[PhotoInfo]) -> Vec<Vec<usize>> {
+    let mut members: BTreeMap<usize, Vec<usize>> = BTreeMap::new();
+    for (i, photo) in photos.iter().enumerate() {
+        if let Some(mount) = photo.mount {
+            members.entry(mount.rig).or_default().push(i);
+        }
+    }
+    let of = |(i, photo): (usize, &PhotoInfo)| match photo.mount {
+        Some(mount) => members[&mount.rig].clone(),
+        None => vec![i],
+    };
+    photos.iter().enumerate().map(of).collect()
 }

@@ -2,8 +2,11 @@
 
 use super::focal::Source;
 use super::model::Working;
-use crate::adjust::{AdjustOptions, AdjustReport, AdjustedCamera, Belief, Focal, Freedom, Loss, Observation, Problem};
+use crate::adjust::{
+    AdjustOptions, AdjustReport, AdjustedCamera, Belief, Focal, Freedom, Loss, Observation, Problem, View,
+};
 use crate::geometry::camera::DCamera;
+use crate::geometry::pose::DPose;
 use glam::DVec2;
 
 /// The loss while the model grows and poses may be far off, and the one at the end, which ignores wrong matches more.
@@ -37,17 +40,11 @@ impl Working<'_> {
             points.clone()
         };
         let mut problem = Problem::default();
-        let mut photos = Vec::new();
-        let mut pose_of = vec![u32::MAX; self.poses.len()];
-        for (photo, pose) in self.poses.iter().enumerate() {
-            if let Some(pose) = pose {
-                pose_of[photo] = photos.len() as u32;
-                photos.push(photo);
-                problem.poses.push(*pose);
-                problem.camera_of.push(self.photos[photo].group as u32);
-            }
+        let mut view_of = vec![None; self.poses.len()];
+        let leaders: Vec<usize> = self.leaders().collect();
+        for leader in &leaders {
+            self.add_views(&mut problem, *leader, self.held_poses[*leader], &mut view_of);
         }
-        problem.held_poses = photos.iter().map(|photo| self.held_poses[*photo]).collect();
         for group in 0..self.cameras.len() {
             problem.cameras.push(AdjustedCamera {
                 camera: self.cameras[group],
@@ -55,7 +52,7 @@ impl Working<'_> {
                 belief: belief(&self.cameras[group], self.first_focals[group]),
             });
         }
-        self.add_points(&mut problem, &chosen, |_| false, |photo| Some(pose_of[photo as usize]));
+        self.add_points(&mut problem, &chosen, |_| false, &view_of);
         let (loss, iterations, tolerance) = match extent {
             Extent::Growing => (GROWING_LOSS, 8, 1e-3),
             Extent::Full => (LOSS, 15, 1e-4),
@@ -67,8 +64,8 @@ impl Working<'_> {
             tolerance,
         };
         let report = problem.solve(&options);
-        for (pose, photo) in problem.poses.iter().zip(photos) {
-            self.poses[photo] = Some(*pose);
+        for (leader, pose) in leaders.into_iter().zip(&problem.poses) {
+            self.place_rig(leader, *pose);
         }
         for group in 0..self.cameras.len() {
             self.take_camera(group, problem.cameras[group].camera);
@@ -83,19 +80,19 @@ impl Working<'_> {
         report
     }
 
-    /// Adjusts a new photograph, its neighbours and its points; all else is held.
+    /// Adjusts a new photograph, its neighbours and its points; all else is held. Photographs on a rig move together.
     pub fn adjust_around(&mut self, photo: usize) {
         let local = self.neighbours(photo);
         let mut variable = vec![false; self.tracks.len()];
-        for o in &self.tracks.of_photo[photo] {
+        for o in self.rigs[photo].iter().flat_map(|p| &self.tracks.of_photo[*p]) {
             let track = self.track_of(*o);
-            variable[track] = self.used[*o as usize] && self.points[track].is_some();
+            variable[track] |= self.used[*o as usize] && self.points[track].is_some();
         }
         // Held points of neighbours anchor them.
         let mut listed = vec![false; self.tracks.len()];
         let mut tracks = Vec::new();
         for neighbour in &local {
-            for o in &self.tracks.of_photo[*neighbour] {
+            for o in self.rigs[*neighbour].iter().flat_map(|p| &self.tracks.of_photo[*p]) {
                 let track = self.track_of(*o);
                 if self.used[*o as usize] && !listed[track] {
                     listed[track] = true;
@@ -105,40 +102,26 @@ impl Working<'_> {
         }
         tracks.sort_unstable();
         let mut problem = Problem::default();
-        let mut pose_of = vec![u32::MAX; self.poses.len()];
-        let mut add = |problem: &mut Problem, photo: usize, held: bool| {
-            let Some(pose) = self.poses[photo] else { return };
-            pose_of[photo] = problem.poses.len() as u32;
-            problem.poses.push(pose);
-            problem.held_poses.push(held);
-            problem.camera_of.push(self.photos[photo].group as u32);
-        };
+        let mut view_of = vec![None; self.poses.len()];
         for neighbour in &local {
-            add(&mut problem, *neighbour, self.held_poses[*neighbour]);
+            self.add_views(&mut problem, *neighbour, self.held_poses[*neighbour], &mut view_of);
         }
-        for other in 0..self.poses.len() {
-            if !local.contains(&other) {
-                add(&mut problem, other, true);
-            }
+        for other in self.leaders().filter(|leader| !local.contains(leader)) {
+            self.add_views(&mut problem, other, true, &mut view_of);
         }
         problem.cameras = self
             .cameras
             .iter()
             .map(|c| AdjustedCamera::new(*c, Freedom::HELD))
             .collect();
-        self.add_points(
-            &mut problem,
-            &tracks,
-            |track| !variable[track],
-            |photo| Some(pose_of[photo as usize]),
-        );
+        self.add_points(&mut problem, &tracks, |track| !variable[track], &view_of);
         problem.solve(&AdjustOptions {
             loss: GROWING_LOSS,
             iterations: 6,
             tolerance: 1e-3,
         });
-        for (pose, photo) in problem.poses.iter().zip(&local) {
-            self.poses[*photo] = Some(*pose);
+        for (leader, pose) in local.into_iter().zip(&problem.poses) {
+            self.place_rig(leader, *pose);
         }
         for (track, point) in tracks.iter().zip(&problem.points) {
             self.points[*track] = Some(*point);
@@ -146,17 +129,42 @@ impl Working<'_> {
         self.filter(&tracks);
     }
 
-    /// The photograph and those that share most points with it, [`MapOptions::local_photos`](super::MapOptions) in all.
+    /// The first registered photograph of each rig; a photograph on none leads itself.
+    fn leaders(&self) -> impl Iterator<Item = usize> {
+        (0..self.poses.len()).filter(|p| self.poses[*p].is_some() && self.rigs[*p][0] == *p)
+    }
+
+    /// Adds the pose of the rig that `leader` leads, and a view for each of its photographs, which `view_of` tells.
+    fn add_views(&self, problem: &mut Problem, leader: usize, held: bool, view_of: &mut [Option<u32>]) {
+        let Some(pose) = self.poses[leader] else { return };
+        let number = problem.poses.len() as u32;
+        problem.poses.push(DPose {
+            rotation: pose.rotation * self.mount(leader).inverse(),
+            ..pose
+        });
+        problem.held_poses.push(held);
+        for photo in &self.rigs[leader] {
+            view_of[*photo] = Some(problem.views.len() as u32);
+            problem.views.push(View {
+                pose: number,
+                camera: self.photos[*photo].group as u32,
+                mount: self.mount(*photo),
+            });
+        }
+    }
+
+    /// The leaders of the rig of `photo` and of those that share most points with it, [`MapOptions::local_photos`](super::MapOptions) in all.
     fn neighbours(&self, photo: usize) -> Vec<usize> {
+        let leader = |photo: usize| self.rigs[photo][0];
         let mut shared = vec![0usize; self.poses.len()];
-        for o in &self.tracks.of_photo[photo] {
+        for o in self.rigs[photo].iter().flat_map(|p| &self.tracks.of_photo[*p]) {
             if self.used[*o as usize] {
                 for other in self.tracks.range(self.track_of(*o)).filter(|o| self.used[*o]) {
-                    shared[self.tracks.observations[other].photo as usize] += 1;
+                    shared[leader(self.tracks.observations[other].photo as usize)] += 1;
                 }
             }
         }
-        shared[photo] = usize::MAX;
+        shared[leader(photo)] = usize::MAX;
         let mut order: Vec<usize> = (0..shared.len())
             .filter(|p| shared[*p] > 0 && self.poses[*p].is_some())
             .collect();
@@ -171,20 +179,20 @@ impl Working<'_> {
         problem: &mut Problem,
         tracks: &[usize],
         held: impl Fn(usize) -> bool,
-        pose_of: impl Fn(u32) -> Option<u32>,
+        view_of: &[Option<u32>],
     ) {
         problem.starts.push(0);
         for track in tracks {
             let held = held(*track);
             for o in self.tracks.range(*track).filter(|o| self.used[*o]) {
-                let Some(pose) = pose_of(self.tracks.observations[o].photo) else {
+                let Some(view) = view_of[self.tracks.observations[o].photo as usize] else {
                     continue;
                 };
-                if held && problem.held_poses[pose as usize] {
+                if held && problem.held_poses[problem.views[view as usize].pose as usize] {
                     continue;
                 }
                 problem.observations.push(Observation {
-                    pose,
+                    view,
                     at: self.tracks.pixels[o],
                 });
             }

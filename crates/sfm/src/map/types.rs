@@ -2,7 +2,7 @@ use super::focal::Source;
 use crate::geometry::camera::DCamera;
 use crate::geometry::essential::Motion;
 use crate::geometry::pose::DPose;
-use glam::DVec3;
+use glam::{DQuat, DVec3};
 
 /// What is known of a photograph beside its features.
 #[derive(Clone, Debug, PartialEq)]
@@ -19,6 +19,19 @@ pub struct PhotoInfo {
     pub focal_prior_px: Option<f64>,
     /// The direction up in camera axes (x right, y down, z forward) if known; otherwise -y.
     pub up: Option<DVec3>,
+    /// The camera of its group, if it is known exactly; it is held.
+    pub camera: Option<DCamera>,
+    /// Its place on a rig, if it is on one.
+    pub mount: Option<Mount>,
+}
+
+/// The place of a photograph on a rig: all photographs of a rig are taken from one position.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Mount {
+    /// The rig's number.
+    pub rig: usize,
+    /// Rotation of the camera's axes into the rig's.
+    pub rotation: DQuat,
 }
 
 /// What is known before mapping, and stays as it is.

@@ -7,7 +7,7 @@
 //! to 1.58 apart before the scene is mapped again.
 
 use super::types::{Model, PhotoInfo, Zoom};
-use crate::adjust::{AdjustOptions, AdjustedCamera, Belief, Focal, Freedom, Loss, Observation, Problem};
+use crate::adjust::{AdjustOptions, AdjustedCamera, Belief, Focal, Freedom, Loss, Observation, Problem, View};
 use crate::geometry::camera::DCamera;
 use crate::{Features, median};
 use glam::DVec2;
@@ -89,7 +89,7 @@ fn own_focals(photos: &[PhotoInfo], features: &[Features], model: &Model) -> Opt
             continue;
         };
         number[photo] = problem.poses.len() as u32;
-        problem.camera_of.push(number[photo]);
+        problem.views.push(View::new(number[photo], number[photo]));
         problem.poses.push(*pose);
         problem.held_poses.push(false);
         problem.cameras.push(alone(camera));
@@ -100,7 +100,7 @@ fn own_focals(photos: &[PhotoInfo], features: &[Features], model: &Model) -> Opt
         for (photo, keypoint) in &point.track {
             let k = &features[*photo as usize].keypoints[*keypoint as usize];
             problem.observations.push(Observation {
-                pose: number[*photo as usize],
+                view: number[*photo as usize],
                 at: DVec2::new(k.x.into(), k.y.into()),
             });
         }

@@ -72,6 +72,19 @@ impl World {
         wrong: f64,
         seed: u64,
     ) -> Self {
+        Self::seen_by(CAMERA, poses, points, twins, noise, wrong, seed)
+    }
+
+    /// As [`World::of_points`], with photographs of `camera`.
+    pub fn seen_by(
+        camera: DCamera,
+        poses: Vec<DPose>,
+        points: &[(DVec3, DVec3)],
+        twins: usize,
+        noise: f64,
+        wrong: f64,
+        seed: u64,
+    ) -> Self {
         let look = |point: usize| if point < 2 * twins { point % twins } else { point };
         let mut world = Self {
             poses,
@@ -92,8 +105,8 @@ impl World {
                 if p.z < 0.1 || facing < 0.35 || rng.uniform() < 0.2 {
                     continue;
                 }
-                let at = CAMERA.pixel(p) + noise * DVec2::new(f64::from(rng.normal()), f64::from(rng.normal()));
-                if at.x < 0.0 || at.y < 0.0 || at.x > 1000.0 || at.y > 750.0 {
+                let at = camera.pixel(p) + noise * DVec2::new(f64::from(rng.normal()), f64::from(rng.normal()));
+                if at.x < 0.0 || at.y < 0.0 || at.x > camera.width.into() || at.y > camera.height.into() {
                     continue;
                 }
                 keypoints.push(Keypoint {
@@ -111,11 +124,13 @@ impl World {
             });
             world.photos.push(PhotoInfo {
                 name: format!("{i:03}.jpg"),
-                width: CAMERA.width,
-                height: CAMERA.height,
+                width: camera.width,
+                height: camera.height,
                 group: 0,
                 focal_prior_px: None,
                 up: None,
+                camera: None,
+                mount: None,
             });
         }
         for a in 0..shown.len() {

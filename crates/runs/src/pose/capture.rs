@@ -1,0 +1,205 @@
+//! What is posed: photographs of one or several folders, frames of films, faces of panoramas.
+
+use super::{PoseProgress, film, is_film};
+use crate::RunError;
+use glam::DVec3;
+use irradia_formats::{
+    DatasetFormat, PanoramaFace, PhotoEntry, PhotoFolder, find_panoramas, has_photos, read_photo_folder,
+    read_photo_folders,
+};
+use irradia_sfm::geometry::camera::DCamera;
+use irradia_sfm::map::{Mount, PhotoInfo};
+use rayon::prelude::*;
+use std::collections::HashMap;
+use std::fs;
+use std::path::{Path, PathBuf};
+
+/// Where frames of films and faces of panoramas are written, in the folder of the dataset.
+const FRAMES: &str = "frames";
+const FACES: &str = "faces";
+/// Folders within folders that are searched.
+const DEPTH: usize = 2;
+
+/// Folders of photographs, and films.
+#[derive(Debug, Default, PartialEq)]
+struct Sources {
+    folders: Vec<PathBuf>,
+    films: Vec<PathBuf>,
+}
+
+impl Sources {
+    /// What `path` holds: a film; a folder of photographs and films; else what the folders in it hold.
+    fn add(&mut self, path: &Path, depth: usize) -> Result<(), RunError> {
+        if is_film(path) {
+            self.films.push(path.to_owned());
+            return Ok(());
+        }
+        let read = RunError::io("read", path);
+        let mut entries: Vec<PathBuf> = match fs::read_dir(path) {
+            Ok(entries) => entries.flatten().map(|entry| entry.path()).collect(),
+            Err(error) => return Err(read(error)),
+        };
+        entries.retain(|entry| {
+            !entry
+                .file_name()
+                .is_some_and(|name| name.to_string_lossy().starts_with('.'))
+        });
+        entries.sort();
+        self.films
+            .extend(entries.iter().filter(|entry| is_film(entry)).cloned());
+        if has_photos(path) {
+            self.folders.push(path.to_owned());
+        } else if depth > 0 {
+            // A folder of datasets is no capture.
+            let is_part = |entry: &&PathBuf| {
+                entry.is_dir() && !entry.ends_with("masks") && DatasetFormat::recognise(entry).is_none()
+            };
+            for folder in entries.iter().filter(is_part) {
+                self.add(folder, depth - 1)?;
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Whether there is anything to pose at `path`: photographs or films, itself, in its folders, or in theirs.
+pub fn is_capture(path: &Path) -> bool {
+    let mut sources = Sources::default();
+    sources.add(path, DEPTH).is_ok() && sources != Sources::default()
+}
+
+/// Photographs that are to be posed.
+#[derive(Debug)]
+pub(super) struct Capture {
+    /// The photographs, also those that stand for frames and panoramas.
+    pub folder: PhotoFolder,
+    /// Whether some are frames of films.
+    pub has_films: bool,
+    /// Faces of panoramas by their names, and the number of the panorama.
+    faces: HashMap<String, (usize, PanoramaFace)>,
+}
+
+impl Capture {
+    /// Reads what `paths` hold. Frames and faces are written into folders of `out`.
+    ///
+    /// # Errors
+    /// When a path or a film cannot be read, or frames and faces have nowhere to be written or cannot be.
+    pub fn read(
+        paths: &[PathBuf],
+        out: Option<&Path>,
+        progress: &(dyn Fn(PoseProgress) + Sync),
+    ) -> Result<Self, RunError> {
+        let mut sources = Sources::default();
+        for path in paths {
+            sources.add(path, DEPTH)?;
+        }
+        let needs_out = |what: &str| {
+            let path = paths.first().map(|path| path.display().to_string()).unwrap_or_default();
+            RunError::Refused(format!("{path}: {what} need a folder to be written to: give --out"))
+        };
+        if !sources.films.is_empty() {
+            let folder = out.ok_or_else(|| needs_out("frames of a film"))?.join(FRAMES);
+            film::frames(&sources.films, &folder, progress)?;
+            sources.folders.push(folder);
+        }
+        let mut capture = Self {
+            folder: read_photo_folders(&sources.folders)?,
+            has_films: !sources.films.is_empty(),
+            faces: HashMap::new(),
+        };
+        let panoramas = capture.take_panoramas();
+        if !panoramas.is_empty() {
+            let folder = out.ok_or_else(|| needs_out("faces of panoramas"))?.join(FACES);
+            capture.add_faces(&panoramas, &folder)?;
+        }
+        Ok(capture)
+    }
+
+    /// Whether there are panoramas.
+    pub fn has_panoramas(&self) -> bool {
+        !self.faces.is_empty()
+    }
+
+    /// Removes panoramas from the photographs.
+    fn take_panoramas(&mut self) -> Vec<PhotoEntry> {
+        let photos = std::mem::take(&mut self.folder.photos);
+        let are = find_panoramas(&photos);
+        let mut panoramas = Vec::new();
+        for (photo, is) in photos.into_iter().zip(are) {
+            match is {
+                true => panoramas.push(photo),
+                false => self.folder.photos.push(photo),
+            }
+        }
+        panoramas
+    }
+
+    fn add_faces(&mut self, panoramas: &[PhotoEntry], folder: &Path) -> Result<(), RunError> {
+        if folder.exists() {
+            fs::remove_dir_all(folder).map_err(RunError::io("clear", folder))?;
+        }
+        let cut: Vec<Vec<PanoramaFace>> = panoramas
+            .par_iter()
+            .map(|panorama| panorama.cut_panorama(folder))
+            .collect::<Result<_, _>>()?;
+        let of: HashMap<String, (usize, PanoramaFace)> = (cut.into_iter().enumerate())
+            .flat_map(|(rig, faces)| faces.into_iter().map(move |face| (face.name.clone(), (rig, face))))
+            .collect();
+        let written = read_photo_folder(folder)?;
+        self.folder.left_out.extend(written.left_out);
+        for mut photo in written.photos {
+            let (rig, face) = &of[&photo.name];
+            let tags = &panoramas[*rig].tags;
+            photo.tags.gps = tags.gps;
+            photo.tags.time.clone_from(&tags.time);
+            photo.tags.focal = Some(f64::from(face.camera.fx) / f64::from(photo.width.max(photo.height)));
+            self.folder.photos.push(photo);
+        }
+        self.folder.photos.sort_by(|a, b| a.name.cmp(&b.name));
+        self.faces = of;
+        Ok(())
+    }
+
+    /// What the mapper is told of the photographs `used`, indices of the folder's.
+    pub fn infos(&self, used: &[usize]) -> Vec<PhotoInfo> {
+        let groups = self.folder.groups();
+        // Groups are numbered from 0 without gaps, also where photographs could not be decoded.
+        let mut numbers: Vec<usize> = Vec::new();
+        let info = |i: &usize| {
+            let photo = &self.folder.photos[*i];
+            let known = numbers.iter().position(|group| *group == groups[*i]);
+            let group = known.unwrap_or_else(|| {
+                numbers.push(groups[*i]);
+                numbers.len() - 1
+            });
+            let face = self.faces.get(&photo.name);
+            let [right, down] = photo.up.map(f64::from);
+            PhotoInfo {
+                name: photo.name.clone(),
+                width: photo.width,
+                height: photo.height,
+                group,
+                focal_prior_px: photo.focal_px(),
+                up: Some(match face {
+                    Some((_, face)) => face.turn.inverse() * DVec3::NEG_Y,
+                    None => DVec3::new(right, down, 0.0),
+                }),
+                camera: face.map(|(_, face)| pinhole(face)),
+                mount: face.map(|(rig, face)| Mount {
+                    rig: *rig,
+                    rotation: face.turn,
+                }),
+            }
+        };
+        used.iter().map(info).collect()
+    }
+}
+
+fn pinhole(face: &PanoramaFace) -> DCamera {
+    let k = &face.camera;
+    DCamera {
+        width: k.width,
+        height: k.height,
+        parameters: [k.fx, k.fy, k.cx, k.cy, 0.0, 0.0, 0.0, 0.0].map(f64::from),
+    }
+}

@@ -4,9 +4,10 @@ mod world;
 
 use glam::{DQuat, DVec3};
 use irradia_sfm::Features;
+use irradia_sfm::PairMatches;
 use irradia_sfm::doctor::{Appearance, Diagnosis, Evidence, Kind, diagnose};
 use irradia_sfm::geometry::pose::DPose;
-use irradia_sfm::map::{MapOptions, verify};
+use irradia_sfm::map::{MapOptions, Model, verify};
 use world::{World, around, look};
 
 /// All diagnoses of a world: with the model, and from its pairs alone.
@@ -241,6 +242,60 @@ fn a_zoom_that_no_metadata_tell_is_named_and_mapped_with_its_own_focal_length() 
     let focal = |group: usize| model.cameras[group].as_ref().expect("used").focal();
     assert!((focal(0) / 870.0 - 1.0).abs() < 0.01, "{}", focal(0));
     assert!((focal(1) / 1305.0 - 1.0).abs() < 0.01, "{}", focal(1));
+}
+
+#[test]
+fn a_zoom_so_far_that_nothing_matches_is_named_from_both_models() {
+    let mut world = ring(24, 2500, 0..0).zoomed(14, 1.6);
+    world
+        .pairs
+        .retain(|pair| (pair.photos[0] < 14) == (pair.photos[1] < 14));
+    let found = world.map();
+    let sizes: Vec<usize> = found.models.iter().map(Model::registered).collect();
+    assert_eq!(sizes, [14, 10]);
+    let [mapped, _] = plainly(&world);
+    let zoom = mapped.iter().find_map(|diagnosis| match diagnosis {
+        Diagnosis::Zoom { photos, ratio } => Some((photos.clone(), *ratio)),
+        _ => None,
+    });
+    let (photos, ratio) = zoom.unwrap_or_else(|| panic!("{mapped:?}"));
+    assert_eq!(photos, (14..24).collect::<Vec<_>>());
+    assert!((ratio / 1.6 - 1.0).abs() < 0.03, "{ratio}");
+}
+
+#[test]
+fn a_background_with_most_of_the_features_stands_still() {
+    // Of the object nothing matches: the background of each photograph is in the same place as in the one before.
+    let mut world = ring(24, 2500, 0..0);
+    let background = world.features[0].clone();
+    world
+        .features
+        .iter_mut()
+        .for_each(|features| *features = background.clone());
+    let count = background.keypoints.len() as u32;
+    let all = |photos: [u32; 2]| PairMatches {
+        photos,
+        matches: (0..count).map(|i| [i, i]).collect(),
+    };
+    world.pairs = (0..12).map(|i| all([i, i + 1])).collect();
+    let [_, alone] = plainly(&world);
+    let still = alone
+        .iter()
+        .find(|diagnosis| matches!(diagnosis, Diagnosis::StandsStill { .. }));
+    assert_eq!(still.map(Diagnosis::photos), Some((0..13).collect()), "{alone:?}");
+    assert!(
+        !alone
+            .iter()
+            .any(|diagnosis| matches!(diagnosis, Diagnosis::Twice { .. })),
+        "{alone:?}"
+    );
+    // Two shots of each place are no background.
+    world.pairs = (0..12).map(|i| all([2 * i, 2 * i + 1])).collect();
+    let [_, alone] = plainly(&world);
+    let twice = alone
+        .iter()
+        .filter(|diagnosis| matches!(diagnosis, Diagnosis::Twice { .. }));
+    assert_eq!(twice.count(), 12, "{alone:?}");
 }
 
 #[test]

@@ -13,7 +13,8 @@ use crate::first_splats::has_points;
 use crate::recipe::Params;
 use crate::spacing::spacing;
 use crate::trainer::{TrainError, Trainer};
-use irradia_scene::Photo;
+use glam::Vec3;
+use irradia_scene::{Photo, View};
 
 /// Training photographs that are looked at, evenly spaced.
 const SAMPLES: usize = 24;
@@ -26,6 +27,9 @@ const KEPT: f64 = 0.5;
 const BORDER_LEFT_OUT: f64 = 0.6;
 /// Least share of a photograph that a sky covers.
 const SKY_SHARE: f64 = 0.1;
+/// Cosine of the angle to the mean direction up of the photographs up to which what is at the upper edge of a photograph may be a sky: a face of a
+/// panorama that looks down has the floor there.
+const UPRIGHT: f32 = 0.5;
 /// Largest difference of a channel between adjacent pixels of a sky, of 255.
 const SKY_STEP: u8 = 8;
 /// Standard deviations between photographs, of the colours of their skies and of the same relative to their brightness, from which each
@@ -110,11 +114,14 @@ impl Trainer {
             std::mem::take(&mut self.recipe.known_space),
             std::mem::take(&mut self.recipe.cut_out),
         ];
-        let (mut cut_outs, mut sky_colors, mut photographs) = (0usize, Vec::new(), 0usize);
+        let (mut cut_outs, mut photographs) = (0usize, 0usize);
+        let (mut sky_colors, mut upright) = (Vec::new(), 0usize);
         if !(skies.is_empty() && cut_out.is_empty()) {
             let every = self.dataset.train.len().div_ceil(SAMPLES);
-            for view in self.dataset.train.iter().step_by(every) {
-                let view = &self.dataset.views[*view];
+            let up = |view: &View| view.camera.pose.rotation * Vec3::NEG_Y;
+            let train = self.dataset.train.iter().map(|view| &self.dataset.views[*view]);
+            let mean_up = train.clone().map(up).sum::<Vec3>().normalize_or_zero();
+            for view in train.step_by(every) {
                 let k = &view.camera.intrinsics;
                 let small = k.scaled((SIDE as f32 / k.width.max(k.height) as f32).min(1.0));
                 // One that cannot be read ends the first step, from which the run can be resumed.
@@ -123,7 +130,10 @@ impl Trainer {
                 };
                 photographs += 1;
                 cut_outs += usize::from(is_cut_out(&photo));
-                sky_colors.extend(sky_color(&photo).filter(|_| photo.channels == 3));
+                if up(view).dot(mean_up) >= UPRIGHT {
+                    upright += 1;
+                    sky_colors.extend(sky_color(&photo).filter(|_| photo.channels == 3));
+                }
             }
         }
         let are_cut_out = photographs > 0 && cut_outs as f64 >= MOST * photographs as f64;
@@ -136,7 +146,7 @@ impl Trainer {
         } else {
             None
         };
-        if !are_cut_out && skies_differ(&sky_colors, photographs) {
+        if !are_cut_out && skies_differ(&sky_colors, upright) {
             self.put_into_effect("the sky differs from photograph to photograph", "skies", skies);
         }
         if let Some(why) = known {

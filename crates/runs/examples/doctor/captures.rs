@@ -120,7 +120,8 @@ impl Capture {
             ("gap", "open-loop") | ("loop", "gap") | ("turntable", "moving" | "contradiction" | "rotation-only") => {
                 true
             }
-            ("twin", "gap" | "open-loop" | "moving") | ("zoom", "contradiction") => true,
+            // Where the board has more matches than the scene, the model follows it, and is wrong indeed.
+            ("moving" | "zoom", "contradiction") | ("twin", "gap" | "open-loop" | "moving") => true,
             _ => false,
         }
     }

@@ -9,7 +9,6 @@ use irradia_formats::{PhotoFolder, write_atomic, write_png};
 use irradia_scene::resize_area;
 use irradia_sfm::PairMatches;
 use irradia_sfm::doctor::{Diagnosis, Evidence, diagnose, shots};
-use irradia_sfm::features::Sift;
 use irradia_sfm::map::{MapOptions, Model, PhotoInfo, Reconstruction, verify};
 use irradia_sfm::matching::PairOptions;
 use serde::Serialize;
@@ -38,8 +37,8 @@ pub struct DoctorInput {
     pub photos: Vec<PathBuf>,
     /// Where the report, features and matches are written, if anywhere.
     pub out: Option<PathBuf>,
-    /// The most features of a photograph, at least 1.
-    pub max_features: usize,
+    /// The most features of a photograph, at least 1; by the number of photographs if `None`.
+    pub max_features: Option<usize>,
 }
 
 impl DoctorInput {
@@ -48,7 +47,7 @@ impl DoctorInput {
         Self {
             photos: vec![photos.into()],
             out: None,
-            max_features: Sift::default().max_features,
+            max_features: None,
         }
     }
 }
@@ -109,7 +108,7 @@ pub struct Plan {
 /// When there are fewer than three photographs, or a file cannot be read or written.
 pub fn doctor(input: &DoctorInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Result<DoctorReport, RunError> {
     let started = Instant::now();
-    if input.max_features == 0 {
+    if input.max_features == Some(0) {
         return Err(RunError::setting("max_features", 0, "must be 1 or more"));
     }
     if let Some(out) = &input.out {

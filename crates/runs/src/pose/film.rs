@@ -314,16 +314,27 @@ fn choose(frames: &[Frame], wanted: usize) -> Vec<usize> {
     best.into_iter().flatten().collect()
 }
 
+/// The expression by which ffmpeg selects frames: a balanced sum, since it evaluates no more than a hundred terms in a row.
+fn is_one_of(frames: &[usize]) -> String {
+    match frames {
+        [] => "0".to_owned(),
+        [frame] => format!("eq(n,{frame})"),
+        several => {
+            let (first, second) = several.split_at(several.len() / 2);
+            format!("({}+{})", is_one_of(first), is_one_of(second))
+        }
+    }
+}
+
 /// Writes the chosen frames, ascending, under their names.
 fn extract(chosen: &Chosen, folder: &Path) -> Result<(), RunError> {
     let film = &chosen.film;
-    let numbers: Vec<String> = chosen.frames.iter().map(|frame| format!("eq(n,{frame})")).collect();
     let output = Command::new("ffmpeg")
         .args(["-loglevel", "error", "-y", "-i"])
         .arg(film)
         .args([
             "-vf",
-            &format!("select='{}'", numbers.join("+")),
+            &format!("select='{}'", is_one_of(&chosen.frames)),
             "-fps_mode",
             "passthrough",
         ])
@@ -371,6 +382,24 @@ mod tests {
         // A minute of walking and a second of standing still share what both ask for.
         assert_eq!(shares(&[frames, still.clone()]), [300, LEAST]);
         assert_eq!(shares(&[still.clone(), still]), [50, 50]);
+    }
+
+    #[test]
+    fn frames_are_selected_by_a_sum_that_is_nowhere_deep() {
+        assert_eq!(is_one_of(&[3, 7, 9]), "(eq(n,3)+(eq(n,7)+eq(n,9)))");
+        let frames: Vec<usize> = (0..300).map(|i| 3 * i).collect();
+        let (mut depth, mut deepest) = (0usize, 0);
+        let text = is_one_of(&frames);
+        for c in text.chars() {
+            match c {
+                '(' => depth += 1,
+                ')' => depth -= 1,
+                _ => {}
+            }
+            deepest = deepest.max(depth);
+        }
+        assert!(depth == 0 && deepest <= 11, "{deepest}");
+        assert_eq!(text.matches("eq(n,").count(), 300);
     }
 
     #[test]

@@ -24,7 +24,6 @@ use crate::folder::to_json;
 use capture::Capture;
 use irradia_formats::{PhotoFolder, write_atomic};
 use irradia_sfm::doctor::Kind;
-use irradia_sfm::features::Sift;
 use irradia_sfm::map::{MapOptions, PhotoInfo, Progress, Reconstruction, extend, reconstruct};
 use irradia_sfm::matching::PairOptions;
 use serde::Serialize;
@@ -59,8 +58,8 @@ pub struct PoseInput {
     pub mapper: Mapper,
     /// The program that [`Mapper::Colmap`] runs.
     pub colmap: String,
-    /// The most features of a photograph, at least 1.
-    pub max_features: usize,
+    /// The most features of a photograph, at least 1; by the number of photographs if `None`.
+    pub max_features: Option<usize>,
     /// How to verify and map.
     pub mapping: MapOptions,
 }
@@ -75,7 +74,7 @@ impl PoseInput {
             distances: Vec::new(),
             mapper: Mapper::default(),
             colmap: "colmap".to_owned(),
-            max_features: Sift::default().max_features,
+            max_features: None,
             mapping: MapOptions::default(),
         }
     }
@@ -214,7 +213,7 @@ pub struct StageReport {
 /// cannot be written.
 pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Result<PoseReport, RunError> {
     let started = Instant::now();
-    if input.max_features == 0 {
+    if input.max_features == Some(0) {
         return Err(RunError::setting("max_features", 0, "must be 1 or more"));
     }
     if input.into && !input.distances.is_empty() {

@@ -8,7 +8,8 @@ use irradia_runs::{
 };
 use irradia_testkit::shared;
 use std::fs;
-use std::path::Path;
+use std::path::{Path, PathBuf};
+use std::process::Command;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;
 
@@ -458,4 +459,56 @@ fn colmap_is_driven_with_the_options_that_it_knows() {
         error.contains("feature_extractor failed") && error.ends_with("out of luck"),
         "{error}"
     );
+}
+
+/// As [`photographs`], as films: the first half of a ring, and the second, each frame shown for a while.
+fn films(folder: &Path) -> Option<Vec<PathBuf>> {
+    let frames = folder.join("frames");
+    fs::create_dir(&frames).unwrap();
+    let mut names: Vec<String> = photographs(&frames).into_iter().map(|(name, _)| name).collect();
+    let second = names.split_off(names.len() / 2);
+    let film = |(film, names): (&str, Vec<String>)| {
+        let list = folder.join(format!("{film}.txt"));
+        let lines: String = names
+            .iter()
+            .flat_map(|name| [format!("file 'frames/{name}'\nduration 0.25\n")])
+            .collect();
+        fs::write(&list, lines).unwrap();
+        let file = folder.join(format!("{film}.mp4"));
+        let made = Command::new("ffmpeg")
+            .args(["-loglevel", "error", "-y", "-f", "concat", "-i"])
+            .arg(&list)
+            .args(["-r", "30", "-pix_fmt", "yuv420p", "-q:v", "2"])
+            .arg(&file)
+            .status();
+        made.is_ok_and(|status| status.success()).then_some(file)
+    };
+    [("first", names), ("second", second)].into_iter().map(film).collect()
+}
+
+#[test]
+fn several_films_are_posed_together() {
+    let folder = tempfile::tempdir().unwrap();
+    let Some(films) = films(folder.path()) else {
+        eprintln!("SKIPPED: ffmpeg is not installed, so that no film can be made");
+        return;
+    };
+    let out = folder.path().join("data");
+    let input = PoseInput {
+        photos: films,
+        ..PoseInput::new("", &out)
+    };
+    let report = quietly(&input).unwrap();
+    let names: Vec<String> = fs::read_dir(out.join("frames"))
+        .unwrap()
+        .map(|entry| entry.unwrap().file_name().into_string().unwrap())
+        .filter(|name| name.ends_with(".jpg"))
+        .collect();
+    // Each of the photographs once.
+    for film in ["first_", "second_"] {
+        let count = names.iter().filter(|name| name.starts_with(film)).count();
+        assert!((15..=22).contains(&count), "{film}: {count}");
+    }
+    assert!(10 * report.registered >= 9 * names.len(), "{report:#?}");
+    assert_eq!(report.models.len(), 1, "{:?}", report.models);
 }

@@ -148,13 +148,16 @@ pub fn diagnose(evidence: &Evidence) -> Vec<Diagnosis> {
         return Vec::new();
     }
     let graph = Graph::new(evidence, HOLDS);
-    let still = motion::stands_still(evidence);
+    let mut still = motion::stands_still(evidence);
     // Pairs on a turntable seem taken from one place.
-    let twice = if still.is_empty() {
-        motion::twice(evidence)
-    } else {
-        Vec::new()
-    };
+    let mut twice = Vec::new();
+    if still.is_empty() {
+        twice = motion::twice(evidence);
+        still = motion::stands_behind(evidence, &twice);
+    }
+    if !still.is_empty() {
+        twice.clear();
+    }
     let (moving, showing) = if still.is_empty() {
         moving::moving(evidence)
     } else {

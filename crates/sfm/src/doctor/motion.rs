@@ -53,6 +53,40 @@ pub(super) fn limits(pair: &PairMatches, samples: usize) -> Limits {
     }
 }
 
+/// Photographs that chains of pairs from the same place join, from which on what is in the same place is no photograph taken twice but a
+/// background that stands still, with more features than what turns before it; in photographs, and as a fraction of all.
+const CHAIN: usize = 6;
+const CHAIN_FRACTION: f64 = 0.2;
+
+/// A background that stands still in all of a chain of `twice`.
+pub(super) fn stands_behind(evidence: &Evidence, twice: &[Diagnosis]) -> Vec<Diagnosis> {
+    let pairs: Vec<[usize; 2]> = (twice.iter())
+        .filter_map(|diagnosis| <[usize; 2]>::try_from(diagnosis.photos()).ok())
+        .collect();
+    let mut chain: Vec<usize> = (0..evidence.photos.len()).collect();
+    // Each photograph gets the smallest number that leads to it.
+    loop {
+        let before = chain.clone();
+        for [a, b] in &pairs {
+            let least = chain[*a].min(chain[*b]);
+            (chain[*a], chain[*b]) = (least, least);
+        }
+        if chain == before {
+            break;
+        }
+    }
+    let members = |of: usize| (0..chain.len()).filter(|p| chain[*p] == of).collect::<Vec<_>>();
+    let longest = (0..chain.len()).map(members).max_by_key(Vec::len).unwrap_or_default();
+    if longest.len() < CHAIN || (longest.len() as f64) < CHAIN_FRACTION * chain.len() as f64 {
+        return Vec::new();
+    }
+    vec![Diagnosis::StandsStill {
+        photos: longest,
+        pairs: [pairs.len(), evidence.matches.len()],
+        fraction: 1.0,
+    }]
+}
+
 /// Photographs that show the same from the same place.
 pub(super) fn twice(evidence: &Evidence) -> Vec<Diagnosis> {
     let same = |pair: &&PairMatches| {

@@ -56,7 +56,8 @@ pub fn reconstruct(
     let mut found = mapped(photos, features, pairs, &known_cameras(photos), options, progress);
     let mut grouped = photos.to_vec();
     while found.zooms.len() < MOST_ZOOMS {
-        let Some(zoom) = found.models.first().and_then(|m| zoom::find(&grouped, features, m)) else {
+        let within = found.models.first().and_then(|m| zoom::find(&grouped, features, m));
+        let Some(zoom) = within.or_else(|| zoom::between(&grouped, &found.models)) else {
             break;
         };
         let mut apart = grouped.clone();
@@ -69,7 +70,7 @@ pub fn reconstruct(
         }
         let again = mapped(&apart, features, pairs, &cameras, options, progress);
         let registered = |found: &Reconstruction| found.models.first().map_or(0, Model::registered);
-        if registered(&again) < registered(&found) || !again.models.first().is_some_and(|m| zoom::holds(&zoom, m)) {
+        if registered(&again) < registered(&found) || !zoom::holds(&zoom, &again.models) {
             break;
         }
         let zooms = [std::mem::take(&mut found.zooms), vec![zoom]].concat();
@@ -77,11 +78,9 @@ pub fn reconstruct(
         grouped = apart;
     }
     // What the adjustment made of them.
-    if let Some(model) = found.models.first() {
-        for zoom in &mut found.zooms {
-            for (focal, group) in zoom.focals.iter_mut().zip([zoom.of, zoom.group]) {
-                *focal = model.cameras[group].as_ref().map_or(*focal, DCamera::focal);
-            }
+    for zoom in &mut found.zooms {
+        for (focal, group) in zoom.focals.iter_mut().zip([zoom.of, zoom.group]) {
+            *focal = zoom::camera(&found.models, group).map_or(*focal, DCamera::focal);
         }
     }
     found

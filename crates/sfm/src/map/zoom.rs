@@ -14,6 +14,10 @@ use glam::DVec2;
 
 /// Photographs of a cluster, at least: fewer hardly determine a camera.
 const LEAST: usize = 3;
+/// Ratio of the focal lengths of two models, at most: of a model that follows what moves before the scene, it may be anything.
+const FARTHEST: f64 = 2.5;
+/// Photographs of a model from which on its focal length is one to compare with another model's.
+const ALONE: usize = 8;
 /// Ratio of the focal lengths of two clusters, at least.
 const APART: f64 = 1.2;
 /// Mean distance of the photographs from the median of their cluster, by that of the two medians, at most.
@@ -53,13 +57,44 @@ pub(super) fn find(photos: &[PhotoInfo], features: &[Features], model: &Model) -
     })
 }
 
-/// Whether both cameras of a model that was mapped with `zoom` still are as far apart.
-pub(super) fn holds(zoom: &Zoom, model: &Model) -> bool {
-    let focals = [zoom.of, zoom.group].map(|group| model.cameras[group].as_ref().map(DCamera::focal));
+/// Photographs of one camera that are in a model of their own, with another focal length: zoomed so far that too few pairs with the others
+/// agree with one focal length. `None` if there are no such.
+pub(super) fn between(photos: &[PhotoInfo], models: &[Model]) -> Option<Zoom> {
+    let (first, others) = models.split_first()?;
+    let groups = first.cameras.len();
+    let focal = |model: &Model, group: usize| {
+        let camera = model.cameras[group].as_ref().filter(|_| !model.focal_held[group]);
+        camera.map(DCamera::focal)
+    };
+    let mut candidates = others
+        .iter()
+        .flat_map(|other| (0..groups).map(move |group| (other, group)));
+    candidates.find_map(|(other, group)| {
+        let focals = [focal(first, group)?, focal(other, group)?];
+        let own = |p: &usize| photos[*p].group == group && other.poses[*p].is_some();
+        let zoomed: Vec<usize> = (0..photos.len()).filter(own).collect();
+        let apart = (focals[1] / focals[0]).ln().abs();
+        ((APART.ln()..FARTHEST.ln()).contains(&apart) && zoomed.len() >= ALONE).then_some(Zoom {
+            of: group,
+            group: groups,
+            photos: zoomed,
+            focals,
+        })
+    })
+}
+
+/// Whether both cameras of what was mapped with `zoom` still are as far apart.
+pub(super) fn holds(zoom: &Zoom, models: &[Model]) -> bool {
+    let focals = [zoom.of, zoom.group].map(|group| camera(models, group).map(DCamera::focal));
     match focals {
         [Some(a), Some(b)] => (b / a).ln().abs() > APART.ln(),
         _ => false,
     }
+}
+
+/// The camera of a group in the first model that has one.
+pub(super) fn camera(models: &[Model], group: usize) -> Option<&DCamera> {
+    models.iter().find_map(|model| model.cameras[group].as_ref())
 }
 
 /// Where sorted values part into two clusters, and the medians of both; `None` if they do not.

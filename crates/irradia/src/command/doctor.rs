@@ -31,7 +31,6 @@ pub fn run(args: &Args) -> Result<()> {
         photos: args.photos.clone(),
         out: args.out.clone(),
         max_features: args.max_features,
-        ..DoctorInput::new("")
     };
     let report = with_progress(|progress| doctor(&input, progress)).map_err(by_option)?;
     tell_findings(&report.findings, |line| say(line))?;

@@ -50,12 +50,12 @@ impl Sources {
         if has_photos(path) {
             self.folders.push(path.to_owned());
         } else if depth > 0 {
+            entries.retain(|entry| entry.is_dir() && !entry.ends_with("masks"));
             // A folder of datasets is no capture.
-            let is_part = |entry: &&PathBuf| {
-                entry.is_dir() && !entry.ends_with("masks") && DatasetFormat::recognise(entry).is_none()
-            };
-            for folder in entries.iter().filter(is_part) {
-                self.add(folder, depth - 1)?;
+            if !entries.iter().any(|entry| DatasetFormat::recognise(entry).is_some()) {
+                for folder in &entries {
+                    self.add(folder, depth - 1)?;
+                }
             }
         }
         Ok(())
@@ -201,5 +201,40 @@ fn pinhole(face: &PanoramaFace) -> DCamera {
         width: k.width,
         height: k.height,
         parameters: [k.fx, k.fy, k.cx, k.cy, 0.0, 0.0, 0.0, 0.0].map(f64::from),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use irradia_formats::write_png;
+
+    #[test]
+    fn folders_in_folders_are_a_capture_and_datasets_are_none() {
+        let root = tempfile::tempdir().unwrap();
+        let photo = |path: &str| {
+            let path = root.path().join(path);
+            fs::create_dir_all(path.parent().unwrap()).unwrap();
+            write_png(&path, 8, 8, 1, &[7; 64]).unwrap();
+        };
+        assert!(!is_capture(root.path()));
+        photo("days/monday/1.png");
+        photo("days/tuesday/morning/1.png");
+        photo("days/masks/1.png");
+        fs::write(root.path().join("days/walk.mp4"), "a film by its name").unwrap();
+        let mut sources = Sources::default();
+        let days = root.path().join("days");
+        sources.add(&days, DEPTH).unwrap();
+        assert_eq!(
+            sources.folders,
+            ["monday", "tuesday/morning"].map(|name| days.join(name))
+        );
+        assert_eq!(sources.films, [days.join("walk.mp4")]);
+        assert!(is_capture(&days) && is_capture(&days.join("walk.mp4")));
+        // One of several folders has poses: whatever the others are, they are not one capture with it.
+        photo("sets/posed/images/1.png");
+        fs::write(root.path().join("sets/posed/transforms.json"), "{}").unwrap();
+        photo("sets/other/1.png");
+        assert!(!is_capture(&root.path().join("sets")));
     }
 }

@@ -28,7 +28,7 @@ enum Command {
     Demo(command::demo::Args),
     /// Say what is wrong with photographs before they are posed: blur, exposure, gaps, ..
     Doctor(command::doctor::Args),
-    /// Find the poses of photographs, or of the frames of a film
+    /// Find the poses of photographs, of films' frames and of panoramas
     Pose(command::pose::Args),
     /// Train a scene from photographs, or a film
     Train(command::train::Args),

@@ -2,21 +2,23 @@
 
 use super::{PoseProgress, film, is_film};
 use crate::RunError;
-use glam::DVec3;
+use glam::{DQuat, DVec3};
 use irradia_formats::{
     DatasetFormat, PanoramaFace, PhotoEntry, PhotoFolder, find_panoramas, has_photos, read_photo_folder,
-    read_photo_folders,
+    read_photo_folders, write_atomic,
 };
 use irradia_sfm::geometry::camera::DCamera;
 use irradia_sfm::map::{Mount, PhotoInfo};
 use rayon::prelude::*;
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::fs;
 use std::path::{Path, PathBuf};
 
 /// Where frames of films and faces of panoramas are written, in the folder of the dataset.
 const FRAMES: &str = "frames";
 const FACES: &str = "faces";
+/// What tells that the folder of faces is of an earlier call.
+const FACES_RECORD: &str = "faces.json";
 /// Folders within folders that are searched.
 const DEPTH: usize = 2;
 
@@ -66,6 +68,27 @@ impl Sources {
 pub fn is_capture(path: &Path) -> bool {
     let mut sources = Sources::default();
     sources.add(path, DEPTH).is_ok() && sources != Sources::default()
+}
+
+/// Empties a folder that an earlier call wrote, which its record tells, or creates it, with an empty record.
+///
+/// # Errors
+/// When it holds anything of another origin, or cannot be written.
+pub(super) fn begin(folder: &Path, record: &str) -> Result<(), RunError> {
+    let record = folder.join(record);
+    if folder.exists() {
+        let is_empty = fs::read_dir(folder).is_ok_and(|mut entries| entries.next().is_none());
+        if !is_empty && !record.exists() {
+            return Err(RunError::Refused(format!(
+                "{} holds files of another origin: choose another --out",
+                folder.display()
+            )));
+        }
+        fs::remove_dir_all(folder).map_err(RunError::io("clear", folder))?;
+    }
+    fs::create_dir_all(folder).map_err(RunError::io("create", folder))?;
+    write_atomic(&record, |file| file.write_all(b"[]\n"))?;
+    Ok(())
 }
 
 /// Photographs that are to be posed.
@@ -135,13 +158,19 @@ impl Capture {
     }
 
     fn add_faces(&mut self, panoramas: &[PhotoEntry], folder: &Path) -> Result<(), RunError> {
-        if folder.exists() {
-            fs::remove_dir_all(folder).map_err(RunError::io("clear", folder))?;
-        }
+        begin(folder, FACES_RECORD)?;
         let cut: Vec<Vec<PanoramaFace>> = panoramas
             .par_iter()
             .map(|panorama| panorama.cut_panorama(folder))
             .collect::<Result<_, _>>()?;
+        let all = || cut.iter().flatten().map(|face| &face.name);
+        let taken = |name: &&String| self.folder.photos.iter().any(|photo| photo.name == **name);
+        let mut names = HashSet::new();
+        if let Some(name) = all().find(|name| taken(name) || !names.insert(*name)) {
+            return Err(RunError::Refused(format!(
+                "a face of a panorama is named {name}, as another photograph: rename the panorama"
+            )));
+        }
         let of: HashMap<String, (usize, PanoramaFace)> = (cut.into_iter().enumerate())
             .flat_map(|(rig, faces)| faces.into_iter().map(move |face| (face.name.clone(), (rig, face))))
             .collect();
@@ -150,7 +179,8 @@ impl Capture {
         for mut photo in written.photos {
             let (rig, face) = &of[&photo.name];
             let tags = &panoramas[*rig].tags;
-            photo.tags.gps = tags.gps;
+            // A panorama tells its place once.
+            photo.tags.gps = tags.gps.filter(|_| face.turn == DQuat::IDENTITY);
             photo.tags.time.clone_from(&tags.time);
             photo.tags.focal = Some(f64::from(face.camera.fx) / f64::from(photo.width.max(photo.height)));
             self.folder.photos.push(photo);
@@ -208,6 +238,23 @@ fn pinhole(face: &PanoramaFace) -> DCamera {
 mod tests {
     use super::*;
     use irradia_formats::write_png;
+
+    #[test]
+    fn folders_of_others_are_not_emptied() {
+        let root = tempfile::tempdir().unwrap();
+        let folder = root.path().join("frames");
+        begin(&folder, "record.json").unwrap();
+        fs::write(folder.join("old.jpg"), "written by an earlier call").unwrap();
+        begin(&folder, "record.json").unwrap();
+        assert!(!folder.join("old.jpg").exists());
+        fs::remove_file(folder.join("record.json")).unwrap();
+        begin(&folder, "record.json").unwrap();
+        fs::remove_file(folder.join("record.json")).unwrap();
+        fs::write(folder.join("mine.jpg"), "somebody's").unwrap();
+        let error = begin(&folder, "record.json").unwrap_err().to_string();
+        assert!(error.contains("another origin"), "{error}");
+        assert!(folder.join("mine.jpg").exists());
+    }
 
     #[test]
     fn folders_in_folders_are_a_capture_and_datasets_are_none() {

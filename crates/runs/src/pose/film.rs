@@ -1,6 +1,7 @@
 //! The frames of films that are worth posing: the sharpest of each window, windows being equal in motion.
 
 use super::PoseProgress;
+use super::capture::begin;
 use crate::RunError;
 use irradia_formats::write_atomic;
 use irradia_sfm::Features;
@@ -36,7 +37,7 @@ pub fn is_film(path: &Path) -> bool {
     extension.is_some_and(|e| FILMS.contains(&e.as_str())) && path.is_file()
 }
 
-/// The record of what was chosen, beside the frames.
+/// The record of what was chosen, beside the frames; it begins empty.
 const RECORD: &str = "frames.json";
 
 /// Which frames of a film were chosen, to reuse them.
@@ -96,10 +97,7 @@ pub(super) fn frames(
         measured.push(frames);
     }
     // Frames of an earlier choice must not be taken for photographs.
-    if folder.exists() {
-        fs::remove_dir_all(folder).map_err(RunError::io("clear", folder))?;
-    }
-    fs::create_dir_all(folder).map_err(RunError::io("create", folder))?;
+    begin(folder, RECORD)?;
     for ((chosen, frames), wanted) in chosen.iter_mut().zip(&measured).zip(shares(&measured)) {
         chosen.frames = choose(frames, wanted);
         extract(chosen, folder)?;

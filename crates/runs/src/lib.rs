@@ -85,7 +85,7 @@ pub use path::{CameraPath, Film, PathKey};
 pub use photographs::photographs_of;
 pub use pose::{
     CameraReport, DoctorInput, DoctorReport, Finding, KnownDistance, LeftOutPhoto, Mapper, PoseInput, PoseProgress,
-    PoseReport, ScaleReport, StageReport, doctor, is_capture, is_film, pose,
+    PoseReport, ScaleReport, StageReport, doctor, is_capture, pose,
 };
 pub use protocol::Protocol;
 pub use provenance::{data_fingerprint, program_fingerprint};

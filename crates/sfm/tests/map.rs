@@ -113,7 +113,7 @@ fn panoramas(count: usize, points: usize) -> World {
             }
         })
         .collect();
-    let mut world = World::seen_by(face, poses, &walls, 0, 0.5, 0.2, 32);
+    let mut world = World::of_points(face, poses, &walls, 0, 0.5, 0.2, 32);
     for (i, photo) in world.photos.iter_mut().enumerate() {
         photo.camera = Some(face);
         photo.focal_prior_px = Some(300.0);
@@ -315,7 +315,7 @@ fn a_label_that_occurs_twice_does_not_fold_the_ring() {
         })
         .collect();
     let points: Vec<(DVec3, DVec3)> = label.iter().copied().chain(other).chain(ground).chain(wall).collect();
-    let world = World::of_points(around(32, 1.0), &points, 400, 0.5, 0.1, 11);
+    let world = World::of_points(world::CAMERA, around(32, 1.0), &points, 400, 0.5, 0.1, 11);
     let result = world.map();
     let model = &result.models[0];
     assert!(model.registered() >= 31, "{}", model.registered());

@@ -54,14 +54,12 @@ pub fn find_panoramas(photos: &[PhotoEntry]) -> Vec<bool> {
     for (photo, read) in photos.iter().zip(read) {
         signs.entry(photo.width).or_default().extend(read);
     }
-    let is_round = |photo: &PhotoEntry| {
-        signs
-            .get(&photo.width)
-            .is_some_and(|signs| Signs::median(signs).is_round())
-    };
+    let round: BTreeMap<u32, bool> = (signs.iter())
+        .map(|(width, signs)| (*width, Signs::median(signs).is_round()))
+        .collect();
     photos
         .iter()
-        .map(|photo| could(photo) && (is_round(photo) || is_declared(photo)))
+        .map(|photo| could(photo) && (round[&photo.width] || is_declared(photo)))
         .collect()
 }
 

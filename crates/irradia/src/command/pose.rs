@@ -7,9 +7,7 @@ use anyhow::Result;
 use clap::builder::RangedU64ValueParser;
 use indicatif::{ProgressBar, ProgressStyle};
 use irradia_runs::formats::DatasetFormat;
-use irradia_runs::{
-    Finding, KnownDistance, Mapper, PoseInput, PoseProgress, PoseReport, TrainInput, is_capture, is_film, pose,
-};
+use irradia_runs::{Finding, KnownDistance, Mapper, PoseInput, PoseProgress, PoseReport, TrainInput, is_capture, pose};
 use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
@@ -99,7 +97,7 @@ pub fn run(args: &Args) -> Result<()> {
 
 /// Whether `data` has photographs and no poses.
 pub fn is_unposed(data: &Path) -> bool {
-    is_film(data) || (data.is_dir() && DatasetFormat::recognise(data).is_none() && is_capture(data))
+    DatasetFormat::recognise(data).is_none() && is_capture(data)
 }
 
 /// Poses the photographs of `input` into the folder `posed` of its run, and makes that its dataset.

@@ -1,7 +1,7 @@
 //! Poses by COLMAP, where it is asked for: whichever version is on the path, whose options are taken from its own help.
 
 use super::capture::Capture;
-use super::stages::usual_features;
+use super::stages::max_features;
 use super::{LeftOutPhoto, PoseInput, PoseProgress, PoseReport, joined, output};
 use crate::RunError;
 use irradia_formats::{PhotoFolder, read_colmap_poses};
@@ -42,10 +42,7 @@ pub(super) fn run(
         &["FeatureExtraction.use_gpu", "SiftExtraction.use_gpu"],
         colmap.use_gpu(),
     );
-    let features = input
-        .max_features
-        .unwrap_or_else(|| usual_features(folder.photos.len()))
-        .to_string();
+    let features = max_features(input.max_features, folder.photos.len()).to_string();
     extract.option(
         &["SiftExtraction.max_num_features", "FeatureExtraction.max_num_features"],
         &features,

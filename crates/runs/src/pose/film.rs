@@ -32,7 +32,7 @@ const BATCH: usize = 32;
 const LONGEST_LINE: usize = 64;
 
 /// Whether `path` is a film by its extension.
-pub fn is_film(path: &Path) -> bool {
+pub(super) fn is_film(path: &Path) -> bool {
     let extension = path.extension().and_then(|e| e.to_str()).map(str::to_ascii_lowercase);
     extension.is_some_and(|e| FILMS.contains(&e.as_str())) && path.is_file()
 }

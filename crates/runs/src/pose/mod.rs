@@ -34,7 +34,7 @@ use std::time::Instant;
 
 pub use capture::is_capture;
 pub use doctor::{DoctorInput, DoctorReport, Finding, doctor};
-pub use film::is_film;
+use film::is_film;
 
 /// Fewer photographs make no dataset.
 const MIN_PHOTOS: usize = 3;

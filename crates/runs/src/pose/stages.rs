@@ -20,10 +20,11 @@ const STORE: &str = "features.bin";
 /// that begin from them end 0.7 dB better on lund_door, 12 photographs.
 const MANY_FEATURES: [(usize, usize); 2] = [(25, 8192), (35, 6144)];
 
-/// The most features of each of so many photographs.
-pub(super) fn usual_features(photos: usize) -> usize {
+/// The most features of each of so many photographs, unless a number is `wanted`.
+pub(super) fn max_features(wanted: Option<usize>, photos: usize) -> usize {
     let many = MANY_FEATURES.into_iter().find(|(most, _)| photos <= *most);
-    many.map_or(Sift::default().max_features, |(_, features)| features)
+    let usual = many.map_or(Sift::default().max_features, |(_, features)| features);
+    wanted.unwrap_or(usual)
 }
 
 /// The photographs on their way to matches.
@@ -50,13 +51,13 @@ pub(super) struct Work<'a> {
 impl<'a> Work<'a> {
     /// Features and matches are kept in the folder `out`.
     pub fn new(
-        max_features: Option<usize>,
+        wanted: Option<usize>,
         out: Option<&Path>,
         folder: &'a PhotoFolder,
         progress: &'a (dyn Fn(PoseProgress) + Sync),
     ) -> Self {
         let sift = Sift {
-            max_features: max_features.unwrap_or_else(|| usual_features(folder.photos.len())),
+            max_features: max_features(wanted, folder.photos.len()),
             ..Sift::default()
         };
         let path = out.map(|out| out.join(STORE));

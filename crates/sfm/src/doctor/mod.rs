@@ -22,7 +22,7 @@ pub use turns::{Turns, turns};
 pub use types::{Diagnosis, Kind};
 
 use crate::geometry::camera::DCamera;
-use crate::map::{LeftOut, Model, PairKind, PhotoInfo, Reason, Source, VerifiedPair, Zoom};
+use crate::map::{LeftOut, Model, PairKind, PhotoInfo, Reason, Source, VerifiedPair, Zoom, rigs};
 use crate::{Features, PairMatches};
 use std::collections::BTreeMap;
 
@@ -55,10 +55,8 @@ pub struct Evidence<'a> {
 struct Graph {
     /// `[photos]` partner and index of the pair, those with most matches first.
     partners: Vec<Vec<(usize, usize)>>,
-    /// Photographs by the rig that they are on.
-    rigs: BTreeMap<usize, Vec<usize>>,
-    /// `[photos]` the rig of each, if it is on one.
-    rig_of: Vec<Option<usize>>,
+    /// `[photos]` the photographs on the same rig, or the photograph alone.
+    rigs: Vec<Vec<usize>>,
 }
 
 /// Matches of a pair that holds photographs together. COLMAP accepts 15, of which chance alone reaches up to 20 among thousands of pairs.
@@ -81,54 +79,52 @@ impl Graph {
         for partners in &mut partners {
             partners.sort_by_key(|(photo, i)| (std::cmp::Reverse(pairs[*i].matches.len()), *photo));
         }
-        let rig_of: Vec<Option<usize>> = evidence.photos.iter().map(|p| p.mount.map(|mount| mount.rig)).collect();
-        let mut rigs: BTreeMap<usize, Vec<usize>> = BTreeMap::new();
-        for (photo, rig) in rig_of.iter().enumerate() {
-            if let Some(rig) = rig {
-                rigs.entry(*rig).or_default().push(photo);
-            }
-        }
-        Self { partners, rigs, rig_of }
+        let rigs = rigs(evidence.photos);
+        Self { partners, rigs }
     }
 
     /// Whether a photograph is on a rig: what is beside it there makes up for what it lacks.
     fn is_on_rig(&self, photo: usize) -> bool {
-        self.rig_of[photo].is_some()
+        self.rigs[photo].len() > 1
     }
 
     /// The partners of a photograph, and those on its rig.
     fn linked(&self, photo: usize) -> impl Iterator<Item = usize> {
-        let rig = self.rig_of[photo].map(|rig| &self.rigs[&rig]);
         let partners = self.partners[photo].iter().map(|p| p.0);
-        partners.chain(rig.into_iter().flatten().copied())
+        partners.chain(self.rigs[photo].iter().copied())
     }
 
     /// Photographs in connected parts, largest first.
     fn parts(&self) -> Vec<Vec<usize>> {
-        let mut part_of = vec![usize::MAX; self.partners.len()];
-        let mut parts: Vec<Vec<usize>> = Vec::new();
-        for start in 0..self.partners.len() {
-            if part_of[start] != usize::MAX {
-                continue;
-            }
-            let mut part = vec![start];
-            part_of[start] = parts.len();
-            let mut next = 0;
-            while next < part.len() {
-                for other in self.linked(part[next]) {
-                    if part_of[other] == usize::MAX {
-                        part_of[other] = parts.len();
-                        part.push(other);
-                    }
-                }
-                next += 1;
-            }
-            part.sort_unstable();
-            parts.push(part);
-        }
-        parts.sort_by_key(|part| (std::cmp::Reverse(part.len()), part[0]));
-        parts
+        connected(self.partners.len(), |photo| self.linked(photo))
     }
+}
+
+/// The parts of `count` photographs that links join, largest first, each ascending.
+fn connected<L: Iterator<Item = usize>>(count: usize, linked: impl Fn(usize) -> L) -> Vec<Vec<usize>> {
+    let mut reached = vec![false; count];
+    let mut parts: Vec<Vec<usize>> = Vec::new();
+    for start in 0..count {
+        if reached[start] {
+            continue;
+        }
+        reached[start] = true;
+        let mut part = vec![start];
+        let mut next = 0;
+        while next < part.len() {
+            for other in linked(part[next]) {
+                if !reached[other] {
+                    reached[other] = true;
+                    part.push(other);
+                }
+            }
+            next += 1;
+        }
+        part.sort_unstable();
+        parts.push(part);
+    }
+    parts.sort_by_key(|part| (std::cmp::Reverse(part.len()), part[0]));
+    parts
 }
 
 /// All that is wrong with a capture, the gravest first.

@@ -1,6 +1,6 @@
 //! What the motion between photographs tells: none, turns only, something that stands still.
 
-use super::{Diagnosis, Evidence, Graph, turns_only};
+use super::{Diagnosis, Evidence, Graph, connected, turns_only};
 use crate::geometry::correspondences::{Correspondences, sampson_squared};
 use crate::geometry::fundamental::Fundamental;
 use crate::geometry::ransac::{Limits, estimate};
@@ -63,21 +63,15 @@ pub(super) fn stands_behind(evidence: &Evidence, twice: &[Diagnosis]) -> Vec<Dia
     let pairs: Vec<[usize; 2]> = (twice.iter())
         .filter_map(|diagnosis| <[usize; 2]>::try_from(diagnosis.photos()).ok())
         .collect();
-    let mut chain: Vec<usize> = (0..evidence.photos.len()).collect();
-    // Each photograph gets the smallest number that leads to it.
-    loop {
-        let before = chain.clone();
-        for [a, b] in &pairs {
-            let least = chain[*a].min(chain[*b]);
-            (chain[*a], chain[*b]) = (least, least);
-        }
-        if chain == before {
-            break;
-        }
+    let count = evidence.photos.len();
+    let mut partners = vec![Vec::new(); count];
+    for [a, b] in &pairs {
+        partners[*a].push(*b);
+        partners[*b].push(*a);
     }
-    let members = |of: usize| (0..chain.len()).filter(|p| chain[*p] == of).collect::<Vec<_>>();
-    let longest = (0..chain.len()).map(members).max_by_key(Vec::len).unwrap_or_default();
-    if longest.len() < CHAIN || (longest.len() as f64) < CHAIN_FRACTION * chain.len() as f64 {
+    let chains = connected(count, |photo| partners[photo].iter().copied());
+    let longest = chains.into_iter().next().unwrap_or_default();
+    if longest.len() < CHAIN || (longest.len() as f64) < CHAIN_FRACTION * count as f64 {
         return Vec::new();
     }
     vec![Diagnosis::StandsStill {

@@ -24,7 +24,7 @@ pub(super) fn overlap(evidence: &Evidence, graph: &Graph) -> Vec<Diagnosis> {
         return found;
     }
     // Panoramas are linked by one another's faces, whose pairs alone would be bridges.
-    if graph.rigs.is_empty() {
+    if !(0..n).any(|photo| graph.is_on_rig(photo)) {
         found.extend(weak_links(graph));
     }
     for photo in 0..n {
@@ -138,7 +138,6 @@ impl Search<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use std::collections::BTreeMap;
 
     fn graph(photos: usize, pairs: &[[usize; 2]]) -> Graph {
         let mut partners = vec![Vec::new(); photos];
@@ -148,8 +147,7 @@ mod tests {
         }
         Graph {
             partners,
-            rigs: BTreeMap::new(),
-            rig_of: vec![None; photos],
+            rigs: (0..photos).map(|photo| vec![photo]).collect(),
         }
     }
 

@@ -25,6 +25,7 @@ pub use distance::{Distance, DistanceFit, to_distances};
 pub(crate) use finish::up;
 pub use focal::Source;
 pub use metric::{Metric, to_metres};
+pub(crate) use types::rigs;
 pub use types::{
     Known, LeftOut, MapOptions, Model, ModelPoint, Mount, PairKind, PhotoInfo, Progress, Reason, Reconstruction,
     VerifiedPair, Zoom,

@@ -2,14 +2,13 @@
 
 use super::focal::Source;
 use super::tracks::Tracks;
-use super::types::{Known, MapOptions, PhotoInfo};
+use super::types::{Known, MapOptions, PhotoInfo, rigs};
 use super::verify::Cameras;
 use crate::geometry::camera::DCamera;
 use crate::geometry::pose::DPose;
 use crate::geometry::triangulate::Sight;
 use glam::{DQuat, DVec2, DVec3};
 use rayon::prelude::*;
-use std::collections::BTreeMap;
 
 /// A growing model.
 #[derive(Clone)]
@@ -194,19 +193,4 @@ impl<'a> Working<'a> {
         }
         sum / count.max(1) as f64
     }
-}
-
-/// `[photos]` the photographs on the same rig, or the photograph alone.
-fn rigs(photos: &[PhotoInfo]) -> Vec<Vec<usize>> {
-    let mut members: BTreeMap<usize, Vec<usize>> = BTreeMap::new();
-    for (i, photo) in photos.iter().enumerate() {
-        if let Some(mount) = photo.mount {
-            members.entry(mount.rig).or_default().push(i);
-        }
-    }
-    let of = |(i, photo): (usize, &PhotoInfo)| match photo.mount {
-        Some(mount) => members[&mount.rig].clone(),
-        None => vec![i],
-    };
-    photos.iter().enumerate().map(of).collect()
 }

@@ -3,6 +3,7 @@ use crate::geometry::camera::DCamera;
 use crate::geometry::essential::Motion;
 use crate::geometry::pose::DPose;
 use glam::{DQuat, DVec3};
+use std::collections::BTreeMap;
 
 /// What is known of a photograph beside its features.
 #[derive(Clone, Debug, PartialEq)]
@@ -32,6 +33,21 @@ pub struct Mount {
     pub rig: usize,
     /// Rotation of the camera's axes into the rig's.
     pub rotation: DQuat,
+}
+
+/// `[photos]` the photographs on the same rig, or the photograph alone.
+pub(crate) fn rigs(photos: &[PhotoInfo]) -> Vec<Vec<usize>> {
+    let mut members: BTreeMap<usize, Vec<usize>> = BTreeMap::new();
+    for (i, photo) in photos.iter().enumerate() {
+        if let Some(mount) = photo.mount {
+            members.entry(mount.rig).or_default().push(i);
+        }
+    }
+    let of = |(i, photo): (usize, &PhotoInfo)| match photo.mount {
+        Some(mount) => members[&mount.rig].clone(),
+        None => vec![i],
+    };
+    photos.iter().enumerate().map(of).collect()
 }
 
 /// What is known before mapping, and stays as it is.

@@ -60,23 +60,11 @@ impl World {
         let points: Vec<(DVec3, DVec3)> = (0..points)
             .map(|_| (2.5 * direction(), direction().normalize()))
             .collect();
-        Self::of_points(poses, &points, 0, noise, wrong, seed)
+        Self::of_points(CAMERA, poses, &points, 0, noise, wrong, seed)
     }
 
     /// From points with the direction in which each faces. The first `twins` look like the `twins` after them.
     pub fn of_points(
-        poses: Vec<DPose>,
-        points: &[(DVec3, DVec3)],
-        twins: usize,
-        noise: f64,
-        wrong: f64,
-        seed: u64,
-    ) -> Self {
-        Self::seen_by(CAMERA, poses, points, twins, noise, wrong, seed)
-    }
-
-    /// As [`World::of_points`], with photographs of `camera`.
-    pub fn seen_by(
         camera: DCamera,
         poses: Vec<DPose>,
         points: &[(DVec3, DVec3)],

@@ -170,6 +170,34 @@ pub(crate) fn decode(path: &Path, orientation: Orientation, colour: Colour) -> R
     Ok(upright(image, orientation, colour))
 }
 
+/// The values of a grey image, those of 8 and 16 bits as they are stored: width, height and `[H, W]`.
+///
+/// # Errors
+/// When it cannot be decoded or is in colour.
+pub(crate) fn decode_values(path: &Path, orientation: Orientation) -> Result<(u32, u32, Vec<f32>), FormatError> {
+    let (decoder, _) = open(path)?;
+    let mut image = DynamicImage::from_decoder(decoder).map_err(|error| undecodable(path, &error))?;
+    image.apply_orientation(orientation);
+    let (width, height) = (image.width(), image.height());
+    let values: Vec<f32> = if image.color().bytes_per_pixel() > image.color().channel_count() {
+        let rgb = image.to_rgb16();
+        rgb.pixels().map_while(|pixel| grey(pixel.0)).map(f32::from).collect()
+    } else {
+        let rgb = image.to_rgb8();
+        rgb.pixels().map_while(|pixel| grey(pixel.0)).map(f32::from).collect()
+    };
+    if values.len() != width as usize * height as usize {
+        let message = "is a picture in colours, not a map of values; store these as grey of 8 or 16 bits, or as .npy";
+        return Err(FormatError::malformed(path, message));
+    }
+    Ok((width, height, values))
+}
+
+/// The value of a colour that is grey.
+fn grey<T: PartialEq + Copy>([red, green, blue]: [T; 3]) -> Option<T> {
+    (red == green && green == blue).then_some(red)
+}
+
 /// `image` with `orientation` applied.
 fn upright(mut image: DynamicImage, orientation: Orientation, colour: Colour) -> Pixels {
     image.apply_orientation(orientation);

@@ -9,6 +9,7 @@ mod atomic;
 mod bytes;
 mod complete;
 mod dataset;
+mod depth_file;
 mod describe;
 mod error;
 mod faces;

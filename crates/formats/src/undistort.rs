@@ -137,6 +137,16 @@ impl Undistortion {
         })
     }
 
+    /// Place in the photograph of a place in the results, both as fractions of their sides; `None` where the lens has none.
+    pub fn place_in_photograph(&self, [x, y]: [f64; 2]) -> Option<[f64; 2]> {
+        let at = self.source_position(x * f64::from(self.pinhole.width), y * f64::from(self.pinhole.height))?;
+        let place = [
+            at.x / f64::from(self.source.width),
+            at.y / f64::from(self.source.height),
+        ];
+        place.iter().all(|at| (0.0..=1.0).contains(at)).then_some(place)
+    }
+
     /// Position in the photograph, pixels, of a position in the results; `None` where the lens has none.
     fn source_position(&self, x: f64, y: f64) -> Option<DVec2> {
         let direction = self.turn * plane_point(&self.pinhole, x, y).extend(1.0);

@@ -3,7 +3,7 @@
 use glam::Vec3;
 use image::{GrayImage, Rgb, RgbImage};
 use irradia_formats::{DatasetFormat, DatasetOptions, Kind, describe, detect, read_dataset};
-use irradia_scene::Dataset;
+use irradia_scene::{Dataset, View};
 use std::fs;
 use std::path::Path;
 use tempfile::TempDir;
@@ -156,6 +156,34 @@ fn exif_orientation_is_applied_exactly_when_the_poses_include_it() {
         "the same, of a smaller copy"
     );
     assert_eq!(corner(r#""fl_x": 70"#), (60, false), "undeclared: upright");
+}
+
+#[test]
+fn maps_of_depth_are_found_where_files_name_them_and_in_their_folder() {
+    let folder = pictures(4, 120, 90);
+    let root = folder.path();
+    let keys = r#""fl_x": 100, "fl_y": 100, "w": 120, "h": 90"#;
+    let map = |path: &str, value: u8| {
+        GrayImage::from_pixel(12, 9, image::Luma([value]))
+            .save(root.join(path))
+            .unwrap()
+    };
+    fs::create_dir(root.join("depths")).unwrap();
+    map("depths/02.png", 2);
+    map("far.png", 7);
+    let values = |transforms: String, name: &str| -> Vec<Option<f32>> {
+        fs::write(root.join(name), transforms).unwrap();
+        let views = read_dataset(root, &DatasetOptions::default()).unwrap().views;
+        let first = |view: &View| Some(view.depth_map.as_ref()?.load().unwrap().values[0]);
+        views.iter().map(first).collect()
+    };
+    let plain = transforms(4, keys);
+    assert_eq!(values(plain.clone(), "transforms.json"), [None, None, Some(2.0), None]);
+    let named = plain.replacen("\"file_path\"", "\"depth_file_path\": \"far.png\", \"file_path\"", 1);
+    assert!(values(named.clone(), "transforms.json").iter().flatten().eq([&7.0]));
+    // Rendered scenes: the truth, to compare with.
+    fs::remove_file(root.join("transforms.json")).unwrap();
+    assert_eq!(values(named, "transforms_train.json"), [None; 4]);
 }
 
 #[test]

@@ -1,9 +1,9 @@
 //! One synthetic capture, written in every layout by conversions of their own, read back: the same cameras and rays as COLMAP's.
 
 use glam::{DMat3, DQuat, DVec3, Vec2};
-use image::{Rgb, RgbImage};
+use image::{GrayImage, Luma, Rgb, RgbImage};
 use irradia_formats::{DatasetFormat, DatasetOptions, read_dataset};
-use irradia_scene::{Dataset, Rng};
+use irradia_scene::{Dataset, Rng, View};
 use std::fmt::Write;
 use std::fs;
 use std::path::Path;
@@ -368,7 +368,16 @@ fn phones() {
         );
         fs::write(cameras.join(format!("shot {i}.json")), text).unwrap();
     }
-    assert_same(&read(polycam.path(), DatasetFormat::Polycam), &truth);
+    let depths = polycam.path().join("keyframes/depth");
+    fs::create_dir_all(&depths).unwrap();
+    GrayImage::from_pixel(8, 6, Luma([9]))
+        .save(depths.join("shot 1.png"))
+        .unwrap();
+    let found = read(polycam.path(), DatasetFormat::Polycam);
+    assert_same(&found, &truth);
+    let grid = |view: &View| view.depth_map.as_ref().map(|map| map.load().unwrap());
+    let grids: Vec<_> = found.views.iter().map(grid).collect();
+    assert!(grids.iter().flatten().count() == 1 && grids[1].as_ref().unwrap().values[0] == 9.0);
 
     let record = folder("rgb");
     let mut poses = Vec::new();

@@ -69,6 +69,8 @@ fn other_kinds_of_pictures_and_masks_are_read() {
     // COLMAP's convention, at half the size.
     let half = image::GrayImage::from_fn(20, 15, |x, _| image::Luma([if x < 10 { 0 } else { 255 }]));
     half.save(root.join("masks/b.tif.png")).unwrap();
+    fs::create_dir(root.join("depths")).unwrap();
+    half.save(root.join("depths/b.png")).unwrap();
     let found = read_photo_folder(root).unwrap();
     assert!(found.left_out.is_empty(), "{:?}", found.left_out);
     assert_eq!(found.photos.len(), 3);
@@ -79,6 +81,7 @@ fn other_kinds_of_pictures_and_masks_are_read() {
         assert!(pixels.data == expected, "{}", photo.name);
         let mask = photo.read_mask(40, 30).unwrap();
         assert_eq!(mask.is_some(), i == 1, "{}", photo.name);
+        assert_eq!(photo.depth.is_some(), i == 1, "{}", photo.name);
         if let Some(mask) = mask {
             assert!((0..1200).all(|p| mask[p] == if p % 40 < 20 { 0 } else { 255 }));
         }

@@ -190,6 +190,7 @@ mod tests {
                 depth_bounds: None,
                 time: None,
                 points_seen: Vec::new(),
+                depth_map: None,
             };
             Dataset {
                 views: vec![view],

@@ -106,6 +106,32 @@ impl PhotoSource for Photo {
     }
 }
 
+/// Depths along +Z that were given beside a photograph, on a regular grid over the view.
+#[derive(Clone, Debug, PartialEq)]
+pub struct DepthGrid {
+    /// Cells from left to right.
+    pub columns: u32,
+    /// Cells from top to bottom.
+    pub rows: u32,
+    /// `[rows, columns]`, at the centres of the cells: depth, or inverse depth, up to scale and shift. Unknown where it is not positive and finite.
+    pub values: Vec<f32>,
+}
+
+/// A source of the depths of a view: a file, or values in memory.
+pub trait DepthSource: Send + Sync {
+    /// Decodes and undistorts. Called from several threads.
+    ///
+    /// # Errors
+    /// One line that names the file and the remedy.
+    fn load(&self) -> Result<DepthGrid, LoadError>;
+}
+
+impl DepthSource for DepthGrid {
+    fn load(&self) -> Result<DepthGrid, LoadError> {
+        Ok(self.clone())
+    }
+}
+
 /// One posed photograph.
 #[derive(Clone)]
 pub struct View {
@@ -122,6 +148,8 @@ pub struct View {
     pub time: Option<f32>,
     /// Indices into [`Dataset::points`] of the points visible in this view; empty if the source does not list them.
     pub points_seen: Vec<u32>,
+    /// Depths of all that the view shows, measured or estimated, if they were given.
+    pub depth_map: Option<Arc<dyn DepthSource>>,
 }
 
 /// Posed photographs of one scene.

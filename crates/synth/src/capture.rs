@@ -237,6 +237,7 @@ pub fn dataset(options: &SynthOptions) -> Result<Dataset, SynthError> {
             depth_bounds: None,
             time: None,
             points_seen: Vec::new(),
+            depth_map: None,
         });
     }
     dataset.views.sort_by(|a, b| a.name.cmp(&b.name));

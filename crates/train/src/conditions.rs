@@ -6,11 +6,13 @@
 //!   nothing beside the object, and what floats there stands before it in other photographs.
 //! - **Skies.** Photographs of many days have skies that no scene can show at once; splats explain them by fog around all that is in
 //!   front.
+//! - **Maps of depth.** They are read, and weighed only where some can be used.
 //! - **Sparse photographs.** What only a few photographs see is not determined by them: steps beyond those that the scene takes to appear only fit
 //!   splats to single photographs.
 
+use crate::depth_maps::DepthMaps;
 use crate::first_splats::has_points;
-use crate::recipe::Params;
+use crate::recipe::{Param, Params};
 use crate::spacing::spacing;
 use crate::trainer::{TrainError, Trainer};
 use glam::Vec3;
@@ -156,7 +158,20 @@ impl Trainer {
             self.put_into_effect("masks leave out all but an object", "cut_out", cut_out);
         }
         self.settle_spacing(sparse);
+        self.settle_depth_maps();
         Ok(())
+    }
+
+    /// Reads the maps of depth if the recipe weighs them; without any that count, frames need no depth for them.
+    fn settle_depth_maps(&mut self) {
+        if DepthMaps::are_given(&self.dataset) && self.recipe.uses(Param::DepthMapWeight) {
+            let maps = DepthMaps::read(&self.dataset);
+            self.decisions.push(maps.summary.clone());
+            self.depth_maps = Some(maps).filter(|maps| !maps.is_empty());
+        }
+        if self.depth_maps.is_none() {
+            self.recipe.params.remove(&Param::DepthMapWeight);
+        }
     }
 
     fn settle_spacing(&mut self, sparse: Params) {
@@ -195,10 +210,12 @@ impl Trainer {
 mod tests {
     use super::*;
     use crate::Recipe;
-    use crate::recipe::{Knob, Param};
+    use crate::recipe::Knob;
     use crate::trainer::{TrainOptions, Trainer};
     use glam::Vec3;
-    use irradia_scene::{Camera, Dataset, Intrinsics, Photo, PointCloud, Pose, View};
+    use irradia_scene::{
+        Camera, Dataset, DepthGrid, DepthSource, Intrinsics, LoadError, Photo, PointCloud, Pose, View,
+    };
     use std::sync::Arc;
 
     /// One grey photograph of `channels` channels, with or without points.
@@ -219,6 +236,7 @@ mod tests {
             depth_bounds: None,
             time: None,
             points_seen: Vec::new(),
+            depth_map: None,
         };
         let positions: Vec<Vec3> = (0..12).map(|i| Vec3::new(0.1 * i as f32, 0.0, 1.0)).collect();
         Arc::new(Dataset {
@@ -258,6 +276,37 @@ mod tests {
         }
         let (value, ..) = trained(3, true, &["known_space.opacity_reg=0.3"]);
         assert_eq!(value, Knob::Const(0.3));
+    }
+
+    #[test]
+    fn maps_of_depth_are_weighed_only_where_some_can_be_used() {
+        struct Broken;
+        impl DepthSource for Broken {
+            fn load(&self) -> Result<DepthGrid, LoadError> {
+                Err(LoadError("depths/a.png: ends too early".into()))
+            }
+        }
+        let settled = |map: Option<Arc<dyn DepthSource>>| {
+            let mut data = (*dataset(3, true)).clone();
+            data.views[0].depth_map = map;
+            let recipe = Recipe::parse("fast", Recipe::built_in("fast").unwrap(), &[]).unwrap();
+            let trainer = Trainer::new(Arc::new(data), recipe, TrainOptions::default()).unwrap();
+            let told = trainer
+                .decisions
+                .iter()
+                .find(|line| line.contains("maps of depth"))
+                .cloned();
+            (told, trainer.recipe.params.contains_key(&Param::DepthMapWeight))
+        };
+        assert_eq!(settled(None), (None, false));
+        let (told, weighed) = settled(Some(Arc::new(Broken)));
+        assert!(told.unwrap().starts_with("0 of 1") && !weighed);
+        let (told, weighed) = settled(Some(Arc::new(DepthGrid {
+            columns: 2,
+            rows: 1,
+            values: vec![1.0, 2.0],
+        })));
+        assert!(told.unwrap().starts_with("1 of 1") && weighed);
     }
 
     #[test]

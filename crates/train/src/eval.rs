@@ -184,6 +184,7 @@ mod tests {
             depth_bounds: None,
             time: None,
             points_seen: Vec::new(),
+            depth_map: None,
         };
         Dataset {
             views: vec![

@@ -129,6 +129,7 @@ mod tests {
             depth_bounds: near.map(|near| [near, 100.0]),
             time: None,
             points_seen: Vec::new(),
+            depth_map: None,
         };
         Dataset {
             views: places.into_iter().zip(angles).map(view).collect(),

@@ -233,6 +233,7 @@ mod tests {
                 depth_bounds: None,
                 time: None,
                 points_seen: (0..400).step_by(2).collect(),
+                depth_map: None,
             }
         });
         Dataset {

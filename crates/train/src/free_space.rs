@@ -127,6 +127,7 @@ pub(crate) mod tests {
                 depth_bounds: bounds,
                 time: None,
                 points_seen: (0..seen as u32).collect(),
+                depth_map: None,
             }],
             train: vec![0],
             points: Some(PointCloud {

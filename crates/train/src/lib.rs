@@ -5,6 +5,7 @@ mod audit;
 pub mod checkpoint;
 pub mod compare;
 mod conditions;
+mod depth_maps;
 mod device;
 mod edges;
 pub mod eval;

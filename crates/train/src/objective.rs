@@ -66,6 +66,8 @@ pub struct Reference<'a> {
     pub background: Option<[f32; 3]>,
     /// Known depths.
     pub depths: &'a [DepthSample],
+    /// Those of a map given beside the photograph.
+    pub depth_map: Option<(&'a [DepthSample], DepthKind)>,
 }
 
 impl Objective {
@@ -173,6 +175,13 @@ impl Objective {
                     v_depth,
                     v_alpha,
                 );
+                total += f64::from(weight) * values.loss;
+            }
+            let weight = plan.value(Param::DepthMapWeight);
+            if let Some((depths, kind)) = reference.depth_map.filter(|_| weight > 0.0) {
+                let values = self
+                    .depth
+                    .evaluate(frame.depth, frame.alpha, depths, kind, weight, v_depth, v_alpha);
                 total += f64::from(weight) * values.loss;
             }
             let weight = plan.value(Param::SmoothWeight);
@@ -326,6 +335,7 @@ mod tests {
             let recipe = Recipe::parse("fast", Recipe::built_in("fast").unwrap(), &set).unwrap();
             let mut plan = plan(&recipe, &Clock::new(&recipe));
             plan.values[Param::DepthWeight] = 0.0;
+            plan.values[Param::DepthMapWeight] = 0.0;
             let frame = FramePlanes {
                 color: &color,
                 alpha: &alpha,
@@ -335,6 +345,7 @@ mod tests {
                 photo,
                 background: None,
                 depths: &[],
+                depth_map: None,
             };
             let mut objective = Objective::new(None);
             objective.evaluate(frame, &reference, &plan, &mut Rng::new(1, 1));
@@ -361,5 +372,48 @@ mod tests {
             None,
             "alpha shows what is empty"
         );
+    }
+
+    #[test]
+    fn a_map_of_depths_draws_the_depth_at_its_pixels() {
+        let photo = Prepared {
+            width: 4,
+            height: 2,
+            rgb: vec![128; 24],
+            alpha: None,
+            mask: None,
+            background: [0.0; 3],
+        };
+        let recipe = Recipe::parse("fast", Recipe::built_in("fast").unwrap(), &[]).unwrap();
+        let plan = plan(&recipe, &Clock::new(&recipe));
+        let (color, alpha, depth) = ([0.5; 24], [1.0; 8], [2.0; 8]);
+        let v_depth = |kind, depths: [f32; 2]| {
+            let samples = [(3, depths[0]), (5, depths[1])].map(|(pixel, depth)| DepthSample {
+                pixel,
+                depth,
+                weight: 1.0 / depth,
+            });
+            let frame = FramePlanes {
+                color: &color,
+                alpha: &alpha,
+                depth: &depth,
+            };
+            let reference = Reference {
+                photo: &photo,
+                background: None,
+                depths: &[],
+                depth_map: Some((&samples, kind)),
+            };
+            let mut objective = Objective::new(None);
+            objective.evaluate(frame, &reference, &plan, &mut Rng::new(1, 1));
+            let v = objective.gradient().depth.unwrap().to_vec();
+            assert!(v.iter().enumerate().all(|(i, v)| *v == 0.0 || i == 3 || i == 5));
+            [v[3], v[5]]
+        };
+        let [near, far] = v_depth(DepthKind::Metric, [1.0, 4.0]);
+        assert!(near > 0.0 && far < 0.0, "{near} {far}");
+        // Each error counts relative to its depth: 1 of 1, and 2 of 4.
+        assert_eq!(near, -4.0 * far);
+        assert_eq!(v_depth(DepthKind::Metric, [2.0, 2.0]), [0.0; 2]);
     }
 }

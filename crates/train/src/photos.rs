@@ -319,6 +319,7 @@ mod tests {
                 depth_bounds: None,
                 time: None,
                 points_seen: vec![],
+                depth_map: None,
             })
             .collect();
         (

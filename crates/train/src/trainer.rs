@@ -1,5 +1,6 @@
 //! Start here: [`Trainer::step`] is one step from batch to update.
 
+use crate::depth_maps::DepthMaps;
 use crate::device::{DeviceLoss, use_device};
 use crate::event::{Event, StepReport};
 use crate::exposure_probe;
@@ -21,7 +22,7 @@ use cpu_time::ProcessTime;
 use irradia_compute::adam::AdamStep;
 use irradia_compute::{Device, DeviceError};
 use irradia_field::{FieldEngine, FieldError, FieldState, KnownDepth};
-use irradia_measure::{DepthSample, Lpips};
+use irradia_measure::Lpips;
 use irradia_scene::{Camera, Dataset, LoadError, Rng, sh};
 use irradia_splat::densify::{DensityChange, classic, fast, mcmc, merge, taming};
 use irradia_splat::init;
@@ -161,6 +162,8 @@ pub struct Trainer {
     /// The distribution of the memory.
     pub memory: MemoryPlan,
     pub(crate) photos: PhotoCache,
+    /// The maps of depth given beside photographs, once they are needed.
+    pub(crate) depth_maps: Option<DepthMaps>,
     /// Known depths of the views on which a field is trained, by view, width and height.
     pub(crate) depths: HashMap<(usize, u32, u32), Arc<[KnownDepth]>>,
     objective: Objective,
@@ -256,6 +259,7 @@ impl Trainer {
             memory,
             pixels: mean_pixels(&cameras),
             decisions,
+            depth_maps: None,
             depths: HashMap::new(),
             objective: Objective::new(options.lpips.clone()),
             device_loss: DeviceLoss::new(&options.device)?,
@@ -403,10 +407,12 @@ impl Trainer {
             depth: plan.compares_depth(),
             ..usual
         };
+        let depth_map = self.given_depths(view, &camera, &plan);
         let reference = Reference {
             photo: &photo,
             background,
             depths: &self.known_depths(view, &camera, &plan),
+            depth_map: depth_map.as_ref().map(|(samples, kind)| (&samples[..], *kind)),
         };
         let (update, has_lpips) = (self.update(&plan), self.options.lpips.is_some());
         let ahead = self.sockets.are_empty().then(|| {
@@ -624,32 +630,6 @@ impl Trainer {
         let mut camera = self.dataset.views[view].camera;
         camera.intrinsics = camera.intrinsics.scaled(scale);
         camera
-    }
-
-    /// Depths of the points that view `view` is known to see, if the plan uses them.
-    pub(crate) fn known_depths(&self, view: usize, camera: &Camera, plan: &StepPlan) -> Vec<DepthSample> {
-        let Some(points) = self
-            .dataset
-            .points
-            .as_ref()
-            .filter(|_| plan.value(Param::DepthWeight) > 0.0)
-        else {
-            return Vec::new();
-        };
-        let seen = &self.dataset.views[view].points_seen;
-        seen.iter()
-            .filter_map(|i| {
-                let (pixel, depth) = camera.project(*points.positions.get(*i as usize)?)?;
-                let [column, row] = [pixel.x.floor(), pixel.y.floor()];
-                let k = &camera.intrinsics;
-                let inside = (0.0..k.width as f32).contains(&column) && (0.0..k.height as f32).contains(&row);
-                inside.then(|| DepthSample {
-                    pixel: row as u32 * k.width + column as u32,
-                    depth,
-                    weight: 1.0,
-                })
-            })
-            .collect()
     }
 
     /// Mean L1 error over some training views, evenly spaced, as the plan renders them.

@@ -6,13 +6,14 @@ use super::split;
 use super::world::world_from_dataset;
 use super::{DEFAULT_MAX_SIDE, DatasetOptions};
 use crate::FormatError;
+use crate::depth_file::DepthFile;
 use crate::faces::{Cut, image_circle};
 use crate::image_file::{Header, read_header};
 use crate::photo::PhotoFile;
 use crate::undistort::Undistortion;
 use glam::DQuat;
 use image::metadata::Orientation;
-use irradia_scene::{Camera, Dataset, Intrinsics, Lens, PointCloud, Similarity, View};
+use irradia_scene::{Camera, Dataset, DepthSource, Intrinsics, Lens, PointCloud, Similarity, View};
 use rayon::prelude::*;
 use std::path::Path;
 use std::sync::Arc;
@@ -268,6 +269,7 @@ impl Finishing<'_> {
                     face.name = format!("{}/{name}", view.name);
                     // Depths are along the axis of the photograph, not of the face.
                     face.depth_bounds = None;
+                    face.depth_map = None;
                     face.points_seen.retain(|point| self.is_seen(&face.camera, *point));
                     Some(face)
                 })
@@ -297,6 +299,14 @@ impl Finishing<'_> {
             undistortion: plan,
             size: (intrinsics.width, intrinsics.height),
         };
+        let depth_map = view.depth.clone().map(|path| {
+            Arc::new(DepthFile {
+                path,
+                orientation: probed.orientation,
+                upright: (probed.source.width, probed.source.height),
+                undistortion: plan,
+            }) as Arc<dyn DepthSource>
+        });
         let mut pose = view.pose?;
         pose.rotation *= plan.map_or(DQuat::IDENTITY, |plan| plan.turn());
         Some(View {
@@ -308,6 +318,7 @@ impl Finishing<'_> {
                 .and_then(|bounds| usable_bounds(bounds.map(|depth| depth * self.world_from_dataset.scale))),
             time: view.time,
             points_seen: view.points_seen.clone(),
+            depth_map,
         })
     }
 }

@@ -26,6 +26,8 @@ pub(super) struct DeclaredView {
     /// `None` when no such file exists.
     pub image: Option<PathBuf>,
     pub mask: Option<PathBuf>,
+    /// A map of depths.
+    pub depth: Option<PathBuf>,
     /// `None` when the numbers do not form a pose.
     pub pose: Option<DeclaredPose>,
     pub camera: DeclaredCamera,
@@ -53,6 +55,7 @@ impl DeclaredView {
             name: name.trim_start_matches("../").to_owned(),
             image,
             mask: None,
+            depth: None,
             pose,
             camera,
             depth_bounds: None,

@@ -2,9 +2,9 @@
 //! names. Fifteen are a 3x5 matrix whose columns are the camera's axes *down, right, backwards* in the world, its centre,
 //! and height, width and focal length in pixels of the original images; two are the nearest and farthest depth.
 
+use super::beside::Beside;
 use super::declared::{Declared, DeclaredCamera, DeclaredView, Focal, pose_from_axes};
 use super::files::{choose_image_folder, list_images, relative_name};
-use super::masks::Masks;
 use super::npy::parse_table;
 use crate::error::read_and_parse;
 use crate::{FormatError, Malformed};
@@ -77,7 +77,7 @@ pub(super) fn read(root: &Path, downscale: f32) -> Result<Declared, FormatError>
             ),
         ));
     }
-    let masks = Masks::beside(root, &folder.name);
+    let masks = Beside::masks(root, &folder.name);
     let views: Vec<DeclaredView> = poses
         .iter()
         .zip(images)
@@ -101,12 +101,13 @@ pub(super) fn read(root: &Path, downscale: f32) -> Result<Declared, FormatError>
                 time: None,
                 points_seen: Vec::new(),
                 split: None,
+                depth: None,
             }
         })
         .collect();
     let mut warnings: Vec<String> = folder.warning.into_iter().collect();
     let masked = views.iter().filter(|view| view.mask.is_some()).count();
-    warnings.extend(masks.and_then(|masks| masks.warning(views.len(), masked)));
+    warnings.extend(masks.and_then(|masks| masks.mask_warning(views.len(), masked)));
     Ok(Declared {
         kind: "LLFF",
         root: root.to_owned(),

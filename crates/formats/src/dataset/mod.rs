@@ -4,6 +4,7 @@
 //! unusable views, and creates the [`Dataset`] with undistorted cameras at the requested size.
 
 mod assemble;
+mod beside;
 mod blender;
 pub(crate) mod bundler;
 pub(crate) mod colmap;
@@ -11,7 +12,6 @@ mod declared;
 mod files;
 mod images;
 pub(crate) mod llff;
-mod masks;
 pub(crate) mod metashape;
 pub(crate) mod nerfies;
 mod nerfstudio;
@@ -29,11 +29,12 @@ pub(crate) mod xml;
 
 use crate::FormatError;
 pub(crate) use assemble::{oriented_size, turned_as_stored};
+pub(crate) use beside::Beside;
 use declared::Declared;
 pub(crate) use declared::DeclaredPoints;
 pub(crate) use files::{is_image_name, list_files};
 use irradia_scene::Dataset;
-pub(crate) use masks::Masks;
+pub(crate) use npy::parse_table;
 pub use split::Holdout;
 use std::fmt;
 use std::path::{Path, PathBuf};
@@ -269,6 +270,11 @@ pub fn read_dataset(path: &Path, options: &DatasetOptions) -> Result<Dataset, Fo
     };
     if let Some(folder) = &options.images {
         images::relocate(&mut declared, folder, options.downscale)?;
+    }
+    // Those of rendered scenes are the truth to compare with.
+    match format {
+        DatasetFormat::Blender => declared.views.iter_mut().for_each(|view| view.depth = None),
+        _ => beside::find_depths(&mut declared),
     }
     assemble::assemble(declared, options)
 }

@@ -1,8 +1,8 @@
 //! A folder with one `transforms.json`, as written by nerfstudio and instant-ngp.
 
+use super::beside::Beside;
 use super::declared::{Declared, DeclaredView, Split};
 use super::files::{find_image, relative_name};
-use super::masks::Masks;
 use super::transforms::{Transforms, parse_transforms};
 use crate::FormatError;
 use crate::error::read_and_parse;
@@ -35,14 +35,14 @@ pub(super) fn read(path: &Path, downscale: f32) -> Result<Declared, FormatError>
     let mut views = declared_views(&file, &root, &transforms)?;
     let mut warnings = Vec::new();
 
-    let masks = Masks::beside(&root, "images");
+    let masks = Beside::masks(&root, "images");
     if let Some(masks) = &masks {
         for view in views.iter_mut().filter(|view| view.mask.is_none()) {
             let below = view.name.split_once('/').map_or(view.name.as_str(), |(_, below)| below);
             view.mask = masks.of(below);
         }
         let masked = views.iter().filter(|view| view.mask.is_some()).count();
-        warnings.extend(masks.warning(views.len(), masked));
+        warnings.extend(masks.mask_warning(views.len(), masked));
     }
     let points = transforms.ply_file_path.as_ref().and_then(|ply| {
         let read = read_declared_points(&root.join(ply));
@@ -111,6 +111,11 @@ pub(super) fn declared_views(
                     .as_ref()
                     .map(|mask| root.join(mask))
                     .filter(|mask| mask.is_file()),
+                depth: frame
+                    .depth_file_path
+                    .as_ref()
+                    .map(|depth| root.join(depth.replace('\\', "/")))
+                    .filter(|depth| depth.is_file()),
                 pose: frame.pose(),
                 camera,
                 depth_bounds: None,

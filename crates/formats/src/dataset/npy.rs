@@ -4,14 +4,14 @@
 use crate::Malformed;
 
 /// A `[rows, columns]` array, row-major.
-pub(super) struct Table {
+pub(crate) struct Table {
     pub rows: usize,
     pub columns: usize,
     pub values: Vec<f64>,
 }
 
 /// Parses an `.npy` file of version 1 to 3 with two dimensions of 4- or 8-byte floats.
-pub(super) fn parse_table(bytes: &[u8]) -> Result<Table, Malformed> {
+pub(crate) fn parse_table(bytes: &[u8]) -> Result<Table, Malformed> {
     let wrong = |what: &str| Malformed(format!("not a usable .npy file: {what}"));
     let rest = bytes
         .strip_prefix(b"\x93NUMPY")

@@ -79,13 +79,11 @@ pub(super) fn read_polycam(path: &Path, downscale: f32) -> Result<Declared, Form
         let stem = file.file_stem().unwrap_or_default();
         let image = find_image(&images.join(stem));
         let name = stem.to_string_lossy();
-        views.push(DeclaredView::posed(
-            path,
-            &name,
-            image,
-            camera.pose(),
-            camera.intrinsics(),
-        ));
+        let depth = find_image(&path.join("keyframes/depth").join(stem));
+        views.push(DeclaredView {
+            depth,
+            ..DeclaredView::posed(path, &name, image, camera.pose(), camera.intrinsics())
+        });
     }
     Ok(declared("Polycam", path, views, downscale))
 }

@@ -33,6 +33,9 @@ pub struct Frame {
     pub transform_matrix: Vec<Vec<Option<f64>>>,
     /// The mask, relative to the file; white is kept.
     pub mask_path: Option<String>,
+    /// A map of depths, relative to the file; `depth_path` in files for instant-ngp.
+    #[serde(alias = "depth_path")]
+    pub depth_file_path: Option<String>,
     /// Time of capture (D-NeRF: 0 to 1 over the capture).
     pub time: Option<f64>,
     /// Intrinsics of this frame only.
@@ -281,6 +284,7 @@ mod tests {
             file_path: String::new(),
             transform_matrix: rows.map(|row| row.map(Some).to_vec()).to_vec(),
             mask_path: None,
+            depth_file_path: None,
             time: None,
             camera: CameraKeys::default(),
         };

@@ -3,7 +3,7 @@
 mod exif;
 mod panorama;
 
-use crate::dataset::{Masks, is_image_name, list_files, oriented_size, turned_as_stored};
+use crate::dataset::{Beside, is_image_name, list_files, oriented_size, turned_as_stored};
 use crate::error::read_file;
 use crate::image_file::{Colour, decode, decode_jpeg_at, read_exif, read_header};
 use crate::{FormatError, Pixels};
@@ -35,6 +35,8 @@ pub struct PhotoEntry {
     pub hash: u64,
     /// Its mask, in the folder `masks`: what is black there is not looked at.
     pub mask: Option<PathBuf>,
+    /// Its map of depths, in the folder `depths` or `depth`.
+    pub depth: Option<PathBuf>,
     /// Where up is in the decoded picture: `[right, down]`; `[0, -1]` unless it is decoded as stored, against its EXIF orientation.
     pub up: [i8; 2],
     orientation: Orientation,
@@ -125,37 +127,42 @@ pub fn read_photo_folder(folder: &Path) -> Result<PhotoFolder, FormatError> {
 /// # Errors
 /// When a folder cannot be read.
 pub fn read_photo_folders(folders: &[impl AsRef<Path>]) -> Result<PhotoFolder, FormatError> {
-    let mut files: Vec<(PathBuf, String, Option<PathBuf>)> = Vec::new();
+    let mut files: Vec<Found> = Vec::new();
     for folder in folders.iter().map(AsRef::as_ref) {
         let mut here = list_pictures(folder)?;
         if here.is_empty() && folder.join("images").is_dir() {
             here = list_pictures(&folder.join("images"))?;
         }
-        let masks = Masks::beside(folder, "images");
+        let [masks, depths] = [Beside::masks(folder, "images"), Beside::depths(folder)];
         files.extend(here.into_iter().map(|path| {
             let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-            let mask = masks.as_ref().and_then(|masks| masks.of(&name));
-            (path, name, mask)
+            let [mask, depth] = [&masks, &depths].map(|beside| beside.as_ref().and_then(|beside| beside.of(&name)));
+            Found {
+                path,
+                name,
+                mask,
+                depth,
+            }
         }));
     }
     let mut known: HashMap<String, usize> = HashMap::new();
-    for (_, name, _) in &files {
-        *known.entry(name.clone()).or_default() += 1;
+    for file in &files {
+        *known.entry(file.name.clone()).or_default() += 1;
     }
-    for (path, name, _) in files.iter_mut().filter(|(_, name, _)| known[name] > 1) {
-        let folder = path.parent().and_then(Path::file_name).unwrap_or_default();
-        *name = format!("{}_{name}", folder.to_string_lossy());
+    for file in files.iter_mut().filter(|file| known[&file.name] > 1) {
+        let folder = file.path.parent().and_then(Path::file_name).unwrap_or_default();
+        file.name = format!("{}_{}", folder.to_string_lossy(), file.name);
     }
-    files.sort_by(|a, b| a.1.cmp(&b.1));
+    files.sort_by(|a, b| a.name.cmp(&b.name));
     let entries: Vec<(String, Result<PhotoEntry, String>)> = files
         .par_iter()
         .enumerate()
-        .map(|(i, (path, name, mask))| {
-            let entry = match i > 0 && files[i - 1].1 == *name {
+        .map(|(i, file)| {
+            let entry = match i > 0 && files[i - 1].name == file.name {
                 true => Err("another photograph has this name: rename it".to_owned()),
-                false => read_entry(path, name, mask.clone()),
+                false => read_entry(file),
             };
-            (name.clone(), entry)
+            (file.name.clone(), entry)
         })
         .collect();
     let mut found = PhotoFolder::default();
@@ -181,6 +188,15 @@ pub fn has_photos(path: &Path) -> bool {
     any(path) || any(&path.join("images"))
 }
 
+/// A photograph and what lies beside it, before any of it is opened.
+struct Found {
+    path: PathBuf,
+    /// Among all photographs.
+    name: String,
+    mask: Option<PathBuf>,
+    depth: Option<PathBuf>,
+}
+
 /// Pictures by their extension, sorted.
 fn list_pictures(folder: &Path) -> Result<Vec<PathBuf>, FormatError> {
     list_files(folder, |path| is_image_name(path) || is_unread(path).is_some())
@@ -192,7 +208,8 @@ fn is_unread(path: &Path) -> Option<&'static str> {
     UNREAD.into_iter().find(|unread| *unread == extension)
 }
 
-fn read_entry(path: &Path, name: &str, mask: Option<PathBuf>) -> Result<PhotoEntry, String> {
+fn read_entry(file: &Found) -> Result<PhotoEntry, String> {
+    let (path, mask) = (&file.path, &file.mask);
     if let Some(kind) = is_unread(path) {
         return Err(format!("{kind} is not read: convert it to JPEG or PNG"));
     }
@@ -204,7 +221,7 @@ fn read_entry(path: &Path, name: &str, mask: Option<PathBuf>) -> Result<PhotoEnt
     };
     let header = read_header(path).map_err(reason)?;
     let mut hash = fnv(&read_file(path).map_err(reason)?);
-    if let Some(mask) = &mask {
+    if let Some(mask) = mask {
         hash ^= fnv(&read_file(mask).map_err(reason)?).rotate_left(1);
     }
     let stored = [header.width, header.height];
@@ -212,13 +229,14 @@ fn read_entry(path: &Path, name: &str, mask: Option<PathBuf>) -> Result<PhotoEnt
     let (orientation, up) = turned_as_stored(&header);
     let (width, height) = oriented_size(&header, orientation);
     Ok(PhotoEntry {
-        name: name.to_owned(),
-        path: path.to_owned(),
+        name: file.name.clone(),
+        path: path.clone(),
         width,
         height,
         tags,
         hash,
-        mask,
+        mask: mask.clone(),
+        depth: file.depth.clone(),
         up,
         orientation,
         jpeg: header.jpeg,

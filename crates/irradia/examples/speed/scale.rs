@@ -301,6 +301,7 @@ fn trainer(splats: &Splats) -> Result<Trainer> {
         depth_bounds: None,
         time: None,
         points_seen: Vec::new(),
+        depth_map: None,
     };
     let few: Vec<Vec3> = (0..splats.len())
         .step_by(splats.len() / 100)

@@ -45,6 +45,7 @@ pub(super) fn with_views_between(mut dataset: Dataset, model: &Model, options: &
             depth_bounds: None,
             time: None,
             points_seen: Vec::new(),
+            depth_map: None,
         });
     }
     dataset

@@ -55,14 +55,15 @@ pub(super) fn end_models(out: &Path, written: &Path) -> Result<(), RunError> {
     fs::rename(written, &sparse).map_err(RunError::io("rename", written))
 }
 
-/// Brings a photograph and its mask into the folders `images`, which exists, and `masks` of the dataset.
+/// Brings a photograph, its mask and its map of depths into the folders `images`, which exists, `masks` and `depths` of the dataset.
 pub(super) fn link_photo(out: &Path, photo: &PhotoEntry) -> Result<(), RunError> {
     link(&photo.path, &out.join("images").join(&photo.name))?;
-    if let Some(mask) = &photo.mask {
-        let masks = out.join("masks");
-        fs::create_dir_all(&masks).map_err(RunError::io("create", &masks))?;
-        let extension = mask.extension().unwrap_or_default().to_string_lossy();
-        link(mask, &masks.join(format!("{}.{extension}", photo.name)))?;
+    for (file, folder) in [(&photo.mask, "masks"), (&photo.depth, "depths")] {
+        let Some(file) = file else { continue };
+        let folder = out.join(folder);
+        fs::create_dir_all(&folder).map_err(RunError::io("create", &folder))?;
+        let extension = file.extension().unwrap_or_default().to_string_lossy();
+        link(file, &folder.join(format!("{}.{extension}", photo.name)))?;
     }
     Ok(())
 }

@@ -25,6 +25,7 @@ fn dataset() -> Arc<Dataset> {
         depth_bounds: None,
         time: None,
         points_seen: Vec::new(),
+        depth_map: None,
     });
     Arc::new(Dataset {
         views: views.into(),

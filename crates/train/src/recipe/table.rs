@@ -456,6 +456,16 @@ table! {
         curve: Some("loss.mask"),
         source: "Irradia",
     }
+    /// Weight of the mean |depth - depth of the map given beside the photograph|, relative to that depth; for splats.
+    DepthMapWeight {
+        name: "depth_map_weight",
+        unit: "",
+        default: 0.0,
+        bounds: NOT_NEGATIVE,
+        group: Group::Loss,
+        curve: Some("loss.depth map"),
+        source: "Hierarchical 3D Gaussians (Kerbl et al. 2024) with inverse depths; here depths, whatever the map has",
+    }
 }
 
 #[cfg(test)]

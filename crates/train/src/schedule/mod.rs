@@ -111,7 +111,9 @@ impl StepPlan {
 
     /// Whether a depth loss is active, which requires depth to be rendered.
     pub fn compares_depth(&self) -> bool {
-        self.value(Param::DepthWeight) > 0.0 || self.value(Param::SmoothWeight) > 0.0
+        [Param::DepthWeight, Param::DepthMapWeight, Param::SmoothWeight]
+            .into_iter()
+            .any(|weight| self.value(weight) > 0.0)
     }
 
     /// Weights of the regularisers.

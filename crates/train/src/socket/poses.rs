@@ -216,6 +216,7 @@ mod tests {
             depth_bounds: None,
             time: None,
             points_seen: vec![],
+            depth_map: None,
         };
         let dataset = Dataset {
             views: [-1.0, 0.0, 1.0].map(view).into(),

@@ -5,9 +5,9 @@ pub mod binary;
 pub mod text;
 mod write;
 
+use super::beside::Beside;
 use super::declared::{Declared, DeclaredCamera, DeclaredPoints, DeclaredPose, DeclaredView, Focal, lens_or_pinhole};
 use super::files::{ImageFolder, choose_image_folder, find_image};
-use super::masks::Masks;
 use crate::error::read_and_parse;
 use crate::{FormatError, Malformed};
 use glam::{DQuat, DVec3};
@@ -187,7 +187,7 @@ pub(super) fn read(root: &Path, downscale: f32) -> Result<Declared, FormatError>
         downscale,
         warning: None,
     });
-    let masks = Masks::beside(root, &folder.name);
+    let masks = Beside::masks(root, &folder.name);
     let mut views = Vec::with_capacity(images.len());
     for image in images {
         let camera = *cameras.get(&image.camera_id).ok_or_else(|| {
@@ -215,11 +215,12 @@ pub(super) fn read(root: &Path, downscale: f32) -> Result<Declared, FormatError>
             time: None,
             points_seen,
             split: None,
+            depth: None,
         });
     }
     let mut warnings: Vec<String> = folder.warning.into_iter().chain(several).collect();
     let masked = views.iter().filter(|view| view.mask.is_some()).count();
-    warnings.extend(masks.and_then(|masks| masks.warning(views.len(), masked)));
+    warnings.extend(masks.and_then(|masks| masks.mask_warning(views.len(), masked)));
     Ok(Declared {
         kind: if files.binary {
             "COLMAP (binary)"

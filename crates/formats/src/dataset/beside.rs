@@ -1,0 +1,145 @@
+//! Files that belong to images, one each, in a folder beside theirs: masks and maps of depth.
+
+use super::declared::Declared;
+use super::files::{is_image_name, relative_name};
+use std::collections::HashMap;
+use std::path::{Path, PathBuf};
+
+/// Maximum depth of the search; a link back to a parent would not end.
+const MAX_DEPTH: u32 = 6;
+
+/// The files in a separate folder, by the image to which they belong.
+pub(crate) struct Beside {
+    folder: String,
+    /// By path below the folder, lower case, without extension.
+    by_stem: HashMap<String, PathBuf>,
+}
+
+impl Beside {
+    /// The masks of the images in `root/images`: in `masks` with the suffix of `images` in its name (`masks_4` for `images_4`),
+    /// else in `masks`.
+    pub fn masks(root: &Path, images: &str) -> Option<Self> {
+        let suffix = images.strip_prefix("images").unwrap_or("");
+        let names = [format!("masks{suffix}"), "masks".to_owned()];
+        Self::find(root, &names, is_image_name)
+    }
+
+    /// The maps of depth below `root`: in `depths`, as the authors' code of 3DGS expects them, or in `depth`.
+    pub fn depths(root: &Path) -> Option<Self> {
+        let is_map = |path: &Path| is_image_name(path) || path.extension().is_some_and(|e| e == "npy");
+        Self::find(root, &["depths".to_owned(), "depth".to_owned()], is_map)
+    }
+
+    /// The files that `keep` accepts in the first of these folders that exists.
+    fn find(root: &Path, names: &[String], keep: impl Fn(&Path) -> bool) -> Option<Self> {
+        let folder = names.iter().find(|name| root.join(name).is_dir())?;
+        let (mut by_stem, top) = (HashMap::new(), root.join(folder));
+        collect(&top, &top, MAX_DEPTH, &keep, &mut by_stem);
+        Some(Self {
+            folder: folder.clone(),
+            by_stem,
+        })
+    }
+
+    /// The file of the image with this path below its folder: the same name, `NAME_mask`, or the full file name with another
+    /// extension appended (COLMAP's `0001.jpg.png`).
+    pub fn of(&self, image: &str) -> Option<PathBuf> {
+        let image = image.to_lowercase();
+        let stem = without_extension(&image);
+        let keys = [stem, &format!("{stem}_mask"), &image];
+        keys.into_iter().find_map(|key| self.by_stem.get(key)).cloned()
+    }
+
+    /// The warning if some images have no mask.
+    pub fn mask_warning(&self, images: usize, masked: usize) -> Option<String> {
+        (masked < images).then(|| {
+            format!(
+                "{} of {images} images have no mask in `{}`; they are used unmasked",
+                images - masked,
+                self.folder
+            )
+        })
+    }
+}
+
+/// Gives views the maps of depth that lie below the dataset's folder, if its files declare none.
+pub(super) fn find_depths(declared: &mut Declared) {
+    if declared.views.iter().any(|view| view.depth.is_some()) {
+        return;
+    }
+    let Some(maps) = Beside::depths(&declared.root) else {
+        return;
+    };
+    for view in &mut declared.views {
+        let below = view.name.split_once('/').map_or(view.name.as_str(), |(_, below)| below);
+        view.depth = maps.of(below).or_else(|| maps.of(&view.name));
+    }
+}
+
+fn collect(
+    top: &Path,
+    folder: &Path,
+    depth: u32,
+    keep: &impl Fn(&Path) -> bool,
+    by_stem: &mut HashMap<String, PathBuf>,
+) {
+    // An unreadable folder is treated as empty; the warning about missing masks reports it.
+    for path in std::fs::read_dir(folder)
+        .into_iter()
+        .flatten()
+        .flatten()
+        .map(|entry| entry.path())
+    {
+        if path.is_dir() && depth > 0 {
+            collect(top, &path, depth - 1, keep, by_stem);
+        } else if keep(&path) {
+            let name = relative_name(top, &path).to_lowercase();
+            by_stem.insert(without_extension(&name).to_owned(), path);
+        }
+    }
+}
+
+fn without_extension(name: &str) -> &str {
+    match name.rsplit_once('.') {
+        Some((stem, extension)) if !extension.contains('/') => stem,
+        _ => name,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn depths_are_found_by_name_and_may_be_arrays() {
+        let root = tempfile::tempdir().unwrap();
+        std::fs::create_dir_all(root.path().join("depths")).unwrap();
+        for name in ["a.png", "b.npy", "c.txt"] {
+            std::fs::write(root.path().join("depths").join(name), b"").unwrap();
+        }
+        let depths = Beside::depths(root.path()).unwrap();
+        assert!(depths.of("A.jpg").unwrap().ends_with("a.png") && depths.of("b.jpg").unwrap().ends_with("b.npy"));
+        assert_eq!(depths.of("c.jpg"), None);
+    }
+
+    #[test]
+    fn masks_are_found_by_each_convention() {
+        let root = tempfile::tempdir().unwrap();
+        std::fs::create_dir_all(root.path().join("masks_2/sub")).unwrap();
+        for name in ["A.png", "b_mask.JPG", "c.jpg.png", "sub/d.png"] {
+            std::fs::write(root.path().join("masks_2").join(name), b"").unwrap();
+        }
+        let masks = Beside::masks(root.path(), "images_2").unwrap();
+        for (image, mask) in [
+            ("a.JPG", "A.png"),
+            ("b.png", "b_mask.JPG"),
+            ("c.jpg", "c.jpg.png"),
+            ("sub/d.jpg", "sub/d.png"),
+        ] {
+            assert!(masks.of(image).unwrap().ends_with(mask), "{image}");
+        }
+        assert_eq!(masks.of("d.jpg"), None);
+        assert!(masks.mask_warning(5, 4).unwrap().contains("1 of 5"));
+        assert!(Beside::masks(root.path(), "images").is_none());
+    }
+}

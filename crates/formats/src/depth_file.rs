@@ -1,0 +1,179 @@
+//! Maps of depth that were given beside photographs: grey images of 8 or 16 bits, or `.npy` arrays.
+
+use crate::FormatError;
+use crate::dataset::parse_table;
+use crate::error::read_and_parse;
+use crate::image_file::{decode_values, read_header};
+use crate::undistort::Undistortion;
+use image::metadata::Orientation;
+use irradia_scene::{DepthGrid, DepthSource, LoadError};
+use std::path::PathBuf;
+
+/// Cells of a grid along its longer side: what a network or a phone's sensor resolves, at little memory (48 KB a photograph).
+const CELLS: u32 = 128;
+
+/// A map on disk with the operations to apply when it is loaded.
+#[derive(Clone, Debug)]
+pub(crate) struct DepthFile {
+    pub path: PathBuf,
+    /// That of the photograph.
+    pub orientation: Orientation,
+    /// Size of the upright photograph.
+    pub upright: (u32, u32),
+    /// That of the photograph, with its axis unturned: depths along +Z stay what they are.
+    pub undistortion: Option<Undistortion>,
+}
+
+impl DepthSource for DepthFile {
+    fn load(&self) -> Result<DepthGrid, LoadError> {
+        self.read().map_err(|error| LoadError(error.to_string()))
+    }
+}
+
+impl DepthFile {
+    fn read(&self) -> Result<DepthGrid, FormatError> {
+        let (width, height, values) = self.values()?;
+        let shown = self.undistortion.map_or(self.upright, |plan| {
+            let pinhole = plan.pinhole();
+            (pinhole.width, pinhole.height)
+        });
+        let cell = (f64::from(shown.0.max(shown.1)) / f64::from(CELLS)).max(1.0);
+        let [columns, rows] = [shown.0, shown.1].map(|side| ((f64::from(side) / cell).round() as u32).max(1));
+        let value = |row: u32, column: u32| {
+            let x = (f64::from(column) + 0.5) / f64::from(columns);
+            let y = (f64::from(row) + 0.5) / f64::from(rows);
+            let [x, y] = match &self.undistortion {
+                None => [x, y],
+                Some(plan) => plan.place_in_photograph([x, y])?,
+            };
+            // The nearest value: a mean over an edge is the depth of nothing.
+            let index = |at: f64, side: u32| ((at * f64::from(side)) as usize).min(side as usize - 1);
+            let value = values[index(y, height) * width as usize + index(x, width)];
+            value.is_finite().then_some(value)
+        };
+        let cells = (0..rows).flat_map(|row| (0..columns).map(move |column| (row, column)));
+        Ok(DepthGrid {
+            columns,
+            rows,
+            values: cells.map(|(row, column)| value(row, column).unwrap_or(0.0)).collect(),
+        })
+    }
+
+    /// Width, height and `[H, W]`, upright.
+    fn values(&self) -> Result<(u32, u32, Vec<f32>), FormatError> {
+        if self.path.extension().is_some_and(|extension| extension == "npy") {
+            let table = read_and_parse(&self.path, parse_table)?;
+            if table.rows == 0 || table.columns == 0 {
+                return Err(FormatError::malformed(&self.path, "has no values; make it again"));
+            }
+            let values = table.values.iter().map(|value| *value as f32).collect();
+            return Ok((table.columns as u32, table.rows as u32, values));
+        }
+        // Like a mask: made from the pixels as some tool displays them, mostly without EXIF data.
+        let header = read_header(&self.path)?;
+        let matches_upright = (header.width > header.height) == (self.upright.0 > self.upright.1);
+        let orientation = if matches_upright {
+            Orientation::NoTransforms
+        } else {
+            self.orientation
+        };
+        decode_values(&self.path, orientation)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::write_png_16;
+    use irradia_scene::{Intrinsics, Lens};
+
+    fn file(path: PathBuf) -> DepthFile {
+        DepthFile {
+            path,
+            orientation: Orientation::NoTransforms,
+            upright: (40, 20),
+            undistortion: None,
+        }
+    }
+
+    #[test]
+    fn grey_images_and_arrays_are_read_as_they_are_stored() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.png");
+        let values: Vec<u16> = (0..40 * 20).map(|i| 60 * i + 7).collect();
+        write_png_16(&path, 40, 20, &values).unwrap();
+        let grid = file(path.clone()).load().unwrap();
+        assert_eq!((grid.columns, grid.rows), (40, 20));
+        assert!(
+            grid.values
+                .iter()
+                .zip(&values)
+                .all(|(got, wanted)| *got == f32::from(*wanted))
+        );
+        // A smaller map of the same photograph.
+        image::GrayImage::from_raw(4, 2, (1..=8).collect())
+            .unwrap()
+            .save(&path)
+            .unwrap();
+        let grid = file(path.clone()).load().unwrap();
+        assert_eq!((grid.values[0], grid.values[39], grid.values[799]), (1.0, 4.0, 8.0));
+        image::RgbImage::from_fn(4, 2, |x, _| image::Rgb([3 * x as u8; 3]))
+            .save(&path)
+            .unwrap();
+        assert_eq!(file(path.clone()).load().unwrap().values[39], 9.0);
+
+        let array = folder.path().join("a.npy");
+        let header = b"{'descr': '<f4', 'fortran_order': False, 'shape': (1, 2), }";
+        let mut bytes = b"\x93NUMPY\x01\x00".to_vec();
+        bytes.extend((header.len() as u16).to_le_bytes());
+        bytes.extend(header);
+        bytes.extend([1.5f32, f32::NAN].into_iter().flat_map(f32::to_le_bytes));
+        std::fs::write(&array, bytes).unwrap();
+        let grid = file(array).load().unwrap();
+        assert_eq!((grid.values[0], grid.values[39]), (1.5, 0.0), "not a number is unknown");
+    }
+
+    #[test]
+    fn pictures_in_colours_are_refused_in_one_line() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.png");
+        image::RgbImage::from_fn(4, 2, |x, _| image::Rgb([x as u8, 0, 0]))
+            .save(&path)
+            .unwrap();
+        let message = file(path).load().unwrap_err().0;
+        assert!(
+            message.contains("a.png") && message.contains("not a map of values"),
+            "{message}"
+        );
+    }
+
+    #[test]
+    fn a_map_is_undistorted_like_its_photograph() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.png");
+        let bent = Intrinsics {
+            lens: Lens::Opencv {
+                k: [-0.2, 0.0, 0.0, 0.0, 0.0, 0.0],
+                p: [0.0; 2],
+            },
+            ..Intrinsics::from_fov_x(200, 100, 1.2)
+        };
+        let column = |i: u16| 100 + i % 200;
+        write_png_16(&path, 200, 100, &(0..200 * 100).map(column).collect::<Vec<_>>()).unwrap();
+        let plan = Undistortion::plan(&bent).unwrap();
+        let grid = DepthFile {
+            upright: (200, 100),
+            undistortion: Some(plan),
+            ..file(path)
+        };
+        let grid = grid.load().unwrap();
+        for column in 0..grid.columns {
+            let x = (f64::from(column) + 0.5) / f64::from(grid.columns);
+            let row = grid.rows / 2;
+            let y = (f64::from(row) + 0.5) / f64::from(grid.rows);
+            let [place, _] = plan.place_in_photograph([x, y]).unwrap();
+            let got = f64::from(grid.values[(row * grid.columns + column) as usize]);
+            assert!((got - 100.0 - 200.0 * place).abs() <= 1.0, "{x}: {got}");
+        }
+    }
+}

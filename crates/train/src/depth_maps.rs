@@ -1,0 +1,461 @@
+//! Known depths, as the reference of a loss: of the points that a view is known to see, and of maps that were given beside photographs, by a
+//! sensor or a network.
+//!
+//! What a network estimates is depth or inverse depth, up to a scale and a shift that differ from photograph to photograph. The points that a
+//! view is known to see tell all three: per view, a line is fitted robustly through the values at its points, once for their depths and
+//! once for their inverses, and what fits most views better is what the maps are (Kerbl et al., "Hierarchical 3D Gaussians", 2024, fit the
+//! inverse depths of one network in this way). Their depths then are world units. Without points, maps are taken for depths, and the loss
+//! itself fits scale and shift to each frame.
+
+use crate::recipe::Param;
+use crate::robust::median;
+use crate::schedule::StepPlan;
+use crate::trainer::Trainer;
+use irradia_measure::{DepthKind, DepthSample};
+use irradia_scene::{Camera, Dataset, DepthGrid, View};
+use rayon::prelude::*;
+
+/// Points of a view below which its map is not fitted to them.
+const ENOUGH_POINTS: usize = 16;
+/// Median relative error of the fitted depths at a view's points, above which its map shows something else.
+const WORST_FIT: f64 = 0.2;
+/// Rounds of reweighted least squares.
+const ROUNDS: usize = 10;
+/// Relative residual below which pairs weigh the same.
+const LEAST_RESIDUAL: f64 = 1e-3;
+/// Depths farther outside the range of a view's points than this factor are extrapolated, and do not count.
+const BEYOND: f32 = 3.0;
+
+/// The maps of a dataset's training views.
+#[derive(Default)]
+pub(crate) struct DepthMaps {
+    /// By view.
+    of: Vec<Option<Known>>,
+    /// What was found, one line.
+    pub summary: String,
+}
+
+/// The map of a view, as it counts.
+struct Known {
+    grid: DepthGrid,
+    kind: DepthKind,
+}
+
+/// What a map's values are.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Values {
+    Depths,
+    Inverses,
+}
+
+/// `scale * value + shift` is the depth, or its inverse.
+#[derive(Clone, Copy, Debug)]
+struct Line {
+    scale: f64,
+    shift: f64,
+    /// Median relative error of the depths.
+    error: f64,
+}
+
+/// The map of a view, with its values and the depths of points at the same places.
+struct Read {
+    grid: DepthGrid,
+    pairs: Vec<[f64; 2]>,
+}
+
+impl DepthMaps {
+    /// Whether any training view has a map.
+    pub fn are_given(dataset: &Dataset) -> bool {
+        dataset
+            .train
+            .iter()
+            .any(|view| dataset.views[*view].depth_map.is_some())
+    }
+
+    /// Reads the maps of the training views and fits them to the points that these see.
+    pub fn read(dataset: &Dataset) -> Self {
+        let read = |view: &usize| {
+            let view = &dataset.views[*view];
+            let grid = view.depth_map.as_ref()?.load();
+            Some(grid.map(|grid| Read {
+                pairs: pairs(dataset, view, &grid),
+                grid,
+            }))
+        };
+        let maps: Vec<_> = dataset.train.par_iter().map(read).collect();
+        let given = maps.iter().flatten().count();
+        let unreadable = maps
+            .iter()
+            .flatten()
+            .find_map(|map| map.as_ref().err())
+            .map(|e| e.to_string());
+        let usable = || {
+            maps.iter()
+                .flatten()
+                .flatten()
+                .filter(|map| map.pairs.len() >= ENOUGH_POINTS)
+        };
+        let error = |values| {
+            usable()
+                .map(|map| Line::fit(&map.pairs, values).error)
+                .collect::<Vec<f64>>()
+        };
+        let values = match usable().next() {
+            Some(_) if median(error(Values::Inverses)) < median(error(Values::Depths)) => Values::Inverses,
+            _ => Values::Depths,
+        };
+        let fitted = usable().next().is_some();
+        let mut of: Vec<Option<Known>> = dataset.views.iter().map(|_| None).collect();
+        let mut errors = Vec::new();
+        for (view, map) in dataset.train.iter().zip(maps) {
+            let Some(Ok(map)) = map else { continue };
+            of[*view] = if map.pairs.len() >= ENOUGH_POINTS {
+                let line = Line::fit(&map.pairs, values);
+                errors.push(line.error);
+                line.is_sound().then(|| map.in_world(&line, values))
+            } else {
+                // Only depths need no points.
+                (values == Values::Depths).then_some(Known {
+                    grid: map.grid,
+                    kind: DepthKind::Relative,
+                })
+            };
+        }
+        let used = of.iter().flatten().count();
+        let kind = match values {
+            Values::Depths => "depths",
+            Values::Inverses => "inverse depths",
+        };
+        let fit = match fitted {
+            true => format!(
+                "{kind}, within {:.1} % of the points in the median",
+                100.0 * median(errors)
+            ),
+            false => "taken for depths, up to scale and shift".to_owned(),
+        };
+        let broken = unreadable.map(|error| format!("; {error}")).unwrap_or_default();
+        Self {
+            of,
+            summary: format!("{used} of {given} given maps of depth are used ({fit}){broken}"),
+        }
+    }
+
+    /// Whether any map counts.
+    pub fn is_empty(&self) -> bool {
+        self.of.iter().all(Option::is_none)
+    }
+
+    /// The depths of `view` at the pixels of `camera`, and what they mean.
+    pub fn samples(&self, view: usize, camera: &Camera) -> Option<(Vec<DepthSample>, DepthKind)> {
+        let Known { grid, kind } = self.of.get(view)?.as_ref()?;
+        let k = &camera.intrinsics;
+        let pixel = |at: u32, cells: u32, side: u32| ((2 * at + 1) * side / (2 * cells)).min(side - 1);
+        let sample = |(i, depth): (usize, &f32)| {
+            let (row, column) = (i as u32 / grid.columns, i as u32 % grid.columns);
+            let usable = *depth > 0.0 && depth.is_finite();
+            usable.then(|| DepthSample {
+                pixel: pixel(row, grid.rows, k.height) * k.width + pixel(column, grid.columns, k.width),
+                depth: *depth,
+                // Errors count relative to the depth.
+                weight: 1.0 / depth,
+            })
+        };
+        Some((grid.values.iter().enumerate().filter_map(sample).collect(), *kind))
+    }
+}
+
+impl Read {
+    /// With depths in world units.
+    fn in_world(mut self, line: &Line, values: Values) -> Known {
+        let depths = self.pairs.iter().map(|[_, depth]| *depth as f32);
+        let (nearest, farthest) = depths.fold((f32::INFINITY, 0f32), |(near, far), z| (near.min(z), far.max(z)));
+        let range = nearest / BEYOND..=farthest * BEYOND;
+        for value in &mut self.grid.values {
+            let known = *value > 0.0 && value.is_finite();
+            let depth = line.depth(f64::from(*value), values) as f32;
+            *value = if known && range.contains(&depth) { depth } else { 0.0 };
+        }
+        Known {
+            grid: self.grid,
+            kind: DepthKind::Metric,
+        }
+    }
+}
+
+impl Line {
+    /// The line through `[value, depth]` with the least absolute errors, relative to the depth. Its error is infinite if it does not rise.
+    fn fit(pairs: &[[f64; 2]], values: Values) -> Self {
+        let target = |z: f64| match values {
+            Values::Depths => z,
+            Values::Inverses => 1.0 / z,
+        };
+        let mut line = Self::through_halves(pairs.iter().map(|[value, z]| [*value, target(*z)]).collect());
+        for _ in 0..ROUNDS {
+            let (mut w, mut x, mut y, mut xx, mut xy) = (0.0, 0.0, 0.0, 0.0, 0.0);
+            for [value, z] in pairs {
+                let t = target(*z);
+                let residual = (line.scale * value + line.shift) / t - 1.0;
+                let weight = 1.0 / (residual.abs().max(LEAST_RESIDUAL) * t * t);
+                (w, x, y) = (w + weight, x + weight * value, y + weight * t);
+                (xx, xy) = (xx + weight * value * value, xy + weight * value * t);
+            }
+            let determinant = w * xx - x * x;
+            if determinant <= 1e-12 * w * xx {
+                break;
+            }
+            line.scale = (w * xy - x * y) / determinant;
+            line.shift = (y - line.scale * x) / w;
+        }
+        let error = |[value, z]: &[f64; 2]| match line.depth(*value, values) {
+            depth if depth > 0.0 => (depth / z - 1.0).abs(),
+            _ => f64::INFINITY,
+        };
+        if line.scale > 0.0 {
+            line.error = median(pairs.iter().map(error).collect());
+        }
+        line
+    }
+
+    /// A line that up to a quarter of wrong pairs do not move: the median of the slopes between values of the lower half and those of the
+    /// upper half (Theil 1950, Sen 1968), and the median shift.
+    fn through_halves(mut pairs: Vec<[f64; 2]>) -> Self {
+        pairs.sort_by(|a, b| a[0].total_cmp(&b[0]));
+        let (lower, upper) = pairs.split_at(pairs.len() / 2);
+        let rises = lower.iter().zip(upper).filter(|(a, b)| b[0] > a[0]);
+        let slopes: Vec<f64> = rises.map(|(a, b)| (b[1] - a[1]) / (b[0] - a[0])).collect();
+        let scale = if slopes.is_empty() { 0.0 } else { median(slopes) };
+        Self {
+            scale,
+            shift: median(pairs.iter().map(|[value, t]| t - scale * value).collect()),
+            error: f64::INFINITY,
+        }
+    }
+
+    fn depth(&self, value: f64, values: Values) -> f64 {
+        let on_line = self.scale * value + self.shift;
+        match values {
+            Values::Depths => on_line,
+            Values::Inverses => 1.0 / on_line,
+        }
+    }
+
+    fn is_sound(&self) -> bool {
+        self.error < WORST_FIT
+    }
+}
+
+impl Trainer {
+    /// Depths of the points that view `view` is known to see, if the plan uses them.
+    pub(crate) fn known_depths(&self, view: usize, camera: &Camera, plan: &StepPlan) -> Vec<DepthSample> {
+        let Some(points) = self
+            .dataset
+            .points
+            .as_ref()
+            .filter(|_| plan.value(Param::DepthWeight) > 0.0)
+        else {
+            return Vec::new();
+        };
+        let seen = &self.dataset.views[view].points_seen;
+        seen.iter()
+            .filter_map(|i| {
+                let (pixel, depth) = camera.project(*points.positions.get(*i as usize)?)?;
+                let [column, row] = [pixel.x.floor(), pixel.y.floor()];
+                let k = &camera.intrinsics;
+                let inside = (0.0..k.width as f32).contains(&column) && (0.0..k.height as f32).contains(&row);
+                inside.then(|| DepthSample {
+                    pixel: row as u32 * k.width + column as u32,
+                    depth,
+                    weight: 1.0,
+                })
+            })
+            .collect()
+    }
+
+    /// Depths of the map that was given beside the photograph of view `view`, if the plan uses them.
+    pub(crate) fn given_depths(
+        &mut self,
+        view: usize,
+        camera: &Camera,
+        plan: &StepPlan,
+    ) -> Option<(Vec<DepthSample>, DepthKind)> {
+        if plan.value(Param::DepthMapWeight) <= 0.0 {
+            return None;
+        }
+        // A resumed run reads them again.
+        let maps = self.depth_maps.get_or_insert_with(|| DepthMaps::read(&self.dataset));
+        maps.samples(view, camera)
+    }
+}
+
+/// `[value, depth]` at each point that `view` sees.
+fn pairs(dataset: &Dataset, view: &View, grid: &DepthGrid) -> Vec<[f64; 2]> {
+    let Some(points) = &dataset.points else {
+        return Vec::new();
+    };
+    let k = &view.camera.intrinsics;
+    let cell = |at: f32, side: u32, cells: u32| {
+        let index = (at / side as f32 * cells as f32).floor();
+        (0.0..cells as f32).contains(&index).then_some(index as usize)
+    };
+    let pair = |point: &u32| {
+        let (pixel, depth) = view.camera.project(*points.positions.get(*point as usize)?)?;
+        let column = cell(pixel.x, k.width, grid.columns)?;
+        let value = grid.values[cell(pixel.y, k.height, grid.rows)? * grid.columns as usize + column];
+        (value > 0.0 && value.is_finite() && depth > view.camera.near).then_some([f64::from(value), f64::from(depth)])
+    };
+    view.points_seen.iter().filter_map(pair).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use glam::{Quat, Vec3};
+    use irradia_scene::{DepthSource, Intrinsics, LoadError, Photo, PointCloud, Pose, Rng};
+    use std::sync::Arc;
+
+    const CELLS: u32 = 32;
+
+    struct Broken;
+
+    impl DepthSource for Broken {
+        fn load(&self) -> Result<DepthGrid, LoadError> {
+            Err(LoadError("depths/b.png: ends too early".into()))
+        }
+    }
+
+    /// Depth of a slanted floor that the camera at the origin sees at these fractions of its picture.
+    fn floor(x: f32, y: f32) -> f32 {
+        2.0 + 3.0 * x + 5.0 * y * y
+    }
+
+    fn camera() -> Camera {
+        let pose = Pose {
+            rotation: Quat::IDENTITY,
+            position: Vec3::ZERO,
+        };
+        Camera::new(pose, Intrinsics::from_fov_x(64, 64, 1.0))
+    }
+
+    /// Views with these maps of the floor, of which all but those in `blind` see its points.
+    fn dataset(maps: Vec<Option<Arc<dyn DepthSource>>>, blind: &[usize]) -> Dataset {
+        let (camera, mut rng) = (camera(), Rng::new(3, 3));
+        let mut positions = Vec::new();
+        for i in 0..200 {
+            let [x, y] = [rng.uniform(), rng.uniform()];
+            // One in ten points is wrong.
+            let z = if i % 10 == 0 { 20.0 } else { floor(x, y) };
+            let k = &camera.intrinsics;
+            let ray = Vec3::new((64.0 * x - k.cx) / k.fx, (64.0 * y - k.cy) / k.fy, 1.0);
+            positions.push(ray * z);
+        }
+        let photo = Photo {
+            width: 64,
+            height: 64,
+            channels: 3,
+            data: vec![0; 3 * 64 * 64],
+            mask: None,
+        };
+        let view = |(i, depth_map): (usize, Option<Arc<dyn DepthSource>>)| View {
+            name: format!("{i}.png"),
+            camera,
+            photo: Arc::new(photo.clone()),
+            depth_bounds: None,
+            time: None,
+            points_seen: if blind.contains(&i) { vec![] } else { (0..200).collect() },
+            depth_map,
+        };
+        let views: Vec<View> = maps.into_iter().enumerate().map(view).collect();
+        Dataset {
+            train: (0..views.len()).collect(),
+            views,
+            points: Some(PointCloud {
+                colors: vec![[0; 3]; positions.len()],
+                positions,
+            }),
+            ..Dataset::default()
+        }
+    }
+
+    /// A map whose values are those of the floor changed by `of`.
+    fn map(of: impl Fn(f32) -> f32) -> Option<Arc<dyn DepthSource>> {
+        let place = |at: u32| (at as f32 + 0.5) / CELLS as f32;
+        let cells = (0..CELLS * CELLS).map(|i| floor(place(i % CELLS), place(i / CELLS)));
+        Some(Arc::new(DepthGrid {
+            columns: CELLS,
+            rows: CELLS,
+            values: cells.map(of).collect(),
+        }))
+    }
+
+    /// Largest relative error of the depths of `view`.
+    fn worst(maps: &DepthMaps, view: usize) -> f32 {
+        let (samples, kind) = maps.samples(view, &camera()).unwrap();
+        assert_eq!(
+            (samples.len(), kind),
+            (CELLS as usize * CELLS as usize, DepthKind::Metric)
+        );
+        let error = |sample: &DepthSample| {
+            let place = |at: u32| (at as f32) / 64.0;
+            let wanted = floor(place(sample.pixel % 64), place(sample.pixel / 64));
+            (sample.depth / wanted - 1.0).abs()
+        };
+        samples.iter().map(error).fold(0.0, f32::max)
+    }
+
+    #[test]
+    fn maps_of_depth_and_of_its_inverse_are_told_apart_and_fitted_to_the_points() {
+        let depths = DepthMaps::read(&dataset(vec![map(|z| 40.0 * z + 30.0), map(|z| 9.0 * z)], &[]));
+        let inverses = DepthMaps::read(&dataset(vec![map(|z| 200.0 / z + 11.0), map(|z| 9.0 / z - 0.5)], &[]));
+        for (maps, kind) in [(depths, "(depths, within"), (inverses, "(inverse depths, within")] {
+            assert!(
+                maps.summary.starts_with("2 of 2 given maps") && maps.summary.contains(kind),
+                "{}",
+                maps.summary
+            );
+            // A cell is a thirty-second of the picture wide, over which depths change by up to a fifth at points between its centres.
+            assert!(
+                worst(&maps, 0) < 0.05 && worst(&maps, 1) < 0.05,
+                "{} {}",
+                worst(&maps, 0),
+                worst(&maps, 1)
+            );
+        }
+    }
+
+    #[test]
+    fn maps_that_cannot_be_read_or_show_something_else_do_not_count() {
+        let mut rng = Rng::new(1, 1);
+        let noise: Vec<f32> = (0..CELLS * CELLS).map(|_| rng.range(1.0, 9.0)).collect();
+        let noise = DepthGrid {
+            columns: CELLS,
+            rows: CELLS,
+            values: noise,
+        };
+        let given = vec![
+            map(|z| z),
+            Some(Arc::new(Broken) as _),
+            Some(Arc::new(noise) as _),
+            None,
+        ];
+        let maps = DepthMaps::read(&dataset(given, &[]));
+        assert!(maps.summary.starts_with("1 of 3 given maps"), "{}", maps.summary);
+        assert!(
+            maps.summary.ends_with("depths/b.png: ends too early"),
+            "{}",
+            maps.summary
+        );
+        let counts = |view| maps.samples(view, &camera()).is_some();
+        assert_eq!([0, 1, 2, 3].map(counts), [true, false, false, false]);
+    }
+
+    #[test]
+    fn without_points_maps_are_depths_up_to_scale_and_shift() {
+        let maps = DepthMaps::read(&dataset(vec![map(|z| 7.0 * z), map(|_| 0.0)], &[0, 1]));
+        let (samples, kind) = maps.samples(0, &camera()).unwrap();
+        assert_eq!((samples.len(), kind), (1024, DepthKind::Relative));
+        assert!(maps.samples(1, &camera()).unwrap().0.is_empty(), "nothing is known");
+        // Where the others are inverse depths, a map without points is not known to be one.
+        let maps = DepthMaps::read(&dataset(vec![map(|z| 1.0 / z), map(|z| 1.0 / z)], &[1]));
+        assert!(maps.samples(0, &camera()).is_some() && maps.samples(1, &camera()).is_none());
+    }
+}

@@ -193,6 +193,21 @@ pub(crate) fn decode_values(path: &Path, orientation: Orientation) -> Result<(u3
     Ok((width, height, values))
 }
 
+/// The colours of an image, each channel in \[0, 1\]: width, height and `[H, W]`.
+///
+/// # Errors
+/// When it cannot be decoded.
+pub(crate) fn decode_colors(path: &Path) -> Result<(u32, u32, Vec<[f32; 3]>), FormatError> {
+    let (decoder, _) = open(path)?;
+    let image = DynamicImage::from_decoder(decoder).map_err(|error| undecodable(path, &error))?;
+    let colors = image.to_rgb32f();
+    Ok((
+        image.width(),
+        image.height(),
+        colors.pixels().map(|pixel| pixel.0).collect(),
+    ))
+}
+
 /// The value of a colour that is grey.
 fn grey<T: PartialEq + Copy>([red, green, blue]: [T; 3]) -> Option<T> {
     (red == green && green == blue).then_some(red)

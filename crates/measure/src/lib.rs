@@ -14,6 +14,7 @@ mod window;
 
 pub use loss::coarse::CoarseLoss;
 pub use loss::depth::{DepthKind, DepthLoss, DepthSample};
+pub use loss::normal::{NormalLoss, NormalSample};
 pub use loss::perceptual::{Crop, perceptual};
 pub use loss::smooth::{SmoothLoss, Smoothed};
 pub use loss::{LossValues, LossWeights, PhotometricLoss, Target, Truth};

@@ -191,6 +191,7 @@ mod tests {
                 time: None,
                 points_seen: Vec::new(),
                 depth_map: None,
+                normal_map: None,
             };
             Dataset {
                 views: vec![view],

@@ -106,28 +106,34 @@ impl PhotoSource for Photo {
     }
 }
 
-/// Depths along +Z that were given beside a photograph, on a regular grid over the view.
+/// What was measured or estimated at each place of a photograph and given beside it, on a regular grid over the view.
 #[derive(Clone, Debug, PartialEq)]
-pub struct DepthGrid {
+pub struct Grid<T> {
     /// Cells from left to right.
     pub columns: u32,
     /// Cells from top to bottom.
     pub rows: u32,
-    /// `[rows, columns]`, at the centres of the cells: depth, or inverse depth, up to scale and shift. Unknown where it is not positive and finite.
-    pub values: Vec<f32>,
+    /// `[rows, columns]`, at the centres of the cells.
+    pub values: Vec<T>,
 }
 
-/// A source of the depths of a view: a file, or values in memory.
-pub trait DepthSource: Send + Sync {
+/// Depth along +Z, or its inverse, up to scale and shift. Unknown where it is not positive and finite.
+pub type DepthGrid = Grid<f32>;
+
+/// Normals as their file has them, each coordinate in \[-1, 1\]. Unknown where they are shorter than a half.
+pub type NormalGrid = Grid<[f32; 3]>;
+
+/// A source of a grid: a file, or values in memory.
+pub trait GridSource<T>: Send + Sync {
     /// Decodes and undistorts. Called from several threads.
     ///
     /// # Errors
     /// One line that names the file and the remedy.
-    fn load(&self) -> Result<DepthGrid, LoadError>;
+    fn load(&self) -> Result<Grid<T>, LoadError>;
 }
 
-impl DepthSource for DepthGrid {
-    fn load(&self) -> Result<DepthGrid, LoadError> {
+impl<T: Clone + Send + Sync> GridSource<T> for Grid<T> {
+    fn load(&self) -> Result<Self, LoadError> {
         Ok(self.clone())
     }
 }
@@ -149,7 +155,9 @@ pub struct View {
     /// Indices into [`Dataset::points`] of the points visible in this view; empty if the source does not list them.
     pub points_seen: Vec<u32>,
     /// Depths of all that the view shows, measured or estimated, if they were given.
-    pub depth_map: Option<Arc<dyn DepthSource>>,
+    pub depth_map: Option<Arc<dyn GridSource<f32>>>,
+    /// Normals of all that the view shows, if they were given.
+    pub normal_map: Option<Arc<dyn GridSource<[f32; 3]>>>,
 }
 
 /// Posed photographs of one scene.

@@ -25,7 +25,9 @@ mod similarity;
 
 pub use camera::{Camera, Intrinsics};
 pub use cloud::GaussianCloud;
-pub use dataset::{Dataset, DepthGrid, DepthSource, LoadError, Photo, PhotoSource, View, every_eighth};
+pub use dataset::{
+    Dataset, DepthGrid, Grid, GridSource, LoadError, NormalGrid, Photo, PhotoSource, View, every_eighth,
+};
 pub use extra::{ExtraColumn, Scalar};
 pub use image::Image;
 pub use lens::Lens;

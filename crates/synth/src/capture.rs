@@ -238,6 +238,7 @@ pub fn dataset(options: &SynthOptions) -> Result<Dataset, SynthError> {
             time: None,
             points_seen: Vec::new(),
             depth_map: None,
+            normal_map: None,
         });
     }
     dataset.views.sort_by(|a, b| a.name.cmp(&b.name));

@@ -6,12 +6,13 @@
 //!   nothing beside the object, and what floats there stands before it in other photographs.
 //! - **Skies.** Photographs of many days have skies that no scene can show at once; splats explain them by fog around all that is in
 //!   front.
-//! - **Maps of depth.** They are read, and weighed only where some can be used.
+//! - **Maps of depth and normals.** They are read, and weighed only where some can be used.
 //! - **Sparse photographs.** What only a few photographs see is not determined by them: steps beyond those that the scene takes to appear only fit
 //!   splats to single photographs.
 
 use crate::depth_maps::DepthMaps;
 use crate::first_splats::has_points;
+use crate::normal_maps::NormalMaps;
 use crate::recipe::{Param, Params};
 use crate::spacing::spacing;
 use crate::trainer::{TrainError, Trainer};
@@ -158,12 +159,12 @@ impl Trainer {
             self.put_into_effect("masks leave out all but an object", "cut_out", cut_out);
         }
         self.settle_spacing(sparse);
-        self.settle_depth_maps();
+        self.settle_maps();
         Ok(())
     }
 
-    /// Reads the maps of depth if the recipe weighs them; without any that count, frames need no depth for them.
-    fn settle_depth_maps(&mut self) {
+    /// Reads the maps of depth and of normals if the recipe weighs them; without any that count, frames need no depth for them.
+    fn settle_maps(&mut self) {
         if DepthMaps::are_given(&self.dataset) && self.recipe.uses(Param::DepthMapWeight) {
             let maps = DepthMaps::read(&self.dataset);
             self.decisions.push(maps.summary.clone());
@@ -171,6 +172,14 @@ impl Trainer {
         }
         if self.depth_maps.is_none() {
             self.recipe.params.remove(&Param::DepthMapWeight);
+        }
+        if NormalMaps::are_given(&self.dataset) && self.recipe.uses(Param::NormalMapWeight) {
+            let maps = NormalMaps::read(&self.dataset);
+            self.decisions.push(maps.summary.clone());
+            self.normal_maps = Some(maps).filter(|maps| !maps.is_empty());
+        }
+        if self.normal_maps.is_none() {
+            self.recipe.params.remove(&Param::NormalMapWeight);
         }
     }
 
@@ -213,9 +222,7 @@ mod tests {
     use crate::recipe::Knob;
     use crate::trainer::{TrainOptions, Trainer};
     use glam::Vec3;
-    use irradia_scene::{
-        Camera, Dataset, DepthGrid, DepthSource, Intrinsics, LoadError, Photo, PointCloud, Pose, View,
-    };
+    use irradia_scene::{Camera, Dataset, DepthGrid, GridSource, Intrinsics, LoadError, Photo, PointCloud, Pose, View};
     use std::sync::Arc;
 
     /// One grey photograph of `channels` channels, with or without points.
@@ -237,6 +244,7 @@ mod tests {
             time: None,
             points_seen: Vec::new(),
             depth_map: None,
+            normal_map: None,
         };
         let positions: Vec<Vec3> = (0..12).map(|i| Vec3::new(0.1 * i as f32, 0.0, 1.0)).collect();
         Arc::new(Dataset {
@@ -281,12 +289,12 @@ mod tests {
     #[test]
     fn maps_of_depth_are_weighed_only_where_some_can_be_used() {
         struct Broken;
-        impl DepthSource for Broken {
+        impl GridSource<f32> for Broken {
             fn load(&self) -> Result<DepthGrid, LoadError> {
                 Err(LoadError("depths/a.png: ends too early".into()))
             }
         }
-        let settled = |map: Option<Arc<dyn DepthSource>>| {
+        let settled = |map: Option<Arc<dyn GridSource<f32>>>| {
             let mut data = (*dataset(3, true)).clone();
             data.views[0].depth_map = map;
             let recipe = Recipe::parse("fast", Recipe::built_in("fast").unwrap(), &[]).unwrap();

@@ -310,14 +310,14 @@ fn pairs(dataset: &Dataset, view: &View, grid: &DepthGrid) -> Vec<[f64; 2]> {
 mod tests {
     use super::*;
     use glam::{Quat, Vec3};
-    use irradia_scene::{DepthSource, Intrinsics, LoadError, Photo, PointCloud, Pose, Rng};
+    use irradia_scene::{GridSource, Intrinsics, LoadError, Photo, PointCloud, Pose, Rng};
     use std::sync::Arc;
 
     const CELLS: u32 = 32;
 
     struct Broken;
 
-    impl DepthSource for Broken {
+    impl GridSource<f32> for Broken {
         fn load(&self) -> Result<DepthGrid, LoadError> {
             Err(LoadError("depths/b.png: ends too early".into()))
         }
@@ -337,7 +337,7 @@ mod tests {
     }
 
     /// Views with these maps of the floor, of which all but those in `blind` see its points.
-    fn dataset(maps: Vec<Option<Arc<dyn DepthSource>>>, blind: &[usize]) -> Dataset {
+    fn dataset(maps: Vec<Option<Arc<dyn GridSource<f32>>>>, blind: &[usize]) -> Dataset {
         let (camera, mut rng) = (camera(), Rng::new(3, 3));
         let mut positions = Vec::new();
         for i in 0..200 {
@@ -355,7 +355,7 @@ mod tests {
             data: vec![0; 3 * 64 * 64],
             mask: None,
         };
-        let view = |(i, depth_map): (usize, Option<Arc<dyn DepthSource>>)| View {
+        let view = |(i, depth_map): (usize, Option<Arc<dyn GridSource<f32>>>)| View {
             name: format!("{i}.png"),
             camera,
             photo: Arc::new(photo.clone()),
@@ -363,6 +363,7 @@ mod tests {
             time: None,
             points_seen: if blind.contains(&i) { vec![] } else { (0..200).collect() },
             depth_map,
+            normal_map: None,
         };
         let views: Vec<View> = maps.into_iter().enumerate().map(view).collect();
         Dataset {
@@ -377,7 +378,7 @@ mod tests {
     }
 
     /// A map whose values are those of the floor changed by `of`.
-    fn map(of: impl Fn(f32) -> f32) -> Option<Arc<dyn DepthSource>> {
+    fn map(of: impl Fn(f32) -> f32) -> Option<Arc<dyn GridSource<f32>>> {
         let place = |at: u32| (at as f32 + 0.5) / CELLS as f32;
         let cells = (0..CELLS * CELLS).map(|i| floor(place(i % CELLS), place(i / CELLS)));
         Some(Arc::new(DepthGrid {

@@ -130,6 +130,7 @@ mod tests {
             time: None,
             points_seen: Vec::new(),
             depth_map: None,
+            normal_map: None,
         };
         Dataset {
             views: places.into_iter().zip(angles).map(view).collect(),

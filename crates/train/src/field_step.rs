@@ -234,6 +234,7 @@ mod tests {
                 time: None,
                 points_seen: (0..400).step_by(2).collect(),
                 depth_map: None,
+                normal_map: None,
             }
         });
         Dataset {

@@ -128,6 +128,7 @@ pub(crate) mod tests {
                 time: None,
                 points_seen: (0..seen as u32).collect(),
                 depth_map: None,
+                normal_map: None,
             }],
             train: vec![0],
             points: Some(PointCloud {

@@ -21,6 +21,7 @@ pub mod half_fit;
 pub mod memory;
 mod misfits;
 pub mod model;
+mod normal_maps;
 mod objective;
 pub mod paces;
 pub mod painter;

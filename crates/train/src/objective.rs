@@ -5,10 +5,10 @@ use crate::photos::Prepared;
 use crate::recipe::Param;
 use crate::schedule::StepPlan;
 use irradia_measure::{
-    CoarseLoss, Crop, DepthKind, DepthLoss, DepthSample, LossWeights, Lpips, PhotometricLoss, SmoothLoss, Smoothed,
-    Target, Truth, perceptual,
+    CoarseLoss, Crop, DepthKind, DepthLoss, DepthSample, LossWeights, Lpips, NormalLoss, NormalSample, PhotometricLoss,
+    SmoothLoss, Smoothed, Target, Truth, perceptual,
 };
-use irradia_scene::Rng;
+use irradia_scene::{Intrinsics, Rng};
 use irradia_splat::{FramePlanes, Gather, OutputGradient};
 use rayon::prelude::*;
 use std::sync::Arc;
@@ -68,6 +68,8 @@ pub struct Reference<'a> {
     pub depths: &'a [DepthSample],
     /// Those of a map given beside the photograph.
     pub depth_map: Option<(&'a [DepthSample], DepthKind)>,
+    /// Normals of a map given beside the photograph, half of their distance from one another in pixels, and the camera.
+    pub normal_map: Option<(&'a [NormalSample], u32, &'a Intrinsics)>,
 }
 
 impl Objective {
@@ -183,6 +185,12 @@ impl Objective {
                     .depth
                     .evaluate(frame.depth, frame.alpha, depths, kind, weight, v_depth, v_alpha);
                 total += f64::from(weight) * values.loss;
+            }
+            let weight = plan.value(Param::NormalMapWeight);
+            if let Some((normals, reach, camera)) = reference.normal_map.filter(|_| weight > 0.0) {
+                let (loss, [depth, alpha]) = (NormalLoss::default(), [frame.depth, frame.alpha]);
+                let loss = loss.evaluate(depth, alpha, camera, normals, reach, weight, v_depth, v_alpha);
+                total += f64::from(weight) * loss;
             }
             let weight = plan.value(Param::SmoothWeight);
             if weight > 0.0 {
@@ -336,6 +344,7 @@ mod tests {
             let mut plan = plan(&recipe, &Clock::new(&recipe));
             plan.values[Param::DepthWeight] = 0.0;
             plan.values[Param::DepthMapWeight] = 0.0;
+            plan.values[Param::NormalMapWeight] = 0.0;
             let frame = FramePlanes {
                 color: &color,
                 alpha: &alpha,
@@ -346,6 +355,7 @@ mod tests {
                 background: None,
                 depths: &[],
                 depth_map: None,
+                normal_map: None,
             };
             let mut objective = Objective::new(None);
             objective.evaluate(frame, &reference, &plan, &mut Rng::new(1, 1));
@@ -403,6 +413,7 @@ mod tests {
                 background: None,
                 depths: &[],
                 depth_map: Some((&samples, kind)),
+                normal_map: None,
             };
             let mut objective = Objective::new(None);
             objective.evaluate(frame, &reference, &plan, &mut Rng::new(1, 1));

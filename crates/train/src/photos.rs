@@ -320,6 +320,7 @@ mod tests {
                 time: None,
                 points_seen: vec![],
                 depth_map: None,
+                normal_map: None,
             })
             .collect();
         (

@@ -10,6 +10,7 @@ use crate::free_space::FreeSpace;
 use crate::half_fit::HalfFit;
 use crate::memory::{MemoryPlan, Needs};
 use crate::model::Model;
+use crate::normal_maps::NormalMaps;
 use crate::objective::{Objective, ObjectiveValues, Reference};
 use crate::photos::{PhotoCache, Prepared};
 use crate::pixel_size::pixel_size;
@@ -164,6 +165,8 @@ pub struct Trainer {
     pub(crate) photos: PhotoCache,
     /// The maps of depth given beside photographs, once they are needed.
     pub(crate) depth_maps: Option<DepthMaps>,
+    /// Those of normals.
+    pub(crate) normal_maps: Option<NormalMaps>,
     /// Known depths of the views on which a field is trained, by view, width and height.
     pub(crate) depths: HashMap<(usize, u32, u32), Arc<[KnownDepth]>>,
     objective: Objective,
@@ -260,6 +263,7 @@ impl Trainer {
             pixels: mean_pixels(&cameras),
             decisions,
             depth_maps: None,
+            normal_maps: None,
             depths: HashMap::new(),
             objective: Objective::new(options.lpips.clone()),
             device_loss: DeviceLoss::new(&options.device)?,
@@ -408,11 +412,15 @@ impl Trainer {
             ..usual
         };
         let depth_map = self.given_depths(view, &camera, &plan);
+        let normal_map = self.given_normals(view, &camera, &plan);
         let reference = Reference {
             photo: &photo,
             background,
             depths: &self.known_depths(view, &camera, &plan),
             depth_map: depth_map.as_ref().map(|(samples, kind)| (&samples[..], *kind)),
+            normal_map: normal_map
+                .as_ref()
+                .map(|(samples, reach)| (&samples[..], *reach, &camera.intrinsics)),
         };
         let (update, has_lpips) = (self.update(&plan), self.options.lpips.is_some());
         let ahead = self.sockets.are_empty().then(|| {

@@ -6,16 +6,16 @@ use super::split;
 use super::world::world_from_dataset;
 use super::{DEFAULT_MAX_SIDE, DatasetOptions};
 use crate::FormatError;
-use crate::depth_file::DepthFile;
 use crate::faces::{Cut, image_circle};
 use crate::image_file::{Header, read_header};
+use crate::map_file::MapFile;
 use crate::photo::PhotoFile;
 use crate::undistort::Undistortion;
 use glam::DQuat;
 use image::metadata::Orientation;
-use irradia_scene::{Camera, Dataset, DepthSource, Intrinsics, Lens, PointCloud, Similarity, View};
+use irradia_scene::{Camera, Dataset, Intrinsics, Lens, PointCloud, Similarity, View};
 use rayon::prelude::*;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 /// Minimum number of views of a scene.
@@ -267,9 +267,10 @@ impl Finishing<'_> {
                 .filter_map(|(name, plan)| {
                     let mut face = self.view(&view, probed, Some(*plan))?;
                     face.name = format!("{}/{name}", view.name);
-                    // Depths are along the axis of the photograph, not of the face.
+                    // Depths and normals have the axes of the photograph, not of the face.
                     face.depth_bounds = None;
                     face.depth_map = None;
+                    face.normal_map = None;
                     face.points_seen.retain(|point| self.is_seen(&face.camera, *point));
                     Some(face)
                 })
@@ -299,14 +300,16 @@ impl Finishing<'_> {
             undistortion: plan,
             size: (intrinsics.width, intrinsics.height),
         };
-        let depth_map = view.depth.clone().map(|path| {
-            Arc::new(DepthFile {
-                path,
-                orientation: probed.orientation,
-                upright: (probed.source.width, probed.source.height),
-                undistortion: plan,
-            }) as Arc<dyn DepthSource>
-        });
+        let map = |path: &Option<PathBuf>| {
+            path.clone().map(|path| {
+                Arc::new(MapFile {
+                    path,
+                    orientation: probed.orientation,
+                    upright: (probed.source.width, probed.source.height),
+                    undistortion: plan,
+                })
+            })
+        };
         let mut pose = view.pose?;
         pose.rotation *= plan.map_or(DQuat::IDENTITY, |plan| plan.turn());
         Some(View {
@@ -318,7 +321,8 @@ impl Finishing<'_> {
                 .and_then(|bounds| usable_bounds(bounds.map(|depth| depth * self.world_from_dataset.scale))),
             time: view.time,
             points_seen: view.points_seen.clone(),
-            depth_map,
+            depth_map: map(&view.depth).map(|map| map as _),
+            normal_map: map(&view.normals).map(|map| map as _),
         })
     }
 }

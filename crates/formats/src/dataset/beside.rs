@@ -30,6 +30,11 @@ impl Beside {
         Self::find(root, &["depths".to_owned(), "depth".to_owned()], is_map)
     }
 
+    /// The maps of normals below `root`: in `normals` or in `normal`.
+    pub fn normals(root: &Path) -> Option<Self> {
+        Self::find(root, &["normals".to_owned(), "normal".to_owned()], is_image_name)
+    }
+
     /// The files that `keep` accepts in the first of these folders that exists.
     fn find(root: &Path, names: &[String], keep: impl Fn(&Path) -> bool) -> Option<Self> {
         let folder = names.iter().find(|name| root.join(name).is_dir())?;
@@ -62,17 +67,19 @@ impl Beside {
     }
 }
 
-/// Gives views the maps of depth that lie below the dataset's folder, if its files declare none.
-pub(super) fn find_depths(declared: &mut Declared) {
-    if declared.views.iter().any(|view| view.depth.is_some()) {
-        return;
-    }
-    let Some(maps) = Beside::depths(&declared.root) else {
-        return;
-    };
+/// Gives views the maps of depth and of normals that lie below the dataset's folder, if its files declare none.
+pub(super) fn find_maps(declared: &mut Declared) {
+    let depths = Beside::depths(&declared.root).filter(|_| declared.views.iter().all(|view| view.depth.is_none()));
+    let normals = Beside::normals(&declared.root).filter(|_| declared.views.iter().all(|view| view.normals.is_none()));
     for view in &mut declared.views {
         let below = view.name.split_once('/').map_or(view.name.as_str(), |(_, below)| below);
-        view.depth = maps.of(below).or_else(|| maps.of(&view.name));
+        let find = |maps: &Beside| maps.of(below).or_else(|| maps.of(&view.name));
+        if let Some(depths) = &depths {
+            view.depth = find(depths);
+        }
+        if let Some(normals) = &normals {
+            view.normals = find(normals);
+        }
     }
 }
 

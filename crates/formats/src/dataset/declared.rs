@@ -28,6 +28,8 @@ pub(super) struct DeclaredView {
     pub mask: Option<PathBuf>,
     /// A map of depths.
     pub depth: Option<PathBuf>,
+    /// A map of normals.
+    pub normals: Option<PathBuf>,
     /// `None` when the numbers do not form a pose.
     pub pose: Option<DeclaredPose>,
     pub camera: DeclaredCamera,
@@ -56,6 +58,7 @@ impl DeclaredView {
             image,
             mask: None,
             depth: None,
+            normals: None,
             pose,
             camera,
             depth_bounds: None,

@@ -102,6 +102,7 @@ pub(super) fn read(root: &Path, downscale: f32) -> Result<Declared, FormatError>
                 points_seen: Vec::new(),
                 split: None,
                 depth: None,
+                normals: None,
             }
         })
         .collect();

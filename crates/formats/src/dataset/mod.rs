@@ -273,8 +273,12 @@ pub fn read_dataset(path: &Path, options: &DatasetOptions) -> Result<Dataset, Fo
     }
     // Those of rendered scenes are the truth to compare with.
     match format {
-        DatasetFormat::Blender => declared.views.iter_mut().for_each(|view| view.depth = None),
-        _ => beside::find_depths(&mut declared),
+        DatasetFormat::Blender => {
+            for view in &mut declared.views {
+                (view.depth, view.normals) = (None, None);
+            }
+        }
+        _ => beside::find_maps(&mut declared),
     }
     assemble::assemble(declared, options)
 }

@@ -89,6 +89,11 @@ pub(super) fn declared_views(
             Some(Split::Left)
         }
     };
+    // A file beside the photograph, if it is there.
+    let beside = |path: &Option<String>| {
+        let path = path.as_ref().map(|path| root.join(path.replace('\\', "/")));
+        path.filter(|path| path.is_file())
+    };
     transforms
         .frames
         .iter()
@@ -106,16 +111,9 @@ pub(super) fn declared_views(
             Ok(DeclaredView {
                 name: relative_name(root, image.as_deref().unwrap_or(&path)),
                 image,
-                mask: frame
-                    .mask_path
-                    .as_ref()
-                    .map(|mask| root.join(mask))
-                    .filter(|mask| mask.is_file()),
-                depth: frame
-                    .depth_file_path
-                    .as_ref()
-                    .map(|depth| root.join(depth.replace('\\', "/")))
-                    .filter(|depth| depth.is_file()),
+                mask: beside(&frame.mask_path),
+                depth: beside(&frame.depth_file_path),
+                normals: beside(&frame.normal_file_path),
                 pose: frame.pose(),
                 camera,
                 depth_bounds: None,

@@ -36,6 +36,9 @@ pub struct Frame {
     /// A map of depths, relative to the file; `depth_path` in files for instant-ngp.
     #[serde(alias = "depth_path")]
     pub depth_file_path: Option<String>,
+    /// A map of normals, relative to the file.
+    #[serde(alias = "normal_path")]
+    pub normal_file_path: Option<String>,
     /// Time of capture (D-NeRF: 0 to 1 over the capture).
     pub time: Option<f64>,
     /// Intrinsics of this frame only.
@@ -285,6 +288,7 @@ mod tests {
             transform_matrix: rows.map(|row| row.map(Some).to_vec()).to_vec(),
             mask_path: None,
             depth_file_path: None,
+            normal_file_path: None,
             time: None,
             camera: CameraKeys::default(),
         };

@@ -37,6 +37,8 @@ pub struct PhotoEntry {
     pub mask: Option<PathBuf>,
     /// Its map of depths, in the folder `depths` or `depth`.
     pub depth: Option<PathBuf>,
+    /// Its map of normals, in the folder `normals` or `normal`.
+    pub normals: Option<PathBuf>,
     /// Where up is in the decoded picture: `[right, down]`; `[0, -1]` unless it is decoded as stored, against its EXIF orientation.
     pub up: [i8; 2],
     orientation: Orientation,
@@ -133,15 +135,23 @@ pub fn read_photo_folders(folders: &[impl AsRef<Path>]) -> Result<PhotoFolder, F
         if here.is_empty() && folder.join("images").is_dir() {
             here = list_pictures(&folder.join("images"))?;
         }
-        let [masks, depths] = [Beside::masks(folder, "images"), Beside::depths(folder)];
+        let beside = [
+            Beside::masks(folder, "images"),
+            Beside::depths(folder),
+            Beside::normals(folder),
+        ];
         files.extend(here.into_iter().map(|path| {
             let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-            let [mask, depth] = [&masks, &depths].map(|beside| beside.as_ref().and_then(|beside| beside.of(&name)));
+            let files = beside
+                .each_ref()
+                .map(|beside| beside.as_ref().and_then(|beside| beside.of(&name)));
+            let [mask, depth, normals] = files;
             Found {
                 path,
                 name,
                 mask,
                 depth,
+                normals,
             }
         }));
     }
@@ -195,6 +205,7 @@ struct Found {
     name: String,
     mask: Option<PathBuf>,
     depth: Option<PathBuf>,
+    normals: Option<PathBuf>,
 }
 
 /// Pictures by their extension, sorted.
@@ -237,6 +248,7 @@ fn read_entry(file: &Found) -> Result<PhotoEntry, String> {
         hash,
         mask: mask.clone(),
         depth: file.depth.clone(),
+        normals: file.normals.clone(),
         up,
         orientation,
         jpeg: header.jpeg,

@@ -302,6 +302,7 @@ fn trainer(splats: &Splats) -> Result<Trainer> {
         time: None,
         points_seen: Vec::new(),
         depth_map: None,
+        normal_map: None,
     };
     let few: Vec<Vec3> = (0..splats.len())
         .step_by(splats.len() / 100)

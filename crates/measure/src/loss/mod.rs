@@ -1,5 +1,5 @@
 //! Losses with their gradients. This module has the photometric loss: L1, D-SSIM and squared error, fused into one pass over
-//! the image. It overwrites the gradient; all others ([`coarse`], [`depth`], [`perceptual`], [`smooth`]) add their weighted
+//! the image. It overwrites the gradient; all others ([`coarse`], [`depth`], [`normal`], [`perceptual`], [`smooth`]) add their weighted
 //! gradient to it, so that a sum of losses needs no further pass.
 //!
 //! `total = l1 L1 + ssim (1 - SSIM) + mse MSE`, each a mean over the H W 3 values. With a mask m in \[0, 1\] the render x is
@@ -12,6 +12,7 @@
 pub mod coarse;
 pub mod depth;
 pub(crate) mod job;
+pub mod normal;
 pub mod perceptual;
 mod pointwise;
 mod rows;

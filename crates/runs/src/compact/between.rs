@@ -46,6 +46,7 @@ pub(super) fn with_views_between(mut dataset: Dataset, model: &Model, options: &
             time: None,
             points_seen: Vec::new(),
             depth_map: None,
+            normal_map: None,
         });
     }
     dataset

@@ -52,7 +52,11 @@ impl Sources {
         if has_photos(path) {
             self.folders.push(path.to_owned());
         } else if depth > 0 {
-            let is_beside = |entry: &Path| ["masks", "depths", "depth"].iter().any(|name| entry.ends_with(name));
+            let is_beside = |entry: &Path| {
+                ["masks", "depths", "depth", "normals", "normal"]
+                    .iter()
+                    .any(|name| entry.ends_with(name))
+            };
             entries.retain(|entry| entry.is_dir() && !is_beside(entry));
             // A folder of datasets is no capture.
             if !entries.iter().any(|entry| DatasetFormat::recognise(entry).is_some()) {

@@ -55,10 +55,14 @@ pub(super) fn end_models(out: &Path, written: &Path) -> Result<(), RunError> {
     fs::rename(written, &sparse).map_err(RunError::io("rename", written))
 }
 
-/// Brings a photograph, its mask and its map of depths into the folders `images`, which exists, `masks` and `depths` of the dataset.
+/// Brings a photograph, its mask and its maps of depth and normals into the folders `images`, which exists, `masks`, `depths` and `normals` of the dataset.
 pub(super) fn link_photo(out: &Path, photo: &PhotoEntry) -> Result<(), RunError> {
     link(&photo.path, &out.join("images").join(&photo.name))?;
-    for (file, folder) in [(&photo.mask, "masks"), (&photo.depth, "depths")] {
+    for (file, folder) in [
+        (&photo.mask, "masks"),
+        (&photo.depth, "depths"),
+        (&photo.normals, "normals"),
+    ] {
         let Some(file) = file else { continue };
         let folder = out.join(folder);
         fs::create_dir_all(&folder).map_err(RunError::io("create", &folder))?;

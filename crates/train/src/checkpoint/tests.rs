@@ -26,6 +26,7 @@ fn dataset() -> Arc<Dataset> {
         time: None,
         points_seen: Vec::new(),
         depth_map: None,
+        normal_map: None,
     });
     Arc::new(Dataset {
         views: views.into(),

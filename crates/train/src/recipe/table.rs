@@ -466,6 +466,16 @@ table! {
         curve: Some("loss.depth map"),
         source: "Hierarchical 3D Gaussians (Kerbl et al. 2024) with inverse depths; here depths, whatever the map has",
     }
+    /// Weight of the mean 1 - cosine between the normals of depth and those of the map given beside the photograph; for splats.
+    NormalMapWeight {
+        name: "normal_map_weight",
+        unit: "",
+        default: 0.0,
+        bounds: NOT_NEGATIVE,
+        group: Group::Loss,
+        curve: Some("loss.normal map"),
+        source: "DN-Splatter (Turkulainen et al. 2024) with the normals of splats; here those of depth",
+    }
 }
 
 #[cfg(test)]

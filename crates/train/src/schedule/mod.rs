@@ -111,9 +111,14 @@ impl StepPlan {
 
     /// Whether a depth loss is active, which requires depth to be rendered.
     pub fn compares_depth(&self) -> bool {
-        [Param::DepthWeight, Param::DepthMapWeight, Param::SmoothWeight]
-            .into_iter()
-            .any(|weight| self.value(weight) > 0.0)
+        [
+            Param::DepthWeight,
+            Param::DepthMapWeight,
+            Param::NormalMapWeight,
+            Param::SmoothWeight,
+        ]
+        .into_iter()
+        .any(|weight| self.value(weight) > 0.0)
     }
 
     /// Weights of the regularisers.

@@ -217,6 +217,7 @@ mod tests {
             time: None,
             points_seen: vec![],
             depth_map: None,
+            normal_map: None,
         };
         let dataset = Dataset {
             views: [-1.0, 0.0, 1.0].map(view).into(),

@@ -216,6 +216,7 @@ pub(super) fn read(root: &Path, downscale: f32) -> Result<Declared, FormatError>
             points_seen,
             split: None,
             depth: None,
+            normals: None,
         });
     }
     let mut warnings: Vec<String> = folder.warning.into_iter().chain(several).collect();

@@ -1,38 +1,54 @@
-//! Maps of depth that were given beside photographs: grey images of 8 or 16 bits, or `.npy` arrays.
+//! Maps of depth and of normals that were given beside photographs: images of 8 or 16 bits, depths also as `.npy` arrays.
 
 use crate::FormatError;
 use crate::dataset::parse_table;
 use crate::error::read_and_parse;
-use crate::image_file::{decode_values, read_header};
+use crate::image_file::{decode_colors, decode_values, read_header};
 use crate::undistort::Undistortion;
 use image::metadata::Orientation;
-use irradia_scene::{DepthGrid, DepthSource, LoadError};
+use irradia_scene::{Grid, GridSource, LoadError};
 use std::path::PathBuf;
 
-/// Cells of a grid along its longer side: what a network or a phone's sensor resolves, at little memory (48 KB a photograph).
+/// Cells of a grid along its longer side: what a network or a phone's sensor resolves, at little memory (48 KB of depths a photograph).
 const CELLS: u32 = 128;
 
 /// A map on disk with the operations to apply when it is loaded.
 #[derive(Clone, Debug)]
-pub(crate) struct DepthFile {
+pub(crate) struct MapFile {
     pub path: PathBuf,
     /// That of the photograph.
     pub orientation: Orientation,
     /// Size of the upright photograph.
     pub upright: (u32, u32),
-    /// That of the photograph, with its axis unturned: depths along +Z stay what they are.
+    /// That of the photograph, with its axis unturned: depths along +Z and normals stay what they are.
     pub undistortion: Option<Undistortion>,
 }
 
-impl DepthSource for DepthFile {
-    fn load(&self) -> Result<DepthGrid, LoadError> {
-        self.read().map_err(|error| LoadError(error.to_string()))
+/// The pixels of a map: width, height and `[H, W]`.
+type Values<T> = (u32, u32, Vec<T>);
+
+impl GridSource<f32> for MapFile {
+    fn load(&self) -> Result<Grid<f32>, LoadError> {
+        let values = self.depths().map_err(|error| LoadError(error.to_string()))?;
+        let mut grid = self.sampled(values, 0.0);
+        grid.values
+            .iter_mut()
+            .filter(|value| !value.is_finite())
+            .for_each(|value| *value = 0.0);
+        Ok(grid)
     }
 }
 
-impl DepthFile {
-    fn read(&self) -> Result<DepthGrid, FormatError> {
-        let (width, height, values) = self.values()?;
+impl GridSource<[f32; 3]> for MapFile {
+    fn load(&self) -> Result<Grid<[f32; 3]>, LoadError> {
+        let values = self.normals().map_err(|error| LoadError(error.to_string()))?;
+        Ok(self.sampled(values, [0.0; 3]))
+    }
+}
+
+impl MapFile {
+    /// The grid over the photograph as it is trained on; `unknown` where the map has nothing.
+    fn sampled<T: Copy>(&self, (width, height, values): Values<T>, unknown: T) -> Grid<T> {
         let shown = self.undistortion.map_or(self.upright, |plan| {
             let pinhole = plan.pinhole();
             (pinhole.width, pinhole.height)
@@ -46,21 +62,22 @@ impl DepthFile {
                 None => [x, y],
                 Some(plan) => plan.place_in_photograph([x, y])?,
             };
-            // The nearest value: a mean over an edge is the depth of nothing.
+            // The nearest value: a mean over an edge is that of nothing.
             let index = |at: f64, side: u32| ((at * f64::from(side)) as usize).min(side as usize - 1);
-            let value = values[index(y, height) * width as usize + index(x, width)];
-            value.is_finite().then_some(value)
+            Some(values[index(y, height) * width as usize + index(x, width)])
         };
         let cells = (0..rows).flat_map(|row| (0..columns).map(move |column| (row, column)));
-        Ok(DepthGrid {
+        Grid {
             columns,
             rows,
-            values: cells.map(|(row, column)| value(row, column).unwrap_or(0.0)).collect(),
-        })
+            values: cells
+                .map(|(row, column)| value(row, column).unwrap_or(unknown))
+                .collect(),
+        }
     }
 
-    /// Width, height and `[H, W]`, upright.
-    fn values(&self) -> Result<(u32, u32, Vec<f32>), FormatError> {
+    /// Upright.
+    fn depths(&self) -> Result<Values<f32>, FormatError> {
         if self.path.extension().is_some_and(|extension| extension == "npy") {
             let table = read_and_parse(&self.path, parse_table)?;
             if table.rows == 0 || table.columns == 0 {
@@ -70,14 +87,28 @@ impl DepthFile {
             return Ok((table.columns as u32, table.rows as u32, values));
         }
         // Like a mask: made from the pixels as some tool displays them, mostly without EXIF data.
-        let header = read_header(&self.path)?;
-        let matches_upright = (header.width > header.height) == (self.upright.0 > self.upright.1);
-        let orientation = if matches_upright {
+        let orientation = if self.is_upright()? {
             Orientation::NoTransforms
         } else {
             self.orientation
         };
         decode_values(&self.path, orientation)
+    }
+
+    /// Only upright: turned pixels would have turned axes.
+    fn normals(&self) -> Result<Values<[f32; 3]>, FormatError> {
+        if !self.is_upright()? {
+            let message = "is not upright, as its photograph is; make it again from the upright photograph";
+            return Err(FormatError::malformed(&self.path, message));
+        }
+        let (width, height, colors) = decode_colors(&self.path)?;
+        let normals = colors.into_iter().map(|color| color.map(|value| 2.0 * value - 1.0));
+        Ok((width, height, normals.collect()))
+    }
+
+    fn is_upright(&self) -> Result<bool, FormatError> {
+        let header = read_header(&self.path)?;
+        Ok((header.width > header.height) == (self.upright.0 > self.upright.1))
     }
 }
 
@@ -87,13 +118,36 @@ mod tests {
     use crate::write_png_16;
     use irradia_scene::{Intrinsics, Lens};
 
-    fn file(path: PathBuf) -> DepthFile {
-        DepthFile {
+    fn file(path: PathBuf) -> MapFile {
+        MapFile {
             path,
             orientation: Orientation::NoTransforms,
             upright: (40, 20),
             undistortion: None,
         }
+    }
+
+    fn depths(file: &MapFile) -> Result<Grid<f32>, LoadError> {
+        file.load()
+    }
+
+    #[test]
+    fn normals_are_upright_colours() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.png");
+        image::RgbImage::from_pixel(4, 2, image::Rgb([255, 0, 51]))
+            .save(&path)
+            .unwrap();
+        let grid: Grid<[f32; 3]> = file(path.clone()).load().unwrap();
+        assert_eq!((grid.columns, grid.rows), (40, 20));
+        assert!(
+            grid.values
+                .iter()
+                .all(|n| n[0] == 1.0 && n[1] == -1.0 && (n[2] + 0.6).abs() < 1e-6)
+        );
+        image::RgbImage::new(2, 4).save(&path).unwrap();
+        let turned: Result<Grid<[f32; 3]>, _> = file(path).load();
+        assert!(turned.unwrap_err().0.contains("not upright"));
     }
 
     #[test]
@@ -102,7 +156,7 @@ mod tests {
         let path = folder.path().join("a.png");
         let values: Vec<u16> = (0..40 * 20).map(|i| 60 * i + 7).collect();
         write_png_16(&path, 40, 20, &values).unwrap();
-        let grid = file(path.clone()).load().unwrap();
+        let grid = depths(&file(path.clone())).unwrap();
         assert_eq!((grid.columns, grid.rows), (40, 20));
         assert!(
             grid.values
@@ -115,12 +169,12 @@ mod tests {
             .unwrap()
             .save(&path)
             .unwrap();
-        let grid = file(path.clone()).load().unwrap();
+        let grid = depths(&file(path.clone())).unwrap();
         assert_eq!((grid.values[0], grid.values[39], grid.values[799]), (1.0, 4.0, 8.0));
         image::RgbImage::from_fn(4, 2, |x, _| image::Rgb([3 * x as u8; 3]))
             .save(&path)
             .unwrap();
-        assert_eq!(file(path.clone()).load().unwrap().values[39], 9.0);
+        assert_eq!(depths(&file(path.clone())).unwrap().values[39], 9.0);
 
         let array = folder.path().join("a.npy");
         let header = b"{'descr': '<f4', 'fortran_order': False, 'shape': (1, 2), }";
@@ -129,7 +183,7 @@ mod tests {
         bytes.extend(header);
         bytes.extend([1.5f32, f32::NAN].into_iter().flat_map(f32::to_le_bytes));
         std::fs::write(&array, bytes).unwrap();
-        let grid = file(array).load().unwrap();
+        let grid = depths(&file(array)).unwrap();
         assert_eq!((grid.values[0], grid.values[39]), (1.5, 0.0), "not a number is unknown");
     }
 
@@ -140,7 +194,7 @@ mod tests {
         image::RgbImage::from_fn(4, 2, |x, _| image::Rgb([x as u8, 0, 0]))
             .save(&path)
             .unwrap();
-        let message = file(path).load().unwrap_err().0;
+        let message = depths(&file(path)).unwrap_err().0;
         assert!(
             message.contains("a.png") && message.contains("not a map of values"),
             "{message}"
@@ -161,12 +215,12 @@ mod tests {
         let column = |i: u16| 100 + i % 200;
         write_png_16(&path, 200, 100, &(0..200 * 100).map(column).collect::<Vec<_>>()).unwrap();
         let plan = Undistortion::plan(&bent).unwrap();
-        let grid = DepthFile {
+        let grid = MapFile {
             upright: (200, 100),
             undistortion: Some(plan),
             ..file(path)
         };
-        let grid = grid.load().unwrap();
+        let grid = depths(&grid).unwrap();
         for column in 0..grid.columns {
             let x = (f64::from(column) + 0.5) / f64::from(grid.columns);
             let row = grid.rows / 2;

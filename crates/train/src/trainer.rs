@@ -737,7 +737,7 @@ impl Trainer {
     /// The per-image parameters to fit on held-out views before comparison.
     pub fn half_fit(&self) -> HalfFit {
         HalfFit {
-            exposure: self.sockets.exposure.is_some(),
+            exposure: self.sockets.exposure.is_some() || self.sockets.bilateral.is_some(),
             pose: self.sockets.poses.is_some(),
         }
     }

@@ -456,6 +456,26 @@ table! {
         curve: Some("loss.mask"),
         source: "Irradia",
     }
+    /// Learning rate of the photographs' grids of colour maps, if the recipe has `bilateral_grid`.
+    RateBilateral {
+        name: "rate_bilateral",
+        unit: "",
+        default: 0.0,
+        bounds: NOT_NEGATIVE,
+        group: Group::Socket,
+        curve: Some("rate.bilateral grid"),
+        source: "Irradia: 0.01 falling to 0.0005 if a recipe with `bilateral_grid` does not set it; gsplat uses 2e-3 to 2e-5 over 30,000 steps",
+    }
+    /// Weight of the total variation of a photograph's grid of colour maps: for each axis the mean squared difference of adjacent cells.
+    BilateralTv {
+        name: "bilateral_tv",
+        unit: "",
+        default: 0.0,
+        bounds: NOT_NEGATIVE,
+        group: Group::Socket,
+        curve: Some("loss.bilateral variation"),
+        source: "gsplat: 10, which a recipe with `bilateral_grid` has if it does not set it",
+    }
 }
 
 #[cfg(test)]

@@ -358,7 +358,9 @@ impl Trainer {
         let entered = self.tick(metrics) && !self.finished();
         let total = self.recipe.total_steps() as f64;
         let at = exposure_probe::AT * total;
-        let probes = self.recipe.exposure == Choice::Auto && self.field.is_none();
+        // A grid contains an exposure: there is nothing to decide.
+        let undecided = self.recipe.exposure == Choice::Auto && self.sockets.bilateral.is_none();
+        let probes = undecided && self.field.is_none();
         if probes && before < at && self.clock.time >= at {
             events.extend(self.decide_exposure()?);
         }

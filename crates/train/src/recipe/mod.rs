@@ -480,7 +480,7 @@ impl Recipe {
         default(exposure, Param::RateExposure, 0.03, 0.001);
         default(exposure, Param::ExposureReg, 0.01, 0.001);
         default(grid, Param::RateBilateral, 0.01, 0.0005);
-        default(grid, Param::BilateralTv, 10.0, 10.0);
+        default(grid, Param::BilateralTv, 30.0, 30.0);
         // Half a degree (9e-3) within as many steps.
         default(poses, Param::RatePoses, 1e-3, 1e-5);
     }

@@ -474,7 +474,7 @@ table! {
         bounds: NOT_NEGATIVE,
         group: Group::Socket,
         curve: Some("loss.bilateral variation"),
-        source: "gsplat: 10, which a recipe with `bilateral_grid` has if it does not set it",
+        source: "Irradia: 30 if a recipe with `bilateral_grid` does not set it; gsplat: 10, for a larger grid",
     }
 }
 

@@ -35,7 +35,9 @@ const BETAS: [f32; 2] = [0.9, 0.999];
 const EPSILON: f32 = 1e-15;
 
 /// A cell as it is used: what red, green, blue and 1 are multiplied by, each for three channels and a lane of padding.
-type Map = [[f32; 4]; 4];
+type Map = [f32; LANES];
+const LANES: usize = 16;
+const NOTHING: Map = [0.0; LANES];
 
 /// A grid of colour maps per view, initially the identity. As with exposures, the mean over the training views of each cell stays
 /// the identity: a change common to all photographs belongs to the scene, which would otherwise drift to a look of no photograph. What
@@ -151,8 +153,8 @@ impl BilateralGrid {
 
 /// Where a [`Map`] has parameter `i` of a cell.
 #[inline(always)]
-fn place(i: usize) -> (usize, usize) {
-    if i < 9 { (i % 3, i / 3) } else { (3, i - 9) }
+fn lane(i: usize) -> usize {
+    if i < 9 { 4 * (i % 3) + i / 3 } else { 3 + i }
 }
 
 /// The cell before position `i` of `count` along an axis of `size` cells, and the weight of the cell after it. The first and the last
@@ -171,24 +173,21 @@ fn maps_of_row(grid: &[f32], (before, w): (usize, f32), to: &mut Vec<Map>) {
     let (upper, lower) = (&rows[before * ROW..][..ROW], &rows[(before + 1) * ROW..][..ROW]);
     to.clear();
     to.extend(upper.iter().zip(lower).map(|(upper, lower)| {
-        let mut map = Map::default();
+        let mut map = NOTHING;
         for (i, (upper, lower)) in upper.iter().zip(lower).enumerate() {
-            let (of, channel) = place(i);
-            map[of][channel] = upper + w * (lower - upper);
+            map[lane(i)] = upper + w * (lower - upper);
         }
         map
     }));
 }
 
-/// The map of a pixel: between `dark` and `bright`, those of the brightnesses before and after its own.
+/// The four cells of a row around a pixel: of the columns before and after it, the darker and the brighter one.
 struct Slice {
-    dark: Map,
-    bright: Map,
-    /// Index of the cell of `dark` in a row, in the column before.
+    /// Index of the darker cell in the column before; the brighter one is next to it.
     at: usize,
     /// Weight of the column after.
     w_column: f32,
-    /// Weight of `bright`.
+    /// Weight of the brighter cells.
     w_bright: f32,
     /// The gradient of `w_bright` for the brightness.
     slope: f32,
@@ -196,54 +195,56 @@ struct Slice {
 
 impl Slice {
     #[inline(always)]
-    fn new(maps: &[Map], (column, w_column): (usize, f32), x: [f32; 3]) -> Self {
+    fn new((column, w_column): (usize, f32), x: [f32; 3]) -> Self {
         let luma = LUMA[0] * x[0] + LUMA[1] * x[1] + LUMA[2] * x[2];
         let most = (SIZE[2] - 1) as f32;
         let t = luma.clamp(0.0, 1.0) * most;
         let before = (t as usize).min(SIZE[2] - 2);
-        let at = column * SIZE[2] + before;
-        let [dark, bright] = [at, at + 1].map(|at| mix(&maps[at], &maps[at + SIZE[2]], w_column));
         Self {
-            dark,
-            bright,
-            at,
+            at: column * SIZE[2] + before,
             w_column,
             w_bright: t - before as f32,
             slope: if (0.0..=1.0).contains(&luma) { most } else { 0.0 },
         }
     }
 
+    /// The maps between the darker cells, and between the brighter ones.
     #[inline(always)]
-    fn apply(&self, x: [f32; 3]) -> [f32; 4] {
-        apply(&mix(&self.dark, &self.bright, self.w_bright), x)
+    fn maps(&self, maps: &[Map]) -> [Map; 2] {
+        let (before, after) = (&maps[self.at..][..2], &maps[self.at + SIZE[2]..][..2]);
+        [0, 1].map(|i| mix(&before[i], &after[i], self.w_column))
+    }
+
+    /// `x` by the map of the pixel.
+    #[inline(always)]
+    fn apply(&self, maps: &[Map], x: [f32; 3]) -> [f32; 4] {
+        let [dark, bright] = self.maps(maps);
+        apply(&mix(&dark, &bright, self.w_bright), x)
     }
 
     /// The VJP of [`Self::apply`] and of saturation at 1: `v` of their result becomes that of `x`, and of the maps of the row, where it
     /// is added.
     #[inline(always)]
-    fn vjp(&self, x: [f32; 3], v: [f32; 3], v_maps: &mut [Map]) -> [f32; 3] {
-        let map = mix(&self.dark, &self.bright, self.w_bright);
-        let y = apply(&map, x);
-        let mut v = [v[0], v[1], v[2], 0.0];
-        for c in 0..3 {
-            if y[c] > 1.0 {
-                v[c] = v[c].max(0.0);
-            }
-        }
-        let (dark, bright) = (apply(&self.dark, x), apply(&self.bright, x));
-        let v_luma = self.slope * (0..3).map(|c| v[c] * (bright[c] - dark[c])).sum::<f32>();
+    fn vjp(&self, maps: &[Map], x: [f32; 3], v: [f32; 3], v_maps: &mut [Map]) -> [f32; 3] {
+        let [dark, bright] = self.maps(maps);
+        let map = mix(&dark, &bright, self.w_bright);
+        let (y, from_dark, from_bright) = (apply(&map, x), apply(&dark, x), apply(&bright, x));
+        let passes = |c: usize| if y[c] > 1.0 { v[c].max(0.0) } else { v[c] };
+        let v = [passes(0), passes(1), passes(2), 0.0];
+        let v_luma = self.slope * (0..3).map(|c| v[c] * (from_bright[c] - from_dark[c])).sum::<f32>();
         let v_x = std::array::from_fn(|k| {
-            let row = &map[k];
+            let row = &map[4 * k..][..3];
             row[0] * v[0] + row[1] * v[1] + row[2] * v[2] + LUMA[k] * v_luma
         });
-        let terms = [x[0], x[1], x[2], 1.0];
+        let (terms, mut v_map) = ([x[0], x[1], x[2], 1.0], NOTHING);
+        for i in 0..LANES {
+            v_map[i] = terms[i / 4] * v[i % 4];
+        }
         for (after, w) in [(0, 1.0 - self.w_column), (SIZE[2], self.w_column)] {
             for (brighter, w) in [(0, w * (1.0 - self.w_bright)), (1, w * self.w_bright)] {
-                let v_map = &mut v_maps[self.at + after + brighter];
-                for (v_map, term) in v_map.iter_mut().zip(terms) {
-                    for c in 0..4 {
-                        v_map[c] += w * term * v[c];
-                    }
+                let sum = &mut v_maps[self.at + after + brighter];
+                for i in 0..LANES {
+                    sum[i] += w * v_map[i];
                 }
             }
         }
@@ -253,12 +254,20 @@ impl Slice {
 
 #[inline(always)]
 fn mix(a: &Map, b: &Map, w: f32) -> Map {
-    std::array::from_fn(|k| std::array::from_fn(|c| a[k][c] + w * (b[k][c] - a[k][c])))
+    let mut mixed = NOTHING;
+    for i in 0..LANES {
+        mixed[i] = a[i] + w * (b[i] - a[i]);
+    }
+    mixed
 }
 
 #[inline(always)]
 fn apply(map: &Map, x: [f32; 3]) -> [f32; 4] {
-    std::array::from_fn(|c| map[0][c] * x[0] + map[1][c] * x[1] + map[2][c] * x[2] + map[3][c])
+    let (terms, mut products) = ([x[0], x[1], x[2], 1.0], NOTHING);
+    for i in 0..LANES {
+        products[i] = map[i] * terms[i / 4];
+    }
+    std::array::from_fn(|c| products[c] + products[4 + c] + products[8 + c] + products[12 + c])
 }
 
 /// A frame and the grid of its photograph.
@@ -316,7 +325,7 @@ impl Kernel for DevelopRows<'_> {
             for (column, place) in columns.iter().enumerate() {
                 let at = i * columns.len() + column;
                 let x = self.frame.color(row * columns.len() + column);
-                let y = Slice::new(&maps, *place, x).apply(x);
+                let y = Slice::new(*place, x).apply(&maps, x);
                 (red[at], green[at], blue[at]) = (y[0].min(1.0), y[1].min(1.0), y[2].min(1.0));
             }
         }
@@ -342,22 +351,22 @@ impl Kernel for VjpRows<'_> {
         let rows = self.first_row..self.first_row + red.len() / columns.len();
         let first = cell(rows.start, *height, SIZE[0]).0;
         let last = cell(rows.end - 1, *height, SIZE[0]).0 + 1;
-        let mut sum = vec![Map::default(); (last + 1 - first) * ROW];
-        let (mut maps, mut v_maps) = (Vec::new(), vec![Map::default(); ROW]);
+        let mut sum = vec![NOTHING; (last + 1 - first) * ROW];
+        let (mut maps, mut v_maps) = (Vec::new(), vec![NOTHING; ROW]);
         for (i, row) in rows.enumerate() {
             let (before, w) = cell(row, *height, SIZE[0]);
             maps_of_row(self.frame.grid, (before, w), &mut maps);
-            v_maps.fill(Map::default());
+            v_maps.fill(NOTHING);
             for (column, place) in columns.iter().enumerate() {
                 let at = i * columns.len() + column;
                 let x = self.frame.color(row * columns.len() + column);
                 let v_y = [red[at], green[at], blue[at]];
-                [red[at], green[at], blue[at]] = Slice::new(&maps, *place, x).vjp(x, v_y, &mut v_maps);
+                [red[at], green[at], blue[at]] = Slice::new(*place, x).vjp(&maps, x, v_y, &mut v_maps);
             }
             for (below, w) in [(0, 1.0 - w), (1, w)] {
                 let sum = &mut sum[(before - first + below) * ROW..][..ROW];
-                let values = sum.as_flattened_mut().as_flattened_mut().iter_mut();
-                for (sum, v) in values.zip(v_maps.as_flattened().as_flattened()) {
+                let values = sum.as_flattened_mut().iter_mut();
+                for (sum, v) in values.zip(v_maps.as_flattened()) {
                     *sum += w * v;
                 }
             }
@@ -385,8 +394,7 @@ fn vjp(grid: &[f32], width: usize, color: &[f32], v: &mut [f32]) -> Vec<f32> {
         let cells = total.as_chunks_mut::<N>().0[first * ROW..].iter_mut();
         for (total, map) in cells.zip(sum) {
             for (i, total) in total.iter_mut().enumerate() {
-                let (of, channel) = place(i);
-                *total += map[of][channel];
+                *total += map[lane(i)];
             }
         }
     }

@@ -2,6 +2,7 @@
 //!
 //! ```text
 //! cargo run --release --example injure -- DATA OUT --gains 0.6,1.6 --balance 0.15      # exposure and white balance per photograph
+//! cargo run --release --example injure -- DATA OUT --local-gains 0.7,1.4               # a gradient and a vignette per photograph
 //! cargo run --release --example injure -- DATA OUT --pose-noise 0.5,0.005              # degrees, fraction of the scene's extent
 //! cargo run --release --example injure -- DATA OUT --people 0.33                       # share of the training photographs
 //! ```
@@ -34,6 +35,10 @@ struct Args {
     /// A factor per channel and photograph, uniform between 1 - this and 1 + this
     #[arg(long, default_value_t = 0.0)]
     balance: f32,
+    /// Factors over each photograph on its sRGB colours: a gradient in a random direction, from the one to the other at its corners or
+    /// less, darkened by a vignette of random strength
+    #[arg(long, value_name = "FROM,TO", value_parser = pair)]
+    local_gains: Option<[f32; 2]>,
     /// Standard deviations of the poses' rotation in degrees and of their position in extents of the scene
     #[arg(long, value_name = "DEG,FRACTION", value_parser = pair)]
     pose_noise: Option<[f32; 2]>,
@@ -89,6 +94,36 @@ fn main() -> Result<()> {
     Ok(())
 }
 
+/// A smooth gain over a photograph: a gradient of its logarithm and a vignette.
+struct LocalGain {
+    /// ln gain at the centre, and its change from there to a corner in each direction.
+    log: f32,
+    slope: [f32; 2],
+    /// ln gain at the corners relative to the centre, not above 0; it grows with the squared distance.
+    vignette: f32,
+}
+
+impl LocalGain {
+    /// A gradient between the gains `from` and `to` at most, of any direction, and a vignette down to `from` at most.
+    fn random([from, to]: [f32; 2], rng: &mut Rng) -> Self {
+        let (from, to) = (from.ln(), to.ln());
+        let ends = [rng.range(from, to), rng.range(from, to)];
+        let angle = rng.range(0.0, std::f32::consts::PI);
+        // At the corner that the gradient reaches last, |x| |cos| + |y| |sin| is up to the root of 2.
+        let steep = 0.5 * (ends[1] - ends[0]) / (angle.cos().abs() + angle.sin().abs());
+        Self {
+            log: 0.5 * (ends[0] + ends[1]),
+            slope: [steep * angle.cos(), steep * angle.sin()],
+            vignette: rng.range(from.min(0.0), 0.0),
+        }
+    }
+
+    /// At `place`, from -1 to 1 across and down.
+    fn at(&self, [x, y]: [f32; 2]) -> f32 {
+        (self.log + self.slope[0] * x + self.slope[1] * y + self.vignette * 0.5 * (x * x + y * y)).exp()
+    }
+}
+
 /// Covers a box of 0.55 x 0.2 times the height at a random place: dark legs, a chequered shirt, a head, the same in every photograph.
 fn stand_in_the_way(photo: &mut Photo, rng: &mut Rng) {
     let (columns, rows) = (photo.width as usize, photo.height as usize);
@@ -121,10 +156,17 @@ fn write_view(args: &Args, dataset: &Dataset, extent: f32, view: usize) -> Resul
     let factors = [0; 3].map(|_| gain * rng.range(1.0 - args.balance, 1.0 + args.balance));
     let source = &dataset.views[view];
     let mut photo = source.photo.load()?;
-    let channels = photo.channels as usize;
-    for pixel in photo.data.chunks_exact_mut(channels) {
+    let local = args.local_gains.map(|range| {
+        // A sequence of its own: other faults stay the same.
+        LocalGain::random(range, &mut Rng::new(args.seed, view as u64 | 1 << 32))
+    });
+    let (channels, columns, rows) = (photo.channels as usize, photo.width, photo.height);
+    for (i, pixel) in (0u32..).zip(photo.data.chunks_exact_mut(channels)) {
+        let place =
+            [(i % columns, columns), (i / columns, rows)].map(|(at, of)| 2.0 * (at as f32 + 0.5) / of as f32 - 1.0);
+        let local = local.as_ref().map_or(1.0, |local| local.at(place));
         for (value, factor) in pixel.iter_mut().zip(factors) {
-            *value = (f32::from(*value) * factor).round().min(255.0) as u8;
+            *value = (f32::from(*value) * factor * local).round().min(255.0) as u8;
         }
     }
     if args.people > 0.0 && dataset.train.contains(&view) && rng.uniform() < args.people {

@@ -366,7 +366,9 @@ impl Trainer {
         let entered = self.tick(metrics) && !self.finished();
         let total = self.recipe.total_steps() as f64;
         let at = exposure_probe::AT * total;
-        let probes = self.recipe.exposure == Choice::Auto && self.field.is_none();
+        // A grid contains an exposure: there is nothing to decide.
+        let undecided = self.recipe.exposure == Choice::Auto && self.sockets.bilateral.is_none();
+        let probes = undecided && self.field.is_none();
         if probes && before < at && self.clock.time >= at {
             events.extend(self.decide_exposure()?);
         }
@@ -725,7 +727,7 @@ impl Trainer {
     /// The per-image parameters to fit on held-out views before comparison.
     pub fn half_fit(&self) -> HalfFit {
         HalfFit {
-            exposure: self.sockets.exposure.is_some(),
+            exposure: self.sockets.exposure.is_some() || self.sockets.bilateral.is_some(),
             pose: self.sockets.poses.is_some(),
         }
     }

@@ -139,6 +139,7 @@ fn a_streamed_checkpoint_has_the_bytes_of_the_format_and_a_copy_is_that_of_its_m
 fn socket_occupants_resume_exactly() {
     let overrides = [
         "exposure=true",
+        "bilateral_grid=true",
         "refine_poses=true",
         "params.rate_poses=0.001",
         "params.rate_sky=0.05",
@@ -153,7 +154,10 @@ fn socket_occupants_resume_exactly() {
     let bytes = to_bytes(&trainer);
     let mut again = read(&bytes).unwrap();
     let names: Vec<&str> = again.sockets.occupants().iter().map(|o| o.name()).collect();
-    assert_eq!(names, ["poses", "residual", "appearance", "exposure", "sky"]);
+    assert_eq!(
+        names,
+        ["poses", "residual", "appearance", "exposure", "bilateral", "sky"]
+    );
     let learnt = [&mut trainer, &mut again].map(|trainer| {
         trainer.step(&mut Vec::new()).unwrap();
         let occupants = trainer.sockets.occupants().into_iter();

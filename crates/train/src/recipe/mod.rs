@@ -119,6 +119,9 @@ documented! {
         /// of the run, photographs differ in exposure beyond what adjacent cameras predict.
         #[serde(default, skip_serializing_if = "Choice::is_no")]
         pub exposure: Choice,
+        /// Train a separate grid of affine colour maps for each photograph, by place and brightness: tone mapping and vignettes.
+        #[serde(default, skip_serializing_if = "is_default")]
+        pub bilateral_grid: bool,
         /// Leave out photographs whose error, after a fifth of the run, is far beyond the others': wrong poses, or another scene.
         #[serde(default, skip_serializing_if = "is_default")]
         pub drop_misfits: bool,
@@ -472,10 +475,12 @@ impl Recipe {
                 self.params.entry(param).or_insert(ramp);
             }
         };
-        let (exposure, poses) = (self.exposure != Choice::No, self.refine_poses);
+        let (exposure, grid, poses) = (self.exposure != Choice::No, self.bilateral_grid, self.refine_poses);
         // A photograph is used 30 to 100 times in a run, within which gains of 1.6 must be reached.
         default(exposure, Param::RateExposure, 0.03, 0.001);
         default(exposure, Param::ExposureReg, 0.01, 0.001);
+        default(grid, Param::RateBilateral, 0.01, 0.0005);
+        default(grid, Param::BilateralTv, 30.0, 30.0);
         // Half a degree (9e-3) within as many steps.
         default(poses, Param::RatePoses, 1e-3, 1e-5);
     }

@@ -476,6 +476,26 @@ table! {
         curve: Some("loss.normal map"),
         source: "DN-Splatter (Turkulainen et al. 2024) with the normals of splats; here those of depth",
     }
+    /// Learning rate of the photographs' grids of colour maps, if the recipe has `bilateral_grid`.
+    RateBilateral {
+        name: "rate_bilateral",
+        unit: "",
+        default: 0.0,
+        bounds: NOT_NEGATIVE,
+        group: Group::Socket,
+        curve: Some("rate.bilateral grid"),
+        source: "Irradia: 0.01 falling to 0.0005 if a recipe with `bilateral_grid` does not set it; gsplat uses 2e-3 to 2e-5 over 30,000 steps",
+    }
+    /// Weight of the total variation of a photograph's grid of colour maps: for each axis the mean squared difference of adjacent cells.
+    BilateralTv {
+        name: "bilateral_tv",
+        unit: "",
+        default: 0.0,
+        bounds: NOT_NEGATIVE,
+        group: Group::Socket,
+        curve: Some("loss.bilateral variation"),
+        source: "Irradia: 30 if a recipe with `bilateral_grid` does not set it; gsplat: 10, for a larger grid",
+    }
 }
 
 #[cfg(test)]

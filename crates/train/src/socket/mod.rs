@@ -4,13 +4,14 @@
 //! |---|---|---|
 //! | before projection | a [`Placement`]: the camera, and the splats if they move | gradients of the camera and of the moved splats |
 //! | at colour | a colour to add to each splat in view, by its [`irradia_splat::Surface`] | the gradients of these colours |
-//! | after blending | the frame as the photograph shows it: a sky behind it, then an exposure | the gradient of that frame, which it converts to that of the scene's frame |
+//! | after blending | the frame as the photograph shows it: a sky behind it, then an exposure, then a grid of exposures | the gradient of that frame, which it converts to that of the scene's frame |
 //!
 //! Each occupant has its forward pass, the vector-Jacobian product beside it, its own Adam, and named tensors. Code that saves
 //! runs (checkpoints, resume, files beside the scene) accesses occupants through [`Occupant`] alone, and rendering goes through
 //! [`Sockets`]: a new one is a file here, a field of [`Sockets`] and an arm in the method of its socket.
 
 mod appearance;
+mod bilateral;
 mod color_field;
 mod exposure;
 mod per_view;
@@ -19,6 +20,7 @@ mod residual;
 mod sky;
 
 pub use appearance::Appearance;
+pub use bilateral::BilateralGrid;
 pub use exposure::Exposure;
 pub(crate) use per_view::PerViewAdam;
 pub use poses::PoseRefinement;
@@ -37,12 +39,13 @@ use irradia_splat::{Engine, Placement, RenderOptions};
 use rayon::prelude::*;
 
 /// Names of the files that occupants may write beside a scene.
-pub const FILES: [&str; 5] = [
+pub const FILES: [&str; 6] = [
     "poses.safetensors",
     "residual.safetensors",
     "exposure.safetensors",
     "sky.safetensors",
     "appearance.safetensors",
+    "bilateral.safetensors",
 ];
 
 /// The planes of `frame` `[3, H, W]` in pieces of `length` pixels, for all threads.
@@ -83,12 +86,16 @@ pub struct Sockets {
     pub appearance: Option<Appearance>,
     /// After blending: each photograph's exposure.
     pub exposure: Option<Exposure>,
+    /// After blending: each photograph's local changes of colour.
+    pub bilateral: Option<BilateralGrid>,
     /// After blending: the sky behind the splats.
     pub sky: Option<Sky>,
     /// The frame over [`Sky`], `[3, H, W]`.
     over_sky: Vec<f32>,
     /// The frame after [`Exposure`], `[3, H, W]`.
     developed: Vec<f32>,
+    /// The frame after [`BilateralGrid`], `[3, H, W]`.
+    graded: Vec<f32>,
 }
 
 impl Sockets {
@@ -114,9 +121,13 @@ impl Sockets {
             poses: recipe.refine_poses.then(|| PoseRefinement::new(dataset)),
             residual,
             exposure: (recipe.exposure == Choice::Yes).then(|| Exposure::new(dataset.views.len(), &dataset.train)),
+            bilateral: recipe
+                .bilateral_grid
+                .then(|| BilateralGrid::new(dataset.views.len(), &dataset.train)),
             sky: recipe.uses(Param::RateSky).then(|| Sky::new(dataset)),
             over_sky: Vec::new(),
             developed: Vec::new(),
+            graded: Vec::new(),
         })
     }
 
@@ -125,9 +136,10 @@ impl Sockets {
         let poses = self.poses.as_ref().map(|o| o as &dyn Occupant);
         let residual = self.residual.as_ref().map(|o| &o.0 as &dyn Occupant);
         let exposure = self.exposure.as_ref().map(|o| o as &dyn Occupant);
+        let bilateral = self.bilateral.as_ref().map(|o| o as &dyn Occupant);
         let sky = self.sky.as_ref().map(|o| o as &dyn Occupant);
         let appearance = self.appearance.as_ref().map(|o| &o.0 as &dyn Occupant);
-        [poses, residual, appearance, exposure, sky]
+        [poses, residual, appearance, exposure, bilateral, sky]
             .into_iter()
             .flatten()
             .collect()
@@ -139,8 +151,9 @@ impl Sockets {
         let residual = self.residual.as_mut().map(|o| &mut o.0 as &mut dyn Occupant);
         let appearance = self.appearance.as_mut().map(|o| &mut o.0 as &mut dyn Occupant);
         let exposure = self.exposure.as_mut().map(|o| o as &mut dyn Occupant);
+        let bilateral = self.bilateral.as_mut().map(|o| o as &mut dyn Occupant);
         let sky = self.sky.as_mut().map(|o| o as &mut dyn Occupant);
-        [poses, residual, appearance, exposure, sky]
+        [poses, residual, appearance, exposure, bilateral, sky]
             .into_iter()
             .flatten()
             .collect()
@@ -158,7 +171,7 @@ impl Sockets {
 
     /// Whether there are any after blending.
     pub fn are_after_blending(&self) -> bool {
-        self.sky.is_some() || self.exposure.is_some()
+        self.sky.is_some() || self.exposure.is_some() || self.bilateral.is_some()
     }
 
     /// The files to write beside the scene: name and bytes.
@@ -217,15 +230,21 @@ impl Sockets {
         }
         if let Some(exposure) = &self.exposure {
             exposure.develop(view, color, &mut self.developed);
+            color = &self.developed;
+        }
+        if let Some(bilateral) = &self.bilateral {
+            let width = camera.intrinsics.width as usize;
+            bilateral.develop(view, width, color, &mut self.graded);
         }
     }
 
     /// The last frame's colour as the photograph shows it, `[3, H, W]`.
     pub fn frame_color<'a>(&'a self, engine: &'a Engine) -> &'a [f32] {
-        match (&self.exposure, &self.sky) {
-            (Some(_), _) => &self.developed,
-            (None, Some(_)) => &self.over_sky,
-            (None, None) => engine.frame().color,
+        match (&self.bilateral, &self.exposure, &self.sky) {
+            (Some(_), ..) => &self.graded,
+            (None, Some(_), _) => &self.developed,
+            (None, None, Some(_)) => &self.over_sky,
+            (None, None, None) => engine.frame().color,
         }
     }
 
@@ -245,6 +264,16 @@ impl Sockets {
         plan: &StepPlan,
     ) {
         let frame = engine.frame();
+        if let Some(bilateral) = &mut self.bilateral {
+            let (rate, weight) = (plan.value(Param::RateBilateral), plan.value(Param::BilateralTv));
+            let color = match (&self.exposure, &self.sky) {
+                (Some(_), _) => &self.developed,
+                (None, Some(_)) => &self.over_sky,
+                (None, None) => frame.color,
+            };
+            let width = camera.intrinsics.width as usize;
+            bilateral.step(view, width, color, objective.v_color_mut(), rate, weight);
+        }
         if let Some(exposure) = &mut self.exposure {
             let (rate, weight) = (plan.value(Param::RateExposure), plan.value(Param::ExposureReg));
             let color = if self.sky.is_some() {

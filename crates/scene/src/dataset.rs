@@ -152,7 +152,8 @@ pub struct View {
     /// Capture time, in the source's own unit (0 to 1 over the capture where transforms.json follows D-NeRF); `None` if the
     /// source has none.
     pub time: Option<f32>,
-    /// Indices into [`Dataset::points`] of the points visible in this view; empty if the source does not list them.
+    /// Indices into [`Dataset::points`] of the points visible in this view, as the source lists them or as they hide one another; empty if
+    /// neither is known.
     pub points_seen: Vec<u32>,
     /// Depths of all that the view shows, measured or estimated, if they were given.
     pub depth_map: Option<Arc<dyn GridSource<f32>>>,

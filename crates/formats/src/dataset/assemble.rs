@@ -3,6 +3,7 @@
 
 use super::declared::{Declared, DeclaredView};
 use super::split;
+use super::visible::find_points_seen;
 use super::world::world_from_dataset;
 use super::{DEFAULT_MAX_SIDE, DatasetOptions};
 use crate::FormatError;
@@ -145,6 +146,7 @@ pub(super) fn assemble(declared: Declared, options: &DatasetOptions) -> Result<D
         views.extend(finishing.views(view, &probed));
         views_of.push(first..views.len());
     }
+    find_points_seen(&mut views, points.as_ref());
     let views_of = |photographs: Vec<usize>| photographs.into_iter().flat_map(|i| views_of[i].clone()).collect();
     Ok(Dataset {
         views,

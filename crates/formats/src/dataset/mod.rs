@@ -24,6 +24,7 @@ mod split;
 mod tokens;
 mod tracks;
 pub(crate) mod transforms;
+mod visible;
 mod world;
 pub(crate) mod xml;
 

@@ -1,0 +1,152 @@
+//! Which points each view sees, for datasets that have points and do not say: a point that is hidden by others is not seen.
+//!
+//! Points are too sparse for a picture of what they hide. Each view has a coarse grid; a point counts as seen if it is hardly farther than the
+//! nearest point in its cell and in those around it. It suits points on surfaces, most of which are then seen by several views; where they are not, as
+//! with random points in a volume, nothing is known.
+
+use irradia_scene::{PointCloud, View};
+use rayon::prelude::*;
+
+/// Cells of the grid along the longer side of a view: at a thousand points in view, one in each.
+const CELLS: f32 = 40.0;
+/// Depth relative to the nearest point around it up to which a point is seen.
+const BEHIND: f32 = 1.1;
+/// Views that must see a point, and the share of the points that must be seen by so many.
+const WITNESSES: u32 = 3;
+const SEEN: f64 = 0.7;
+/// Points that are enough: of more, some are left out, evenly spaced in their order.
+const ENOUGH: usize = 50_000;
+
+/// Sets the points that `views` see, if no view has any.
+pub(super) fn find_points_seen(views: &mut [View], points: Option<&PointCloud>) {
+    let Some(points) = points.filter(|_| views.iter().all(|view| view.points_seen.is_empty())) else {
+        return;
+    };
+    let every = points.positions.len().div_ceil(ENOUGH).max(1);
+    let seen: Vec<Vec<u32>> = views.par_iter().map(|view| seen_by(view, points, every)).collect();
+    let mut witnesses = vec![0u32; points.positions.len()];
+    for point in seen.iter().flatten() {
+        witnesses[*point as usize] += 1;
+    }
+    let witnessed = witnesses.iter().filter(|count| **count >= WITNESSES).count();
+    if witnessed as f64 >= SEEN * witnesses.len().div_ceil(every) as f64 {
+        for (view, mut seen) in views.iter_mut().zip(seen) {
+            seen.retain(|point| witnesses[*point as usize] >= WITNESSES);
+            view.points_seen = seen;
+        }
+    }
+}
+
+/// The points in `view` that no other hides, of one in `every`.
+fn seen_by(view: &View, points: &PointCloud, every: usize) -> Vec<u32> {
+    let k = &view.camera.intrinsics;
+    let side = k.width.max(k.height) as f32 / CELLS;
+    let [columns, rows] = [k.width, k.height].map(|length| (length as f32 / side) as usize + 1);
+    let mut inside = Vec::new();
+    // With a rim, so that each cell has eight around it.
+    let stride = columns + 2;
+    let mut nearest = vec![f32::INFINITY; stride * (rows + 2)];
+    for (i, position) in points.positions.iter().enumerate().step_by(every) {
+        if let Some((pixel, depth)) = view.camera.sees(*position) {
+            let cell = ((pixel.y / side) as usize + 1) * stride + (pixel.x / side) as usize + 1;
+            nearest[cell] = nearest[cell].min(depth);
+            inside.push((i as u32, cell, depth));
+        }
+    }
+    let around = |cell: usize| {
+        let rows = [cell - stride, cell, cell + stride];
+        let values = rows.into_iter().flat_map(|middle| [middle - 1, middle, middle + 1]);
+        values.map(|cell| nearest[cell]).fold(f32::INFINITY, f32::min)
+    };
+    inside.retain(|(_, cell, depth)| *depth <= BEHIND * around(*cell));
+    inside.into_iter().map(|(point, ..)| point).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use glam::{Quat, Vec3};
+    use irradia_scene::{Camera, Intrinsics, Photo, Pose};
+    use std::sync::Arc;
+
+    /// Four cameras side by side that look along +Z.
+    fn views() -> Vec<View> {
+        let photo = Arc::new(Photo {
+            width: 1,
+            height: 1,
+            channels: 3,
+            data: vec![0; 3],
+            mask: None,
+        });
+        let view = |i: i32| View {
+            name: format!("{i}"),
+            camera: Camera::new(
+                Pose {
+                    rotation: Quat::IDENTITY,
+                    position: Vec3::new(0.2 * i as f32, 0.0, 0.0),
+                },
+                Intrinsics::from_fov_x(400, 300, 1.0),
+            ),
+            photo: photo.clone(),
+            depth_bounds: None,
+            time: None,
+            points_seen: Vec::new(),
+            depth_map: None,
+            normal_map: None,
+        };
+        (0..4).map(view).collect()
+    }
+
+    fn cloud(positions: Vec<Vec3>) -> PointCloud {
+        PointCloud {
+            colors: vec![[0; 3]; positions.len()],
+            positions,
+        }
+    }
+
+    /// Points of a wall at depth `z`, `side` to each side.
+    fn wall(z: f32, side: f32) -> impl Iterator<Item = Vec3> {
+        let at = move |i: i32| (i as f32 - 29.5) / 29.5 * side;
+        (0..3600).map(move |i| Vec3::new(at(i % 60), at(i / 60), z))
+    }
+
+    #[test]
+    fn what_stands_before_a_wall_hides_the_wall_behind_it() {
+        let points = cloud(wall(4.0, 0.8).chain(wall(8.0, 3.0)).collect());
+        let mut seen = views();
+        find_points_seen(&mut seen, Some(&points));
+        let front = 0..3600u32;
+        for view in &seen {
+            let before = view.points_seen.iter().filter(|point| front.contains(point)).count();
+            assert_eq!(before, 3600, "the wall before");
+            let behind = view.points_seen.iter().filter(|point| !front.contains(point));
+            // Seen beside the one before, and not through it but at its rim.
+            let through = |point: &&u32| {
+                let at = points.positions[**point as usize] - view.camera.pose.position;
+                let hidden = (points.positions[0].x - view.camera.pose.position.x)..(0.8 - view.camera.pose.position.x);
+                hidden.contains(&(at.x / 2.0)) && (at.y / 2.0).abs() < 0.8
+            };
+            assert!(behind.clone().count() > 1000 && behind.filter(through).count() == 0);
+        }
+        // What a dataset says is not replaced.
+        let mut told = views();
+        told[0].points_seen = vec![7];
+        find_points_seen(&mut told, Some(&points));
+        assert!(told[0].points_seen == [7] && told[1].points_seen.is_empty());
+    }
+
+    #[test]
+    fn random_points_in_a_volume_and_points_that_few_views_see_tell_nothing() {
+        let mut rng = irradia_scene::Rng::new(1, 1);
+        let volume = (0..20_000).map(|_| Vec3::new(rng.range(-3.0, 3.0), rng.range(-3.0, 3.0), rng.range(3.0, 9.0)));
+        let volume = cloud(volume.collect());
+        let mut seen = views();
+        find_points_seen(&mut seen, Some(&volume));
+        find_points_seen(&mut seen, None);
+        assert!(seen.iter().all(|view| view.points_seen.is_empty()));
+        let mut two = views();
+        two.truncate(2);
+        find_points_seen(&mut two, Some(&cloud(wall(4.0, 1.0).collect())));
+        assert!(two.iter().all(|view| view.points_seen.is_empty()));
+    }
+}

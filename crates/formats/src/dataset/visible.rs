@@ -11,9 +11,10 @@ use rayon::prelude::*;
 const CELLS: f32 = 40.0;
 /// Depth relative to the nearest point around it up to which a point is seen.
 const BEHIND: f32 = 1.1;
-/// Views that must see a point, and the share of the points that must be seen by so many.
+/// Views that must see a point, and the share of the points that must be seen by so many. Of scenes by `synth` with their true depths: room 0.92 (96 % of
+/// what is found is seen), shelf 0.82 (94 %), thin 0.73 (86 %: its depths cost 0.9 dB), outdoor 0.63; fox and lund_door 0.98.
 const WITNESSES: u32 = 3;
-const SEEN: f64 = 0.7;
+const SEEN: f64 = 0.8;
 /// Points that are enough: of more, some are left out, evenly spaced in their order.
 const ENOUGH: usize = 50_000;
 
@@ -112,7 +113,7 @@ mod tests {
 
     #[test]
     fn what_stands_before_a_wall_hides_the_wall_behind_it() {
-        let points = cloud(wall(4.0, 0.8).chain(wall(8.0, 3.0)).collect());
+        let points = cloud(wall(4.0, 0.5).chain(wall(8.0, 3.0)).collect());
         let mut seen = views();
         find_points_seen(&mut seen, Some(&points));
         let front = 0..3600u32;
@@ -123,8 +124,8 @@ mod tests {
             // Seen beside the one before, and not through it but at its rim.
             let through = |point: &&u32| {
                 let at = points.positions[**point as usize] - view.camera.pose.position;
-                let hidden = (points.positions[0].x - view.camera.pose.position.x)..(0.8 - view.camera.pose.position.x);
-                hidden.contains(&(at.x / 2.0)) && (at.y / 2.0).abs() < 0.8
+                let hidden = (points.positions[0].x - view.camera.pose.position.x)..(0.5 - view.camera.pose.position.x);
+                hidden.contains(&(at.x / 2.0)) && (at.y / 2.0).abs() < 0.5
             };
             assert!(behind.clone().count() > 1000 && behind.filter(through).count() == 0);
         }

@@ -117,6 +117,20 @@ pub struct Grid<T> {
     pub values: Vec<T>,
 }
 
+impl<T> Grid<T> {
+    /// Column and row of the pixel at the middle of each cell, in an image of `width` x `height` pixels, and its value.
+    pub fn pixels(&self, width: u32, height: u32) -> impl Iterator<Item = ([u32; 2], &T)> {
+        let middle = |cell: u32, cells: u32, side: u32| ((2 * cell + 1) * side / (2 * cells)).min(side - 1);
+        (0u32..).zip(&self.values).map(move |(i, value)| {
+            let (column, row) = (i % self.columns, i / self.columns);
+            (
+                [middle(column, self.columns, width), middle(row, self.rows, height)],
+                value,
+            )
+        })
+    }
+}
+
 /// Depth along +Z, or its inverse, up to scale and shift. Unknown where it is not positive and finite.
 pub type DepthGrid = Grid<f32>;
 

@@ -149,18 +149,14 @@ impl DepthMaps {
     pub fn samples(&self, view: usize, camera: &Camera) -> Option<(Vec<DepthSample>, DepthKind)> {
         let Known { grid, kind } = self.of.get(view)?.as_ref()?;
         let k = &camera.intrinsics;
-        let pixel = |at: u32, cells: u32, side: u32| ((2 * at + 1) * side / (2 * cells)).min(side - 1);
-        let sample = |(i, depth): (usize, &f32)| {
-            let (row, column) = (i as u32 / grid.columns, i as u32 % grid.columns);
-            let usable = *depth > 0.0 && depth.is_finite();
-            usable.then(|| DepthSample {
-                pixel: pixel(row, grid.rows, k.height) * k.width + pixel(column, grid.columns, k.width),
-                depth: *depth,
-                // Errors count relative to the depth.
-                weight: 1.0 / depth,
-            })
-        };
-        Some((grid.values.iter().enumerate().filter_map(sample).collect(), *kind))
+        let known = grid.pixels(k.width, k.height).filter(|(_, depth)| is_known(**depth));
+        let samples = known.map(|([x, y], depth)| DepthSample {
+            pixel: y * k.width + x,
+            depth: *depth,
+            // Errors count relative to the depth.
+            weight: 1.0 / depth,
+        });
+        Some((samples.collect(), *kind))
     }
 }
 
@@ -171,9 +167,12 @@ impl Read {
         let (nearest, farthest) = depths.fold((f32::INFINITY, 0f32), |(near, far), z| (near.min(z), far.max(z)));
         let range = nearest / BEYOND..=farthest * BEYOND;
         for value in &mut self.grid.values {
-            let known = *value > 0.0 && value.is_finite();
             let depth = line.depth(f64::from(*value), values) as f32;
-            *value = if known && range.contains(&depth) { depth } else { 0.0 };
+            *value = if is_known(*value) && range.contains(&depth) {
+                depth
+            } else {
+                0.0
+            };
         }
         Known {
             grid: self.grid,
@@ -287,6 +286,11 @@ impl Trainer {
     }
 }
 
+/// Whether a value of a map is one.
+fn is_known(value: f32) -> bool {
+    value > 0.0 && value.is_finite()
+}
+
 /// `[value, depth]` at each point that `view` sees.
 fn pairs(dataset: &Dataset, view: &View, grid: &DepthGrid) -> Vec<[f64; 2]> {
     let Some(points) = &dataset.points else {
@@ -301,7 +305,7 @@ fn pairs(dataset: &Dataset, view: &View, grid: &DepthGrid) -> Vec<[f64; 2]> {
         let (pixel, depth) = view.camera.project(*points.positions.get(*point as usize)?)?;
         let column = cell(pixel.x, k.width, grid.columns)?;
         let value = grid.values[cell(pixel.y, k.height, grid.rows)? * grid.columns as usize + column];
-        (value > 0.0 && value.is_finite() && depth > view.camera.near).then_some([f64::from(value), f64::from(depth)])
+        (is_known(value) && depth > view.camera.near).then_some([f64::from(value), f64::from(depth)])
     };
     view.points_seen.iter().filter_map(pair).collect()
 }

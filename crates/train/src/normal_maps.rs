@@ -123,16 +123,11 @@ impl NormalMaps {
     pub fn samples(&self, view: usize, camera: &Camera) -> Option<(Vec<NormalSample>, u32)> {
         let grid = self.of.get(view)?.as_ref()?;
         let k = &camera.intrinsics;
-        let pixel = |at: u32, cells: u32, side: u32| ((2 * at + 1) * side / (2 * cells)).min(side - 1);
-        let sample = |(i, normal): (usize, &[f32; 3])| {
-            let (row, column) = (i as u32 / grid.columns, i as u32 % grid.columns);
-            (*normal != [0.0; 3]).then(|| NormalSample {
-                pixel: [pixel(column, grid.columns, k.width), pixel(row, grid.rows, k.height)],
-                normal: *normal,
-            })
-        };
-        let samples = grid.values.iter().enumerate().filter_map(sample).collect();
-        Some((samples, (k.width / (2 * grid.columns)).max(1)))
+        let known = grid
+            .pixels(k.width, k.height)
+            .filter(|(_, normal)| **normal != [0.0; 3]);
+        let samples = known.map(|(pixel, normal)| NormalSample { pixel, normal: *normal });
+        Some((samples.collect(), (k.width / (2 * grid.columns)).max(1)))
     }
 }
 
@@ -142,16 +137,11 @@ fn facing(dataset: &Dataset, maps: &[(usize, NormalGrid)], axes: Axes) -> f64 {
     for (view, map) in maps {
         let camera = &dataset.views[*view].camera;
         let k = &camera.intrinsics;
-        for (i, normal) in map.values.iter().enumerate() {
+        for ([x, y], normal) in map.pixels(k.width, k.height) {
             let Some(normal) = axes.in_camera(*normal, camera) else {
                 continue;
             };
-            let place = [i as u32 % map.columns, i as u32 / map.columns].map(|at| at as f32 + 0.5);
-            let ray = Vec3::new(
-                (place[0] / map.columns as f32 * k.width as f32 - k.cx) / k.fx,
-                (place[1] / map.rows as f32 * k.height as f32 - k.cy) / k.fy,
-                1.0,
-            );
+            let ray = Vec3::new((x as f32 + 0.5 - k.cx) / k.fx, (y as f32 + 0.5 - k.cy) / k.fy, 1.0);
             known += 1;
             facing += usize::from(normal.dot(ray) < 0.0);
         }

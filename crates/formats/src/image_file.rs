@@ -102,6 +102,23 @@ pub fn write_png_16(path: &Path, width: u32, height: u32, data: &[u16]) -> Resul
     })
 }
 
+impl Header {
+    /// Whether its picture lies or stands as one of `upright` size does.
+    pub fn lies_as(&self, (width, height): (u32, u32)) -> bool {
+        (self.width > self.height) == (width > height)
+    }
+
+    /// The orientation of a file beside a photograph of this orientation and `upright` size: masks and maps are made from the pixels as displayed
+    /// by some tool and rarely have EXIF data, so that one with the aspect of the stored photograph is turned with it.
+    pub fn turned_with(&self, photograph: Orientation, upright: (u32, u32)) -> Orientation {
+        if self.lies_as(upright) {
+            Orientation::NoTransforms
+        } else {
+            photograph
+        }
+    }
+}
+
 /// Size and orientation, without the pixels. The format is detected by content, not by extension.
 pub(crate) fn read_header(path: &Path) -> Result<Header, FormatError> {
     if let Some(header) = read_jpeg_header(path)? {

@@ -86,29 +86,19 @@ impl MapFile {
             let values = table.values.iter().map(|value| *value as f32).collect();
             return Ok((table.columns as u32, table.rows as u32, values));
         }
-        // Like a mask: made from the pixels as some tool displays them, mostly without EXIF data.
-        let orientation = if self.is_upright()? {
-            Orientation::NoTransforms
-        } else {
-            self.orientation
-        };
+        let orientation = read_header(&self.path)?.turned_with(self.orientation, self.upright);
         decode_values(&self.path, orientation)
     }
 
     /// Only upright: turned pixels would have turned axes.
     fn normals(&self) -> Result<Values<[f32; 3]>, FormatError> {
-        if !self.is_upright()? {
+        if !read_header(&self.path)?.lies_as(self.upright) {
             let message = "is not upright, as its photograph is; make it again from the upright photograph";
             return Err(FormatError::malformed(&self.path, message));
         }
         let (width, height, colors) = decode_colors(&self.path)?;
         let normals = colors.into_iter().map(|color| color.map(|value| 2.0 * value - 1.0));
         Ok((width, height, normals.collect()))
-    }
-
-    fn is_upright(&self) -> Result<bool, FormatError> {
-        let header = read_header(&self.path)?;
-        Ok((header.width > header.height) == (self.upright.0 > self.upright.1))
     }
 }
 

@@ -110,15 +110,7 @@ impl PhotoFile {
     }
 
     fn read_mask(&self, path: &Path, size: (u32, u32)) -> Result<Vec<u8>, FormatError> {
-        // Masks are made from the pixels as displayed by some tool and rarely have EXIF data: one with the aspect of the stored
-        // photograph gets the same orientation.
-        let header = read_header(path)?;
-        let matches_upright = (header.width > header.height) == (self.upright.0 > self.upright.1);
-        let orientation = if matches_upright {
-            Orientation::NoTransforms
-        } else {
-            self.orientation
-        };
+        let orientation = read_header(path)?.turned_with(self.orientation, self.upright);
         let mut mask = decode(path, orientation, Colour::Grey)?;
         if (mask.width, mask.height) != self.upright {
             mask = resized(mask, self.upright);

@@ -180,19 +180,14 @@ mod tests {
                 data: vec![value; 64 * channels as usize],
                 mask: None,
             };
-            let view = View {
-                name: "a".into(),
-                camera: Camera::new(
+            let view = View::new(
+                "a",
+                Camera::new(
                     Pose::look_at(Vec3::NEG_Z, Vec3::ZERO, Vec3::NEG_Y),
                     Intrinsics::from_fov_x(8, 8, 1.0),
                 ),
-                photo: Arc::new(photo),
-                depth_bounds: None,
-                time: None,
-                points_seen: Vec::new(),
-                depth_map: None,
-                normal_map: None,
-            };
+                Arc::new(photo),
+            );
             Dataset {
                 views: vec![view],
                 train: vec![0],

@@ -175,6 +175,22 @@ pub struct View {
     pub normal_map: Option<Arc<dyn GridSource<[f32; 3]>>>,
 }
 
+impl View {
+    /// A view of which nothing else is known.
+    pub fn new(name: impl Into<String>, camera: Camera, photo: Arc<dyn PhotoSource>) -> Self {
+        Self {
+            name: name.into(),
+            camera,
+            photo,
+            depth_bounds: None,
+            time: None,
+            points_seen: Vec::new(),
+            depth_map: None,
+            normal_map: None,
+        }
+    }
+}
+
 /// Posed photographs of one scene.
 #[derive(Clone, Default)]
 pub struct Dataset {

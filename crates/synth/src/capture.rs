@@ -230,16 +230,9 @@ pub fn dataset(options: &SynthOptions) -> Result<Dataset, SynthError> {
             data: frame.rgba(),
             mask: None,
         };
-        dataset.views.push(View {
-            name: format!("{}.png", shot.name()),
-            camera: shot.camera,
-            photo: Arc::new(photo),
-            depth_bounds: None,
-            time: None,
-            points_seen: Vec::new(),
-            depth_map: None,
-            normal_map: None,
-        });
+        dataset
+            .views
+            .push(View::new(format!("{}.png", shot.name()), shot.camera, Arc::new(photo)));
     }
     dataset.views.sort_by(|a, b| a.name.cmp(&b.name));
     let held_out = format!("{}/", Part::Test.name());

@@ -227,25 +227,20 @@ mod tests {
 
     /// One grey photograph of `channels` channels, with or without points.
     fn dataset(channels: u32, points: bool) -> Arc<Dataset> {
-        let view = View {
-            name: "a".into(),
-            camera: Camera::new(
+        let view = View::new(
+            "a",
+            Camera::new(
                 Pose::look_at(Vec3::NEG_Z, Vec3::ZERO, Vec3::NEG_Y),
                 Intrinsics::from_fov_x(8, 8, 1.0),
             ),
-            photo: Arc::new(Photo {
+            Arc::new(Photo {
                 width: 8,
                 height: 8,
                 channels,
                 data: vec![128; 64 * channels as usize],
                 mask: None,
             }),
-            depth_bounds: None,
-            time: None,
-            points_seen: Vec::new(),
-            depth_map: None,
-            normal_map: None,
-        };
+        );
         let positions: Vec<Vec3> = (0..12).map(|i| Vec3::new(0.1 * i as f32, 0.0, 1.0)).collect();
         Arc::new(Dataset {
             views: vec![view],

@@ -48,6 +48,10 @@ enum Values {
     Inverses,
 }
 
+impl Values {
+    const BOTH: [Self; 2] = [Self::Depths, Self::Inverses];
+}
+
 /// `scale * value + shift` is the depth, or its inverse.
 #[derive(Clone, Copy, Debug)]
 struct Line {
@@ -61,6 +65,8 @@ struct Line {
 struct Read {
     grid: DepthGrid,
     pairs: Vec<[f64; 2]>,
+    /// Through the pairs, in the order of [`Values::BOTH`]; `None` for too few of them.
+    lines: Option<[Line; 2]>,
 }
 
 impl DepthMaps {
@@ -77,48 +83,40 @@ impl DepthMaps {
         let read = |view: &usize| {
             let view = &dataset.views[*view];
             let grid = view.depth_map.as_ref()?.load();
-            Some(grid.map(|grid| Read {
-                pairs: pairs(dataset, view, &grid),
-                grid,
+            Some(grid.map(|grid| {
+                let pairs = pairs(dataset, view, &grid);
+                let enough = pairs.len() >= ENOUGH_POINTS;
+                Read {
+                    lines: enough.then(|| Values::BOTH.map(|values| Line::fit(&pairs, values))),
+                    pairs,
+                    grid,
+                }
             }))
         };
         let maps: Vec<_> = dataset.train.par_iter().map(read).collect();
         let given = maps.iter().flatten().count();
-        let unreadable = maps
-            .iter()
-            .flatten()
-            .find_map(|map| map.as_ref().err())
-            .map(|e| e.to_string());
-        let usable = || {
-            maps.iter()
-                .flatten()
-                .flatten()
-                .filter(|map| map.pairs.len() >= ENOUGH_POINTS)
-        };
-        let error = |values| {
-            usable()
-                .map(|map| Line::fit(&map.pairs, values).error)
-                .collect::<Vec<f64>>()
-        };
-        let values = match usable().next() {
-            Some(_) if median(error(Values::Inverses)) < median(error(Values::Depths)) => Values::Inverses,
+        let unreadable = maps.iter().flatten().find_map(|map| map.as_ref().err());
+        let broken = unreadable.map(|error| format!("; {error}")).unwrap_or_default();
+        let lines: Vec<[Line; 2]> = maps.iter().flatten().flatten().filter_map(|map| map.lines).collect();
+        let errors = [0, 1].map(|i| lines.iter().map(|lines| lines[i].error).collect::<Vec<f64>>());
+        let fitted = (!lines.is_empty()).then(|| errors.map(median));
+        let values = match fitted {
+            Some([of_depths, of_inverses]) if of_inverses < of_depths => Values::Inverses,
             _ => Values::Depths,
         };
-        let fitted = usable().next().is_some();
         let mut of: Vec<Option<Known>> = dataset.views.iter().map(|_| None).collect();
-        let mut errors = Vec::new();
         for (view, map) in dataset.train.iter().zip(maps) {
             let Some(Ok(map)) = map else { continue };
-            of[*view] = if map.pairs.len() >= ENOUGH_POINTS {
-                let line = Line::fit(&map.pairs, values);
-                errors.push(line.error);
-                line.is_sound().then(|| map.in_world(&line, values))
-            } else {
+            of[*view] = match map.lines {
+                Some(lines) => {
+                    let line = lines[values as usize];
+                    line.is_sound().then(|| map.in_world(&line, values))
+                }
                 // Only depths need no points.
-                (values == Values::Depths).then_some(Known {
+                None => (values == Values::Depths).then_some(Known {
                     grid: map.grid,
                     kind: DepthKind::Relative,
-                })
+                }),
             };
         }
         let used = of.iter().flatten().count();
@@ -127,13 +125,12 @@ impl DepthMaps {
             Values::Inverses => "inverse depths",
         };
         let fit = match fitted {
-            true => format!(
+            Some(errors) => format!(
                 "{kind}, within {:.1} % of the points in the median",
-                100.0 * median(errors)
+                100.0 * errors[values as usize]
             ),
-            false => "taken for depths, up to scale and shift".to_owned(),
+            None => "taken for depths, up to scale and shift".to_owned(),
         };
-        let broken = unreadable.map(|error| format!("; {error}")).unwrap_or_default();
         Self {
             of,
             summary: format!("{used} of {given} given maps of depth are used ({fit}){broken}"),
@@ -360,14 +357,9 @@ mod tests {
             mask: None,
         };
         let view = |(i, depth_map): (usize, Option<Arc<dyn GridSource<f32>>>)| View {
-            name: format!("{i}.png"),
-            camera,
-            photo: Arc::new(photo.clone()),
-            depth_bounds: None,
-            time: None,
             points_seen: if blind.contains(&i) { vec![] } else { (0..200).collect() },
             depth_map,
-            normal_map: None,
+            ..View::new(format!("{i}.png"), camera, Arc::new(photo.clone()))
         };
         let views: Vec<View> = maps.into_iter().enumerate().map(view).collect();
         Dataset {

@@ -171,21 +171,18 @@ mod tests {
             rotation: Quat::IDENTITY,
             position: Vec3::ZERO,
         };
-        let view = |name: &str, data: Vec<u8>, mask: Option<Vec<u8>>| View {
-            name: name.into(),
-            camera: Camera::new(pose, Intrinsics::from_fov_x(16, 16, 1.0)),
-            photo: Arc::new(Photo {
-                width: 16,
-                height: 16,
-                channels: 3,
-                data,
-                mask,
-            }),
-            depth_bounds: None,
-            time: None,
-            points_seen: Vec::new(),
-            depth_map: None,
-            normal_map: None,
+        let view = |name: &str, data: Vec<u8>, mask: Option<Vec<u8>>| {
+            View::new(
+                name,
+                Camera::new(pose, Intrinsics::from_fov_x(16, 16, 1.0)),
+                Arc::new(Photo {
+                    width: 16,
+                    height: 16,
+                    channels: 3,
+                    data,
+                    mask,
+                }),
+            )
         };
         Dataset {
             views: vec![

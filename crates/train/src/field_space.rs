@@ -117,20 +117,18 @@ mod tests {
             mask: None,
         });
         let view = |(x, angle): (f32, f32)| View {
-            name: x.to_string(),
-            camera: Camera::new(
-                Pose {
-                    position: Vec3::new(x, 0.1 * x * x, 0.0),
-                    rotation: Quat::from_rotation_y(angle.to_radians()),
-                },
-                Intrinsics::from_fov_x(40, 30, 0.9),
-            ),
-            photo: photo.clone(),
             depth_bounds: near.map(|near| [near, 100.0]),
-            time: None,
-            points_seen: Vec::new(),
-            depth_map: None,
-            normal_map: None,
+            ..View::new(
+                x.to_string(),
+                Camera::new(
+                    Pose {
+                        position: Vec3::new(x, 0.1 * x * x, 0.0),
+                        rotation: Quat::from_rotation_y(angle.to_radians()),
+                    },
+                    Intrinsics::from_fov_x(40, 30, 0.9),
+                ),
+                photo.clone(),
+            )
         };
         Dataset {
             views: places.into_iter().zip(angles).map(view).collect(),

@@ -224,17 +224,15 @@ mod tests {
             let angle = 0.25 * (i as f32 - 2.0);
             let eye = 3.0 * Vec3::new(angle.sin(), 0.0, -angle.cos());
             View {
-                name: i.to_string(),
-                camera: Camera::new(
-                    Pose::look_at(eye, Vec3::ZERO, Vec3::NEG_Y),
-                    Intrinsics::from_fov_x(SIDE, SIDE, 0.5),
-                ),
-                photo: photo.clone(),
-                depth_bounds: None,
-                time: None,
                 points_seen: (0..400).step_by(2).collect(),
-                depth_map: None,
-                normal_map: None,
+                ..View::new(
+                    i.to_string(),
+                    Camera::new(
+                        Pose::look_at(eye, Vec3::ZERO, Vec3::NEG_Y),
+                        Intrinsics::from_fov_x(SIDE, SIDE, 0.5),
+                    ),
+                    photo.clone(),
+                )
             }
         });
         Dataset {

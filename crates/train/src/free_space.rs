@@ -121,14 +121,13 @@ pub(crate) mod tests {
         };
         Dataset {
             views: vec![View {
-                name: "a".into(),
-                camera: Camera::new(pose, Intrinsics::from_fov_x(1, 1, 1.0)),
-                photo: Arc::new(photo),
                 depth_bounds: bounds,
-                time: None,
                 points_seen: (0..seen as u32).collect(),
-                depth_map: None,
-                normal_map: None,
+                ..View::new(
+                    "a",
+                    Camera::new(pose, Intrinsics::from_fov_x(1, 1, 1.0)),
+                    Arc::new(photo),
+                )
             }],
             train: vec![0],
             points: Some(PointCloud {

@@ -199,20 +199,18 @@ mod tests {
                 values: vec![of(Vec3::NEG_Y, &camera); (CELLS * CELLS) as usize],
             };
             View {
-                name: format!("{i}.png"),
-                camera,
-                photo: Arc::new(Photo {
-                    width: 64,
-                    height: 64,
-                    channels: 3,
-                    data: vec![0; 3 * 64 * 64],
-                    mask: None,
-                }),
-                depth_bounds: None,
-                time: None,
-                points_seen: vec![],
-                depth_map: None,
                 normal_map: Some(Arc::new(map)),
+                ..View::new(
+                    format!("{i}.png"),
+                    camera,
+                    Arc::new(Photo {
+                        width: 64,
+                        height: 64,
+                        channels: 3,
+                        data: vec![0; 3 * 64 * 64],
+                        mask: None,
+                    }),
+                )
             }
         };
         let views = vec![view(0), view(2)];

@@ -312,16 +312,7 @@ mod tests {
         );
         let views = sources
             .iter()
-            .map(|s| View {
-                name: format!("{}", s.1),
-                camera,
-                photo: s.clone(),
-                depth_bounds: None,
-                time: None,
-                points_seen: vec![],
-                depth_map: None,
-                normal_map: None,
-            })
+            .map(|s| View::new(format!("{}", s.1), camera, s.clone()))
             .collect();
         (
             Arc::new(Dataset {

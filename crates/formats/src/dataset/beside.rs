@@ -1,4 +1,4 @@
-//! Files that belong to images, one each, in a folder beside theirs: masks and maps of depth.
+//! Files that belong to images, one each, in a folder beside theirs: masks, and maps of depth and of normals.
 
 use super::declared::Declared;
 use super::files::{is_image_name, relative_name};
@@ -72,14 +72,10 @@ pub(super) fn find_maps(declared: &mut Declared) {
     let depths = Beside::depths(&declared.root).filter(|_| declared.views.iter().all(|view| view.depth.is_none()));
     let normals = Beside::normals(&declared.root).filter(|_| declared.views.iter().all(|view| view.normals.is_none()));
     for view in &mut declared.views {
-        let below = view.name.split_once('/').map_or(view.name.as_str(), |(_, below)| below);
-        let find = |maps: &Beside| maps.of(below).or_else(|| maps.of(&view.name));
-        if let Some(depths) = &depths {
-            view.depth = find(depths);
-        }
-        if let Some(normals) = &normals {
-            view.normals = find(normals);
-        }
+        let find = |maps: &Beside| maps.of(view.name_below()).or_else(|| maps.of(&view.name));
+        let [depth, normals] = [&depths, &normals].map(|maps| maps.as_ref().and_then(find));
+        view.depth = view.depth.take().or(depth);
+        view.normals = view.normals.take().or(normals);
     }
 }
 

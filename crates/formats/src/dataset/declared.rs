@@ -67,6 +67,11 @@ impl DeclaredView {
             split: None,
         }
     }
+
+    /// Its name below the folder of the photographs: `a/b.jpg` of `images/a/b.jpg`.
+    pub fn name_below(&self) -> &str {
+        self.name.split_once('/').map_or(&self.name, |(_, below)| below)
+    }
 }
 
 /// A pose in the files' own coordinates, which may be too large for `f32`.

@@ -13,12 +13,13 @@ use std::path::Path;
 pub(super) fn relocate(declared: &mut Declared, folder: &Path, downscale: f32) -> Result<(), FormatError> {
     for view in &mut declared.views {
         let name = Path::new(&view.name);
-        let below = view.name.split_once('/').map(|(_, below)| Path::new(below));
-        let candidates = [Some(name), below, name.file_name().map(Path::new)];
-        view.image = candidates
+        let below = Path::new(view.name_below());
+        let candidates = [Some(name), Some(below), name.file_name().map(Path::new)];
+        let found = candidates
             .into_iter()
             .flatten()
             .find_map(|name| find_image(&folder.join(name)));
+        view.image = found;
     }
     if declared.views.iter().all(|view| view.image.is_none()) {
         let first = declared.views.first().map_or("", |view| view.name.as_str());

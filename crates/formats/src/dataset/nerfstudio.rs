@@ -38,8 +38,7 @@ pub(super) fn read(path: &Path, downscale: f32) -> Result<Declared, FormatError>
     let masks = Beside::masks(&root, "images");
     if let Some(masks) = &masks {
         for view in views.iter_mut().filter(|view| view.mask.is_none()) {
-            let below = view.name.split_once('/').map_or(view.name.as_str(), |(_, below)| below);
-            view.mask = masks.of(below);
+            view.mask = masks.of(view.name_below());
         }
         let masked = views.iter().filter(|view| view.mask.is_some()).count();
         warnings.extend(masks.mask_warning(views.len(), masked));

@@ -79,21 +79,18 @@ mod tests {
             data: vec![0; 3],
             mask: None,
         });
-        let view = |i: i32| View {
-            name: format!("{i}"),
-            camera: Camera::new(
-                Pose {
-                    rotation: Quat::IDENTITY,
-                    position: Vec3::new(0.2 * i as f32, 0.0, 0.0),
-                },
-                Intrinsics::from_fov_x(400, 300, 1.0),
-            ),
-            photo: photo.clone(),
-            depth_bounds: None,
-            time: None,
-            points_seen: Vec::new(),
-            depth_map: None,
-            normal_map: None,
+        let view = |i: i32| {
+            View::new(
+                format!("{i}"),
+                Camera::new(
+                    Pose {
+                        rotation: Quat::IDENTITY,
+                        position: Vec3::new(0.2 * i as f32, 0.0, 0.0),
+                    },
+                    Intrinsics::from_fov_x(400, 300, 1.0),
+                ),
+                photo.clone(),
+            )
         };
         (0..4).map(view).collect()
     }

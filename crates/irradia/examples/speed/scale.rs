@@ -291,18 +291,15 @@ fn trainer(splats: &Splats) -> Result<Trainer> {
         mask: None,
     };
     let photo: Arc<Photo> = Arc::new(photo);
-    let view = |i: usize| View {
-        name: format!("{i}"),
-        camera: Camera {
-            pose: turned(0.01 * i as f32),
-            ..camera(1280, 720, 1.0)
-        },
-        photo: photo.clone(),
-        depth_bounds: None,
-        time: None,
-        points_seen: Vec::new(),
-        depth_map: None,
-        normal_map: None,
+    let view = |i: usize| {
+        View::new(
+            format!("{i}"),
+            Camera {
+                pose: turned(0.01 * i as f32),
+                ..camera(1280, 720, 1.0)
+            },
+            photo.clone(),
+        )
     };
     let few: Vec<Vec3> = (0..splats.len())
         .step_by(splats.len() / 100)

@@ -35,19 +35,14 @@ pub(super) fn with_views_between(mut dataset: Dataset, model: &Model, options: &
             mask: None,
         };
         dataset.train.push(dataset.views.len());
-        dataset.views.push(View {
-            name: format!(
+        dataset.views.push(View::new(
+            format!(
                 "between {} and {}",
                 dataset.views[dataset.train[*a]].name, dataset.views[dataset.train[*b]].name
             ),
             camera,
-            photo: Arc::new(photo),
-            depth_bounds: None,
-            time: None,
-            points_seen: Vec::new(),
-            depth_map: None,
-            normal_map: None,
-        });
+            Arc::new(photo),
+        ));
     }
     dataset
 }

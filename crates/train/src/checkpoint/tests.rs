@@ -9,24 +9,21 @@ fn dataset() -> Arc<Dataset> {
     let positions: Vec<Vec3> = (0..12)
         .map(|i| Vec3::new(i as f32 * 0.1, (i % 3) as f32 * 0.1, 2.0))
         .collect();
-    let views = [0.0, 1.0].map(|x| View {
-        name: format!("view {x}"),
-        camera: Camera::new(
-            Pose::look_at(Vec3::X * x, 2.0 * Vec3::Z, Vec3::NEG_Y),
-            Intrinsics::from_fov_x(8, 8, 1.0),
-        ),
-        photo: Arc::new(Photo {
-            width: 8,
-            height: 8,
-            channels: 3,
-            data: vec![128; 3 * 8 * 8],
-            mask: None,
-        }),
-        depth_bounds: None,
-        time: None,
-        points_seen: Vec::new(),
-        depth_map: None,
-        normal_map: None,
+    let views = [0.0, 1.0].map(|x| {
+        View::new(
+            format!("view {x}"),
+            Camera::new(
+                Pose::look_at(Vec3::X * x, 2.0 * Vec3::Z, Vec3::NEG_Y),
+                Intrinsics::from_fov_x(8, 8, 1.0),
+            ),
+            Arc::new(Photo {
+                width: 8,
+                height: 8,
+                channels: 3,
+                data: vec![128; 3 * 8 * 8],
+                mask: None,
+            }),
+        )
     });
     Arc::new(Dataset {
         views: views.into(),

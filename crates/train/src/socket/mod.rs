@@ -57,6 +57,12 @@ fn pieces(frame: &mut [f32], length: usize) -> impl IndexedParallelIterator<Item
     pieces.map(|((red, green), blue)| [red, green, blue])
 }
 
+/// The last of the `layers` that are there, else `frame`: what the next one changes.
+fn topmost<'a>(frame: &'a [f32], layers: &[(bool, &'a Vec<f32>)]) -> &'a [f32] {
+    let there = layers.iter().rev().find(|(there, _)| *there);
+    there.map_or(frame, |(_, layer)| layer)
+}
+
 /// The part of a socket's occupant that is saved with a run.
 pub trait Occupant {
     /// Prefix of its tensors' names in a checkpoint, and name of its file beside the scene.
@@ -240,12 +246,12 @@ impl Sockets {
 
     /// The last frame's colour as the photograph shows it, `[3, H, W]`.
     pub fn frame_color<'a>(&'a self, engine: &'a Engine) -> &'a [f32] {
-        match (&self.bilateral, &self.exposure, &self.sky) {
-            (Some(_), ..) => &self.graded,
-            (None, Some(_), _) => &self.developed,
-            (None, None, Some(_)) => &self.over_sky,
-            (None, None, None) => engine.frame().color,
-        }
+        let layers = [
+            (self.sky.is_some(), &self.over_sky),
+            (self.exposure.is_some(), &self.developed),
+            (self.bilateral.is_some(), &self.graded),
+        ];
+        topmost(engine.frame().color, &layers)
     }
 
     /// Whether the camera's gradient is needed.
@@ -264,23 +270,18 @@ impl Sockets {
         plan: &StepPlan,
     ) {
         let frame = engine.frame();
+        let layers = [
+            (self.sky.is_some(), &self.over_sky),
+            (self.exposure.is_some(), &self.developed),
+        ];
         if let Some(bilateral) = &mut self.bilateral {
             let (rate, weight) = (plan.value(Param::RateBilateral), plan.value(Param::BilateralTv));
-            let color = match (&self.exposure, &self.sky) {
-                (Some(_), _) => &self.developed,
-                (None, Some(_)) => &self.over_sky,
-                (None, None) => frame.color,
-            };
-            let width = camera.intrinsics.width as usize;
+            let (color, width) = (topmost(frame.color, &layers), camera.intrinsics.width as usize);
             bilateral.step(view, width, color, objective.v_color_mut(), rate, weight);
         }
         if let Some(exposure) = &mut self.exposure {
             let (rate, weight) = (plan.value(Param::RateExposure), plan.value(Param::ExposureReg));
-            let color = if self.sky.is_some() {
-                &self.over_sky
-            } else {
-                frame.color
-            };
+            let color = topmost(frame.color, &layers[..1]);
             exposure.step(view, color, objective.v_color_mut(), rate, weight);
         }
         if let Some(sky) = &mut self.sky {

@@ -200,24 +200,21 @@ mod tests {
 
     #[test]
     fn a_motion_common_to_all_views_is_removed() {
-        let view = |x: f32| View {
-            name: String::new(),
-            camera: Camera::new(
-                Pose::look_at(Vec3::new(x, 0.3, -3.0), Vec3::ZERO, Vec3::NEG_Y),
-                Intrinsics::from_fov_x(48, 40, 0.8),
-            ),
-            photo: Arc::new(Photo {
-                width: 0,
-                height: 0,
-                channels: 3,
-                data: vec![],
-                mask: None,
-            }),
-            depth_bounds: None,
-            time: None,
-            points_seen: vec![],
-            depth_map: None,
-            normal_map: None,
+        let view = |x: f32| {
+            View::new(
+                String::new(),
+                Camera::new(
+                    Pose::look_at(Vec3::new(x, 0.3, -3.0), Vec3::ZERO, Vec3::NEG_Y),
+                    Intrinsics::from_fov_x(48, 40, 0.8),
+                ),
+                Arc::new(Photo {
+                    width: 0,
+                    height: 0,
+                    channels: 3,
+                    data: vec![],
+                    mask: None,
+                }),
+            )
         };
         let dataset = Dataset {
             views: [-1.0, 0.0, 1.0].map(view).into(),

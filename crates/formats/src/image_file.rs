@@ -1,4 +1,5 @@
 use crate::complete::{jpeg_file_is_complete, jpeg_is_complete, png_is_complete};
+use crate::heic::{HeicDecoder, is_heif};
 use crate::{FormatError, write_atomic};
 use image::codecs::png::{CompressionType, FilterType, PngEncoder};
 use image::metadata::Orientation;
@@ -43,7 +44,7 @@ pub(crate) enum Colour {
     Grey,
 }
 
-/// Reads a JPEG, PNG, WebP or TIFF of any depth as 3 or (if the file has alpha) 4 channels of 8 bits, with the EXIF orientation applied.
+/// Reads a JPEG, PNG, WebP, TIFF or HEIC of any depth as 3 or (if the file has alpha) 4 channels of 8 bits, with the EXIF orientation applied.
 ///
 /// # Errors
 /// When the file cannot be read, is not an image, or is truncated.
@@ -187,6 +188,12 @@ pub(crate) fn decode(path: &Path, orientation: Orientation, colour: Colour) -> R
     Ok(upright(image, orientation, colour))
 }
 
+/// The pixels of a HEIC in memory.
+pub(crate) fn decode_heic(bytes: &[u8]) -> Result<Pixels, image::ImageError> {
+    let image = DynamicImage::from_decoder(HeicDecoder::new(bytes.to_vec())?)?;
+    Ok(upright(image, Orientation::NoTransforms, Colour::Keep))
+}
+
 /// The values of a grey image, those of 8 and 16 bits as they are stored: width, height and `[H, W]`.
 ///
 /// # Errors
@@ -305,27 +312,29 @@ trait Source: BufRead + Seek {}
 impl<T: BufRead + Seek> Source for T {}
 
 /// Opens an image that is not truncated; the format is detected by its first bytes. Returns whether it is a JPEG.
-fn open(path: &Path) -> Result<(impl ImageDecoder + use<>, bool), FormatError> {
-    let (source, complete, jpeg) = open_source(path).map_err(|source| FormatError::Read {
+fn open(path: &Path) -> Result<(Box<dyn ImageDecoder>, bool), FormatError> {
+    let unread = |source| FormatError::Read {
         path: path.to_owned(),
         source,
-    })?;
+    };
+    let mut reader = BufReader::new(File::open(path).map_err(unread)?);
+    if is_heif(reader.fill_buf().map_err(unread)?) {
+        let mut bytes = Vec::new();
+        reader.read_to_end(&mut bytes).map_err(unread)?;
+        let decoder = HeicDecoder::new(bytes).map_err(|error| undecodable(path, &error))?;
+        return Ok((Box::new(decoder), false));
+    }
+    let (source, complete, jpeg) = complete_source(reader).map_err(unread)?;
     if !complete {
         return Err(truncated(path));
     }
-    let reader = ImageReader::new(source)
-        .with_guessed_format()
-        .map_err(|source| FormatError::Read {
-            path: path.to_owned(),
-            source,
-        })?;
+    let reader = ImageReader::new(source).with_guessed_format().map_err(unread)?;
     let decoder = reader.into_decoder().map_err(|error| undecodable(path, &error))?;
-    Ok((decoder, jpeg))
+    Ok((Box::new(decoder), jpeg))
 }
 
 /// The file, whether it is complete, and whether it is a JPEG.
-fn open_source(path: &Path) -> io::Result<(Box<dyn Source>, bool, bool)> {
-    let mut reader = BufReader::new(File::open(path)?);
+fn complete_source(mut reader: BufReader<File>) -> io::Result<(Box<dyn Source>, bool, bool)> {
     let start = reader.fill_buf()?;
     if start.starts_with(&[0xFF, 0xD8]) {
         // The decoder would read all of it anyway.
@@ -342,7 +351,7 @@ fn open_source(path: &Path) -> io::Result<(Box<dyn Source>, bool, bool)> {
 fn undecodable(path: &Path, error: &image::ImageError) -> FormatError {
     FormatError::malformed(
         path,
-        format!("not a readable JPEG, PNG, WebP or TIFF image ({error}); restore or remove it"),
+        format!("not a readable JPEG, PNG, WebP, TIFF or HEIC image ({error}); restore or remove it"),
     )
 }
 

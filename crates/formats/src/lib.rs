@@ -12,6 +12,7 @@ mod dataset;
 mod describe;
 mod error;
 mod faces;
+mod heic;
 mod image_file;
 mod map_file;
 mod pack;

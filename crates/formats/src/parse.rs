@@ -32,6 +32,14 @@ pub fn gltf(text: &[u8]) -> Result<irradia_scene::GaussianCloud, crate::Malforme
     crate::splats::gltf::parse_gltf(text, &absent)
 }
 
+/// The pixels of a HEIC photograph: width, height, and 3 or 4 channels of 8 bits.
+///
+/// # Errors
+/// When it is damaged, or not coded as HEVC.
+pub fn heic(bytes: &[u8]) -> Result<crate::Pixels, crate::Malformed> {
+    crate::image_file::decode_heic(bytes).map_err(|error| crate::Malformed(error.to_string()))
+}
+
 /// All tensors of a PyTorch state dict or a safetensors file; see [`crate::read_tensors`].
 ///
 /// # Errors

@@ -32,19 +32,21 @@ fn what_is_no_photograph_or_a_copy_is_named_with_its_reason() {
     fs::copy(root.join("b.jpg"), root.join("c.jpg")).unwrap();
     fs::write(root.join("d.jpg"), "not a picture").unwrap();
     fs::write(root.join("e.jpg"), &fs::read(root.join("b.jpg")).unwrap()[..400]).unwrap();
-    fs::write(root.join("f.HEIC"), "ftypheic").unwrap();
+    fs::write(root.join("f.HEIC"), "\0\0\0\x10ftypheic\0\0\0\0").unwrap();
+    fs::write(root.join("g.dng"), "II*").unwrap();
     fs::write(root.join("notes.txt"), "ignored").unwrap();
     fs::write(root.join(".hidden.jpg"), "ignored").unwrap();
     let found = read_photo_folder(root).unwrap();
     let names: Vec<&str> = found.photos.iter().map(|photo| photo.name.as_str()).collect();
     assert_eq!(names, ["a.png", "b.jpg"]);
     let reasons: Vec<(&str, &str)> = found.left_out.iter().map(|(a, b)| (a.as_str(), b.as_str())).collect();
-    assert_eq!(reasons.len(), 4, "{reasons:?}");
+    assert_eq!(reasons.len(), 5, "{reasons:?}");
     for ((name, reason), (expected, word)) in reasons.iter().zip([
         ("c.jpg", "copy of b.jpg"),
         ("d.jpg", "not a readable"),
         ("e.jpg", "truncated"),
-        ("f.HEIC", "convert"),
+        ("f.HEIC", "not a readable"),
+        ("g.dng", "convert"),
     ]) {
         assert!(*name == expected && reason.contains(word), "{name}: {reason}");
     }
@@ -89,6 +91,54 @@ fn other_kinds_of_pictures_and_masks_are_read() {
     // Another mask makes it another photograph: its features are not reused.
     fs::remove_file(root.join("masks/b.tif.png")).unwrap();
     assert_ne!(read_photo_folder(root).unwrap().photos[1].hash, found.photos[1].hash);
+}
+
+#[test]
+fn phones_photographs_are_read_with_what_the_camera_wrote() {
+    use exif::{Field, In, Tag, Value};
+    let folder = tempfile::tempdir().unwrap();
+    let mut writer = exif::experimental::Writer::new();
+    // The turn stands in the container as well: what EXIF says must not turn the picture once more.
+    let tags = [(Tag::FocalLengthIn35mmFilm, 27), (Tag::Orientation, 6)].map(|(tag, value)| Field {
+        tag,
+        ifd_num: In::PRIMARY,
+        value: Value::Short(vec![value]),
+    });
+    tags.iter().for_each(|tag| writer.push_field(tag));
+    let mut block = std::io::Cursor::new(Vec::new());
+    writer.write(&mut block, false).unwrap();
+    let seen = picture(40, 30, 10);
+    let mut pixels = heifer::Image::filled(40, 30, 8, [0, 0, 0, 255]);
+    for (to, from) in pixels.data.chunks_exact_mut(4).zip(seen.pixels()) {
+        (0..3).for_each(|channel| to[channel] = from.0[channel].into());
+    }
+    let metadata = heifer::Metadata {
+        exif: Some(block.into_inner()),
+        ..heifer::Metadata::default()
+    };
+    let bytes = heifer::encode_with_metadata(&pixels, &metadata, &heifer::EncodeOptions::default()).unwrap();
+    fs::write(folder.path().join("IMG_0001.HEIC"), &bytes).unwrap();
+    fs::write(folder.path().join("IMG_0002.HEIC"), &bytes[..bytes.len() - 9]).unwrap();
+    let found = read_photo_folder(folder.path()).unwrap();
+    assert_eq!(
+        (found.photos.len(), found.left_out.len()),
+        (1, 1),
+        "{:?}",
+        found.left_out
+    );
+    assert!(found.left_out[0].1.contains("not a readable"), "{:?}", found.left_out);
+    let photo = &found.photos[0];
+    assert_eq!((photo.width, photo.height, photo.up), (40, 30, [0, -1]));
+    assert_eq!(photo.tags.focal, Some(0.75));
+    let read = photo.read(1).unwrap();
+    assert_eq!((read.width, read.height, read.channels), (40, 30, 3));
+    let off: u32 = read
+        .data
+        .iter()
+        .zip(seen.as_raw())
+        .map(|(a, b)| u32::from(a.abs_diff(*b)))
+        .sum();
+    assert!(off < 4 * 3600, "{off}");
 }
 
 #[test]

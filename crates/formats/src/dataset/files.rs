@@ -4,8 +4,9 @@ use crate::FormatError;
 use std::io::Read;
 use std::path::{Component, Path, PathBuf};
 
-const EXTENSIONS: [&str; 12] = [
-    "png", "jpg", "jpeg", "PNG", "JPG", "JPEG", "webp", "tif", "tiff", "WEBP", "TIF", "TIFF",
+const EXTENSIONS: [&str; 18] = [
+    "png", "jpg", "jpeg", "PNG", "JPG", "JPEG", "webp", "tif", "tiff", "WEBP", "TIF", "TIFF", "heic", "heif", "hif",
+    "HEIC", "HEIF", "HIF",
 ];
 
 /// The image file for a dataset's `path`: that file, or that name with an extension added or replaced.

@@ -16,7 +16,7 @@ use std::collections::{BTreeMap, HashMap};
 use std::path::{Path, PathBuf};
 
 /// Extensions of photographs that are not read.
-const UNREAD: [&str; 7] = ["heic", "heif", "avif", "dng", "cr2", "nef", "arw"];
+const UNREAD: [&str; 5] = ["avif", "dng", "cr2", "nef", "arw"];
 
 /// A photograph on disk.
 #[derive(Clone, Debug, PartialEq)]

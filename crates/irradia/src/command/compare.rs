@@ -367,6 +367,8 @@ fn request(args: &Args, program: &str, source: &Source, variant: &Variant, seed:
     }
     option("--holdout", reading.holdout.clone());
     option("--background", args.background().map(|b| b.name().to_owned()));
+    // Published figures are those of the given poses.
+    option("--poses", args.protocol.map(|_| "given".to_owned()));
     Request {
         arguments,
         recipe_hash: variant.hash.clone(),

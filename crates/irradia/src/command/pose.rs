@@ -3,11 +3,13 @@
 use super::{by_option, thread_count, use_threads};
 use crate::Usage;
 use crate::terminal::{note, say};
-use anyhow::Result;
+use anyhow::{Context, Result};
 use clap::builder::RangedU64ValueParser;
 use indicatif::{ProgressBar, ProgressStyle};
 use irradia_runs::formats::DatasetFormat;
+use irradia_runs::scene::Dataset;
 use irradia_runs::{Finding, KnownDistance, Mapper, PoseInput, PoseProgress, PoseReport, TrainInput, is_capture, pose};
+use std::collections::HashSet;
 use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
@@ -102,19 +104,12 @@ pub fn is_unposed(data: &Path) -> bool {
 
 /// Poses the photographs of `input` into the folder `posed` of its run, and makes that its dataset.
 pub fn pose_first(input: &mut TrainInput, poses: Poses, anyway: bool) -> Result<()> {
-    let posed = input.out.join("posed");
-    let data = std::mem::replace(&mut input.data, posed.clone());
     note(format_args!(
-        "{} has no poses: they are found first, into {}",
-        data.display(),
-        posed.display()
+        "{} has no poses: they are found first",
+        input.data.display()
     ));
-    let request = PoseInput {
-        mapper: poses.into(),
-        ..PoseInput::new(data, &posed)
-    };
-    let report = pose_with_progress(&request)?;
-    note(summary(&report));
+    let report = pose_into_run(input, poses)?;
+    let posed = &input.data;
     if report.fraction() < ENOUGH && !anyway {
         let reasons: Vec<&str> = report
             .findings
@@ -135,6 +130,55 @@ pub fn pose_first(input: &mut TrainInput, poses: Poses, anyway: bool) -> Result<
         .into());
     }
     Ok(())
+}
+
+/// As [`pose_first`], for photographs whose poses in `dataset` are not to be used; the same views are held out. Fails if a held-out view, or more than
+/// a few of the others, find no pose.
+pub fn pose_again(input: &mut TrainInput, dataset: &Dataset, poses: Poses) -> Result<()> {
+    if let Some(images) = input.reading.images.take() {
+        input.data = images;
+    }
+    input.reading.format = None;
+    let report = pose_into_run(input, poses)?;
+    let file_name = |name: &str| name.rsplit('/').next().unwrap_or(name).to_owned();
+    let left_out: HashSet<&str> = report.left_out.iter().map(|left| left.name.as_str()).collect();
+    let lost = |views: &[usize]| {
+        let names = views.iter().map(|view| file_name(&dataset.views[*view].name));
+        names.filter(|name| left_out.contains(name.as_str())).count()
+    };
+    let (train, test) = (lost(&dataset.train), lost(&dataset.test));
+    if test > 0 || train as f64 > (1.0 - ENOUGH) * dataset.train.len() as f64 {
+        return Err(Usage(format!(
+            "{train} of {} training views and {test} of {} held-out ones find no pose again; train with --poses given",
+            dataset.train.len(),
+            dataset.test.len()
+        ))
+        .into());
+    }
+    if input.reading.holdout.is_none() && !dataset.test.is_empty() {
+        let names: Vec<String> = dataset
+            .test
+            .iter()
+            .map(|view| file_name(&dataset.views[*view].name))
+            .collect();
+        let list = input.data.join("test.txt");
+        std::fs::write(&list, names.join("\n") + "\n").with_context(|| format!("cannot write {}", list.display()))?;
+    }
+    Ok(())
+}
+
+/// Poses the photographs of `input` into the folder `posed` of its run, and makes that its dataset.
+fn pose_into_run(input: &mut TrainInput, poses: Poses) -> Result<PoseReport> {
+    let posed = input.out.join("posed");
+    note(format_args!("poses are found, into {}", posed.display()));
+    let data = std::mem::replace(&mut input.data, posed.clone());
+    let request = PoseInput {
+        mapper: poses.into(),
+        ..PoseInput::new(data, &posed)
+    };
+    let report = pose_with_progress(&request)?;
+    note(summary(&report));
+    Ok(report)
 }
 
 fn pose_with_progress(input: &PoseInput) -> Result<PoseReport> {

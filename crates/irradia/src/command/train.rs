@@ -1,16 +1,21 @@
 //! `irradia train`
 
 use super::lpips::{self, lpips_path, unseen_lpips_path};
-use super::pose::{Poses, is_unposed, pose_first};
+use super::pose::{Poses, is_unposed, pose_again, pose_first};
 use super::progress::{Progress, size_in_words};
 use super::view::ListenArgs;
 use super::{DataArgs, by_option, thread_count, use_threads, warn};
+use crate::Usage;
 use crate::interrupt::stop_flag;
 use crate::terminal::{note, one_line, say};
 use anyhow::{Result, anyhow};
 use clap::builder::RangedU64ValueParser;
 use irradia_compute::DeviceChoice;
-use irradia_runs::{Background, DEFAULT_RECIPE, Finished, Run, RunError, RunFolder, TrainInput};
+use irradia_runs::scene::Dataset;
+use irradia_runs::{
+    Background, DEFAULT_RECIPE, Finished, PoseCheck, Reading, Run, RunError, RunFolder, TrainInput, TrainRequest,
+    check_poses, is_posed_here,
+};
 use irradia_train::event::Observer;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::Ordering;
@@ -30,9 +35,10 @@ pub struct Args {
     /// Begin with the splats of this scene, a file or a run's folder, in the coordinates of the photographs, instead of points
     #[arg(long, value_name = "SCENE", conflicts_with = "resume")]
     pub from: Option<PathBuf>,
-    /// Who finds the poses of photographs that have none: irradia, or colmap, if it is installed
-    #[arg(long, value_name = "WHO", default_value = "irradia", value_enum)]
-    pub poses: Poses,
+    /// Whose poses are used: those given with the photographs, or new ones by irradia, or by colmap, if it is installed. When absent those
+    /// given, unless the photographs contradict them, else irradia's
+    #[arg(long, value_name = "WHO", value_enum, conflicts_with_all = ["resume", "replay"])]
+    pub poses: Option<PosesOf>,
     /// Train although fewer than 80 % of the photographs could be posed
     #[arg(long)]
     pub anyway: bool,
@@ -91,6 +97,25 @@ pub struct Args {
     pub reading: DataArgs,
 }
 
+/// Whose poses are used.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+pub enum PosesOf {
+    Given,
+    Irradia,
+    Colmap,
+}
+
+impl PosesOf {
+    /// Who finds new ones.
+    fn mapper(self) -> Option<Poses> {
+        match self {
+            Self::Given => None,
+            Self::Irradia => Some(Poses::Irradia),
+            Self::Colmap => Some(Poses::Colmap),
+        }
+    }
+}
+
 impl Args {
     /// Where to serve a viewer, if one is requested.
     fn viewer(&self) -> Option<&ListenArgs> {
@@ -146,9 +171,15 @@ pub fn run(args: &Args) -> Result<()> {
                 // Posing takes a while: mistakes are reported first.
                 input.clone().check().map_err(by_option)?;
                 RunFolder::check_free(&input.out, input.overwrite)?;
-                pose_first(&mut input, args.poses, args.anyway)?;
+                let Some(mapper) = args.poses.map_or(Some(Poses::Irradia), PosesOf::mapper) else {
+                    let message = format!("{} has no poses: leave --poses given out", input.data.display());
+                    return Err(Usage(message).into());
+                };
+                pose_first(&mut input, mapper, args.anyway)?;
+                return begin(input, args.viewer());
             }
-            begin(input, args.viewer())
+            let (request, dataset) = with_poses(input, args.poses)?;
+            begin_on(request, dataset, args.viewer())
         }
     }
 }
@@ -201,11 +232,77 @@ fn input(args: &Args) -> Result<TrainInput> {
     })
 }
 
+/// The dataset of `input`, whose photographs have poses: with these, or with new ones if they are wanted or the photographs contradict those given.
+fn with_poses(input: TrainInput, poses: Option<PosesOf>) -> Result<(TrainRequest, Dataset)> {
+    let read = |input: TrainInput| -> Result<(TrainRequest, Dataset)> {
+        let request = input.check().map_err(by_option)?;
+        let dataset = request.read_dataset()?;
+        Ok((request, dataset))
+    };
+    let given = read(input.clone())?;
+    RunFolder::check_free(&input.out, input.overwrite)?;
+    if let Some(mapper) = poses.and_then(PosesOf::mapper) {
+        let mut again = input;
+        pose_again(&mut again, &given.1, mapper)?;
+        return read(again);
+    }
+    // Rendered scenes are exact, our own poses have been examined, and the splats of --from lie in the world of those given.
+    let is_sure = given.1.kind == "Blender" || is_posed_here(&input.data) || input.from.is_some();
+    if poses.is_some() || is_sure {
+        return Ok(given);
+    }
+    let found = check(&input)?;
+    if !found.is_broken() {
+        note(format_args!(
+            "{} pairs of photographs were matched: they agree with the given poses",
+            found.pairs
+        ));
+        return Ok(given);
+    }
+    let [a, b] = &found.contradicting[0];
+    let (wrong, of) = (found.contradicting.len(), found.pairs);
+    let line = format!("{wrong} of {of} pairs of photographs contradict the given poses, such as {a} and {b}");
+    note(format_args!(
+        "{line}: new ones are found; --poses given keeps those given"
+    ));
+    let mut again = input;
+    let posed = pose_again(&mut again, &given.1, Poses::Irradia).and_then(|()| check(&again));
+    match posed {
+        Ok(new) if 2.0 * new.share() < found.share() => {
+            let (request, mut dataset) = read(again)?;
+            dataset
+                .warnings
+                .push(format!("{line}: new ones are used, in a world of their own"));
+            Ok((request, dataset))
+        }
+        posed => {
+            let why = posed.err().map_or_else(
+                || "the photographs contradict new ones as well".to_owned(),
+                |error| one_line(&error),
+            );
+            note(format_args!("the given poses are used after all: {why}"));
+            Ok(given)
+        }
+    }
+}
+
+/// Compares the poses of the dataset of `input` with its photographs, at a size that does not depend on that of the training.
+fn check(input: &TrainInput) -> Result<PoseCheck> {
+    let mut input = input.clone();
+    (input.reading.downscale, input.reading.max_side) = (1.0, Reading::default().max_side);
+    let dataset = input.check().map_err(by_option)?.read_dataset()?;
+    Ok(check_poses(&dataset))
+}
+
 /// Begins a new run on the current threads, and finishes it; `viewer` shows it meanwhile.
 pub fn begin(input: TrainInput, viewer: Option<&ListenArgs>) -> Result<()> {
     let request = input.check().map_err(by_option)?;
     RunFolder::check_free(&request.input().out, request.input().overwrite)?;
     let dataset = request.read_dataset()?;
+    begin_on(request, dataset, viewer)
+}
+
+fn begin_on(request: TrainRequest, dataset: Dataset, viewer: Option<&ListenArgs>) -> Result<()> {
     warn(&dataset.warnings);
     warn(&request.warnings());
     let run = Run::begin_on(request, dataset).map_err(by_option)?;

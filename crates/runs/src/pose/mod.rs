@@ -10,6 +10,7 @@
 //! ```
 
 mod capture;
+mod check;
 mod colmap;
 mod doctor;
 mod film;
@@ -33,6 +34,7 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 pub use capture::is_capture;
+pub use check::{PoseCheck, check_poses};
 pub use doctor::{DoctorInput, DoctorReport, Finding, doctor};
 use film::is_film;
 
@@ -334,11 +336,16 @@ pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Resu
     Ok(report)
 }
 
+/// Whether [`pose`] wrote the dataset in `data`.
+pub fn is_posed_here(data: &Path) -> bool {
+    data.join(REPORT).exists()
+}
+
 /// Refuses to replace a model that [`pose`] did not write.
 fn check_free(out: &Path) -> Result<(), RunError> {
     let foreign = ["sparse", "transforms.json", "transforms_train.json", "poses_bounds.npy"]
         .into_iter()
-        .find(|name| out.join(name).exists() && !out.join(REPORT).exists());
+        .find(|name| out.join(name).exists() && !is_posed_here(out));
     match foreign {
         Some(name) => Err(RunError::Refused(format!(
             "{} already holds {name} of another origin: choose another --out",

@@ -260,7 +260,7 @@ fn mask_of(photo: &PhotoEntry, pixels: &Pixels) -> Result<Option<Vec<u8>>, Strin
 }
 
 /// Brightness of a pixel of 3 or 4 channels, with the weights of BT.709 in 1/256.
-fn luma(pixel: &[u8]) -> u8 {
+pub(super) fn luma(pixel: &[u8]) -> u8 {
     let [r, g, b] = [0, 1, 2].map(|c| u32::from(pixel[c]));
     ((54 * r + 183 * g + 19 * b + 128) >> 8) as u8
 }

@@ -1,15 +1,18 @@
 //! Photographs in, a dataset out: ray-traced photographs whose poses are known, and folders with which nothing can be done.
 
+use glam::Quat;
 use irradia_runs::formats::{DatasetFormat, DatasetOptions, read_dataset, read_image, write_png};
-use irradia_runs::scene::Camera;
-use irradia_runs::synth::{Capture, Part, SynthOptions};
+use irradia_runs::scene::{Camera, Dataset, Photo, View};
+use irradia_runs::synth::{Capture, Part, Shot, SynthOptions};
 use irradia_runs::{
-    DoctorInput, Finding, KnownDistance, Mapper, PoseInput, PoseProgress, PoseReport, RunError, doctor, pose,
+    DoctorInput, Finding, KnownDistance, Mapper, PoseInput, PoseProgress, PoseReport, RunError, check_poses, doctor,
+    pose,
 };
 use irradia_testkit::shared;
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
+use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;
 
@@ -41,6 +44,57 @@ fn photographs(folder: &Path) -> Vec<(String, Camera)> {
 
 fn quietly(input: &PoseInput) -> Result<PoseReport, RunError> {
     pose(input, &|_| {})
+}
+
+#[test]
+fn wrong_poses_are_told_from_sound_ones_and_from_a_single_wrong_one() {
+    let capture = Capture::new(&OPTIONS).unwrap();
+    let scene = OPTIONS.scene.build(OPTIONS.seed).0;
+    let view = |shot: &Shot| {
+        let frame = scene.trace(&shot.camera, 4, 1);
+        let photo = Photo {
+            width: OPTIONS.width,
+            height: OPTIONS.height,
+            channels: 4,
+            data: frame.rgba(),
+            mask: None,
+        };
+        View::new(shot.name(), shot.camera, Arc::new(photo))
+    };
+    let sound: Vec<View> = capture
+        .shots()
+        .iter()
+        .filter(|shot| shot.part == Part::Train)
+        .map(view)
+        .collect();
+    let turned = |is_turned: &dyn Fn(&View) -> bool| {
+        let mut views = sound.clone();
+        let turn = Quat::from_rotation_z(0.4);
+        for view in views.iter_mut().filter(|view| is_turned(view)) {
+            let pose = &mut view.camera.pose;
+            pose.rotation = turn * pose.rotation;
+            pose.position = turn * pose.position;
+        }
+        check_poses(&Dataset {
+            views,
+            ..Dataset::default()
+        })
+    };
+    let found = turned(&|_| false);
+    assert!(
+        found.pairs > 40 && found.contradicting.is_empty() && !found.is_broken(),
+        "{found:?}"
+    );
+    let found = turned(&|view| view.name == "train/r_007");
+    assert!(
+        !found.contradicting.is_empty() && !found.is_broken(),
+        "one photograph: {found:?}"
+    );
+    let is_east = |view: &View| view.camera.pose.position.x > 0.0;
+    let found = turned(&is_east);
+    assert!(found.is_broken(), "one side: {found:?}");
+    let side = |name: &String| sound.iter().find(|view| view.name == *name).map(is_east);
+    assert!(found.contradicting.iter().all(|[a, b]| side(a) != side(b)), "{found:?}");
 }
 
 #[test]

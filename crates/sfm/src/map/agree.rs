@@ -113,12 +113,15 @@ fn covered(photos: &[PhotoInfo], features: &[Features], pair: &VerifiedPair) -> 
     of_side(0).min(of_side(1))
 }
 
+/// Indices of the pairs of neighbours with enough matches to tell.
+pub fn telling(pairs: &[VerifiedPair], strengths: &[f64]) -> impl Iterator<Item = usize> {
+    (0..pairs.len()).filter(|i| pairs[*i].matches.len() >= TELLS && strengths[*i] >= 1.0)
+}
+
 /// Neighbours whose matches contradict the model, those with most matches first: where it is folded.
 pub fn contradictions(pairs: &[VerifiedPair], strengths: &[f64], agreement: &[Option<f64>]) -> Vec<usize> {
-    let mut found: Vec<usize> = (0..pairs.len())
-        .filter(|i| {
-            pairs[*i].matches.len() >= TELLS && strengths[*i] >= 1.0 && agreement[*i].is_some_and(|a| a < CONTRADICTS)
-        })
+    let mut found: Vec<usize> = telling(pairs, strengths)
+        .filter(|i| agreement[*i].is_some_and(|a| a < CONTRADICTS))
         .collect();
     found.sort_by_key(|i| (std::cmp::Reverse(pairs[*i].matches.len()), *i));
     found

@@ -20,7 +20,7 @@ mod unfold;
 mod verify;
 mod zoom;
 
-pub use agree::{agreement, contradictions, strengths};
+pub use agree::{agreement, contradictions, strengths, telling};
 pub use distance::{Distance, DistanceFit, to_distances};
 pub(crate) use finish::up;
 pub use focal::Source;

@@ -1,0 +1,165 @@
+//! Whether the poses of a dataset agree with its photographs.
+//!
+//! Programs that find poses may take one part of a scene for another that looks alike, and the dataset then jumps between adjacent photographs. Their
+//! own reprojection errors do not show it, since they dropped the matches that contradict them; matching the photographs again does.
+
+use super::stages::luma;
+use irradia_scene::{Camera, Dataset, Intrinsics, Photo, View};
+use irradia_sfm::Features;
+use irradia_sfm::features::{Extractor, GreyPhoto, Sift};
+use irradia_sfm::geometry::camera::DCamera;
+use irradia_sfm::geometry::pose::DPose;
+use irradia_sfm::map::{
+    MapOptions, Model, PhotoInfo, VerifiedPair, agreement, contradictions, strengths, telling, verify,
+};
+use irradia_sfm::matching::{MatchOptions, PairOptions, candidate_pairs, match_pairs};
+use rayon::prelude::*;
+
+/// Long side of the photographs that are compared, px, and the most features of each: neighbours are told by a fraction of what poses need.
+const SIDE: u32 = 480;
+const FEATURES: usize = 1000;
+/// Photographs that are compared; of more, evenly spaced ones.
+const PHOTOGRAPHS: usize = 120;
+
+/// Pairs across which the poses must jump, to be told from parts of a scene that do look alike.
+const JUMPS: usize = 2;
+/// Neighbours that must agree with a photograph for it to be in place.
+const SEVERAL: usize = 2;
+/// The share of pairs that contradict their poses from which on it is not single photographs that are wrong.
+const SHARE: f64 = 0.2;
+
+/// What the matches of photographs say of their poses.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct PoseCheck {
+    /// Pairs of adjacent photographs with enough matches to tell.
+    pub pairs: usize,
+    /// Names of those whose matches contradict their poses, those with most matches first.
+    pub contradicting: Vec<[String; 2]>,
+    /// Those of them whose photographs agree with others: there the poses jump.
+    pub jumps: Vec<[String; 2]>,
+}
+
+impl PoseCheck {
+    /// Whether more is wrong than the poses of single photographs.
+    pub fn is_broken(&self) -> bool {
+        self.jumps.len() >= JUMPS || (self.contradicting.len() >= JUMPS && self.share() >= SHARE)
+    }
+
+    /// The share of pairs that contradict their poses.
+    pub fn share(&self) -> f64 {
+        self.contradicting.len() as f64 / self.pairs.max(1) as f64
+    }
+}
+
+/// Matches the photographs of `dataset` and compares what they say with its poses. Photographs that cannot be read are left out.
+pub fn check_poses(dataset: &Dataset) -> PoseCheck {
+    let step = dataset.views.len().div_ceil(PHOTOGRAPHS).max(1);
+    let seen: Vec<(&View, PhotoInfo, Features)> = dataset
+        .views
+        .par_iter()
+        .step_by(step)
+        .enumerate()
+        .filter_map(|(i, view)| look(i, view))
+        .collect();
+    let (photos, features): (Vec<PhotoInfo>, Vec<Features>) = seen
+        .iter()
+        .enumerate()
+        .map(|(group, (_, info, features))| (PhotoInfo { group, ..info.clone() }, features.clone()))
+        .unzip();
+    let matching = MatchOptions::default();
+    let candidates = candidate_pairs(&features, &PairOptions::default(), &matching);
+    let matches = match_pairs(&features, &candidates, &matching, || ());
+    let (_, pairs) = verify(&photos, &features, &matches, &MapOptions::default(), &mut |_| ());
+    let strengths = strengths(&photos, &features, &pairs);
+    let model = Model {
+        cameras: photos.iter().map(|photo| photo.camera).collect(),
+        poses: poses(seen.iter().map(|(view, ..)| &view.camera)),
+        ..Model::default()
+    };
+    let agreement = agreement(&photos, &features, &pairs, &model);
+    let in_place = in_place(photos.len(), &pairs, &strengths, &agreement);
+    let names = |pair: [u32; 2]| pair.map(|photo| photos[photo as usize].name.clone());
+    let contradicting: Vec<[u32; 2]> = contradictions(&pairs, &strengths, &agreement)
+        .into_iter()
+        .map(|i| pairs[i].photos)
+        .collect();
+    let jump = |photos: &&[u32; 2]| photos.iter().all(|photo| in_place[*photo as usize]);
+    PoseCheck {
+        pairs: telling(&pairs, &strengths).count(),
+        jumps: contradicting.iter().filter(jump).copied().map(names).collect(),
+        contradicting: contradicting.into_iter().map(names).collect(),
+    }
+}
+
+/// `[photos]` whether several neighbours of a photograph agree with its pose: one that is wrong on its own contradicts all of them, while a jump leaves
+/// each side in agreement with itself.
+fn in_place(photos: usize, pairs: &[VerifiedPair], strengths: &[f64], agreement: &[Option<f64>]) -> Vec<bool> {
+    let mut agreeing = vec![0; photos];
+    let agree = telling(pairs, strengths).filter(|i| agreement[*i].is_some_and(|agreement| agreement > 0.5));
+    for photo in agree.flat_map(|i| pairs[i].photos) {
+        agreeing[photo as usize] += 1;
+    }
+    agreeing.into_iter().map(|agreeing| agreeing >= SEVERAL).collect()
+}
+
+/// A photograph and its features at the size at which it is compared.
+fn look(group: usize, view: &View) -> Option<(&View, PhotoInfo, Features)> {
+    let full = view.camera.intrinsics;
+    let k = full.scaled((SIDE as f32 / full.width.max(full.height) as f32).min(1.0));
+    let photo = view.photo.load_at(k.width, k.height).ok()?;
+    let features = features(&photo);
+    let info = PhotoInfo {
+        name: view.name.clone(),
+        width: k.width,
+        height: k.height,
+        group,
+        focal_prior_px: Some(f64::from(k.fx)),
+        up: None,
+        camera: Some(camera(&k)),
+        mount: None,
+    };
+    Some((view, info, features))
+}
+
+fn features(photo: &Photo) -> Features {
+    let grey: Vec<u8> = photo.data.chunks_exact(photo.channels as usize).map(luma).collect();
+    let sift = Sift {
+        max_features: FEATURES,
+        ..Sift::default()
+    };
+    sift.extract(&GreyPhoto {
+        width: photo.width,
+        height: photo.height,
+        data: &grey,
+        mask: photo.alpha().as_deref().or(photo.mask.as_deref()),
+    })
+}
+
+fn camera(k: &Intrinsics) -> DCamera {
+    let [fx, fy, cx, cy] = [k.fx, k.fy, k.cx, k.cy].map(f64::from);
+    DCamera {
+        width: k.width,
+        height: k.height,
+        parameters: [fx, fy, cx, cy, 0.0, 0.0, 0.0, 0.0],
+    }
+}
+
+/// The poses in a world in which the cameras' median distance from their middle is 1.
+fn poses<'a>(cameras: impl Iterator<Item = &'a Camera>) -> Vec<Option<DPose>> {
+    let mut poses: Vec<DPose> = cameras
+        .map(|camera| DPose {
+            rotation: camera.pose.rotation.as_dquat(),
+            position: camera.pose.position.as_dvec3(),
+        })
+        .collect();
+    let middle = poses.iter().map(|pose| pose.position).sum::<glam::DVec3>() / poses.len().max(1) as f64;
+    let mut distances: Vec<f64> = poses.iter().map(|pose| pose.position.distance(middle)).collect();
+    distances.sort_by(f64::total_cmp);
+    let scale = distances
+        .get(distances.len() / 2)
+        .map_or(1.0, |distance| distance.max(f64::MIN_POSITIVE));
+    poses
+        .iter_mut()
+        .for_each(|pose| pose.position = (pose.position - middle) / scale);
+    poses.into_iter().map(Some).collect()
+}

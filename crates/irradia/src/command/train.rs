@@ -253,8 +253,9 @@ fn with_poses(input: TrainInput, poses: Option<PosesOf>) -> Result<(TrainRequest
     }
     let found = check(&input)?;
     if !found.is_broken() {
+        let agree = found.pairs - found.contradicting.len();
         note(format_args!(
-            "{} pairs of photographs were matched: they agree with the given poses",
+            "{agree} of {} pairs of photographs agree with the given poses",
             found.pairs
         ));
         return Ok(given);

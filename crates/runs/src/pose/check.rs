@@ -26,7 +26,7 @@ const JUMPS: usize = 2;
 /// Neighbours that must agree with a photograph for it to be in place.
 const SEVERAL: usize = 2;
 /// The share of pairs that contradict their poses from which on it is not single photographs that are wrong.
-const SHARE: f64 = 0.2;
+const SHARE: f64 = 0.1;
 
 /// What the matches of photographs say of their poses.
 #[derive(Clone, Debug, Default, PartialEq)]

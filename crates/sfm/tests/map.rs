@@ -12,7 +12,7 @@ use irradia_sfm::map::{
     to_distances,
 };
 use std::f64::consts::{FRAC_PI_2, PI};
-use world::{World, around};
+use world::{CAMERA, World, around, look};
 
 #[test]
 fn cameras_return_from_noise_wrong_matches_and_an_unknown_lens() {
@@ -45,6 +45,44 @@ fn cameras_return_from_noise_wrong_matches_and_an_unknown_lens() {
     assert!(up > 0.5, "{up}");
     for point in &model.points {
         assert!(point.track.len() >= 2 && point.track.is_sorted() && point.error < 4.0);
+    }
+}
+
+/// Photographs of a room all around by a lens of short focal length, 300 px at 1000.
+fn wide(fisheye: bool) -> World {
+    let mut rng = Rng::new(7, 1);
+    let mut uniform = move || f64::from(rng.range(-1.0, 1.0));
+    let mut direction = move || DVec3::new(uniform(), uniform(), uniform());
+    let points: Vec<(DVec3, DVec3)> = (0..3000)
+        .map(|_| {
+            let wall = direction();
+            let place = 3.0 * wall / wall.abs().max_element();
+            (place, -place.normalize())
+        })
+        .collect();
+    let poses = (0..24).map(|i| {
+        let angle = std::f64::consts::TAU * f64::from(i) / 24.0;
+        let eye = DVec3::new(1.2 * angle.cos(), 1.2 * angle.sin(), 0.3 * (3.0 * angle).sin());
+        look(eye, DVec3::new(-eye.x, -eye.y, 0.2 * (5.0 * angle).cos()))
+    });
+    let camera = DCamera {
+        parameters: [300.0, 300.0, 500.0, 375.0, 0.0, 0.0, 0.0, 0.0],
+        fisheye,
+        ..CAMERA
+    };
+    World::of_points(camera, poses.collect(), &points, 0, 0.5, 0.2, 3)
+}
+
+#[test]
+fn a_fisheye_is_told_from_a_wide_perspective_lens() {
+    for fisheye in [true, false] {
+        let world = wide(fisheye);
+        let result = world.map();
+        let model = &result.models[0];
+        let camera = model.cameras[0].expect("registered");
+        assert_eq!((model.registered(), camera.fisheye), (24, fisheye), "{camera:?}");
+        assert!((camera.focal() / 300.0 - 1.0).abs() < 0.005, "{camera:?}");
+        assert!(world.auc(model, 1.0) > 95.0, "{fisheye}: {}", world.auc(model, 1.0));
     }
 }
 

@@ -236,6 +236,7 @@ fn pinhole(face: &PanoramaFace) -> DCamera {
         width: k.width,
         height: k.height,
         parameters: [k.fx, k.fy, k.cx, k.cy, 0.0, 0.0, 0.0, 0.0].map(f64::from),
+        fisheye: false,
     }
 }
 

@@ -141,6 +141,7 @@ fn camera(k: &Intrinsics) -> DCamera {
         width: k.width,
         height: k.height,
         parameters: [fx, fy, cx, cy, 0.0, 0.0, 0.0, 0.0],
+        fisheye: false,
     }
 }
 

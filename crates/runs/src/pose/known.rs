@@ -108,9 +108,11 @@ impl KnownPoses {
             .cameras
             .get(&id)
             .ok_or_else(|| refused(format!("camera {id} is missing")))?;
-        let parameters = camera.opencv().ok_or_else(|| {
+        let perspective = camera.opencv().map(|parameters| (parameters, false));
+        let lens = perspective.or_else(|| Some((camera.fisheye()?, true)));
+        let (parameters, fisheye) = lens.ok_or_else(|| {
             refused(format!(
-                "photographs cannot be added to cameras of the model {}, only to pinhole cameras, RADIAL and OPENCV",
+                "photographs cannot be added to cameras of the model {}, only to pinhole cameras, RADIAL, OPENCV and OPENCV_FISHEYE",
                 camera.model
             ))
         })?;
@@ -118,6 +120,7 @@ impl KnownPoses {
             width: camera.width as u32,
             height: camera.height as u32,
             parameters,
+            fisheye,
         })
     }
 }

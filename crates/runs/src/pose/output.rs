@@ -148,7 +148,9 @@ fn colmap_model(work: &Work, infos: &[PhotoInfo], model: &Model) -> ColmapModel 
 /// The simplest of COLMAP's models that the camera fits in.
 fn colmap_camera(id: u32, camera: &DCamera) -> ColmapCamera {
     let [fx, fy, cx, cy, k1, k2, p1, p2] = camera.parameters;
-    let (model, params) = if fx == fy && [k2, p1, p2] == [0.0; 3] {
+    let (model, params) = if camera.fisheye {
+        ("OPENCV_FISHEYE", camera.parameters.to_vec())
+    } else if fx == fy && [k2, p1, p2] == [0.0; 3] {
         ("SIMPLE_RADIAL", vec![fx, cx, cy, k1])
     } else {
         ("OPENCV", camera.parameters.to_vec())

@@ -345,6 +345,54 @@ fn photographs_of_two_scenes_a_copy_and_a_text_file_have_one_clear_outcome() {
 }
 
 #[test]
+fn a_fisheye_is_found_without_metadata_and_photographs_are_added_to_it() {
+    let folder = tempfile::tempdir().unwrap();
+    let options = SynthOptions {
+        scene: irradia_runs::synth::SceneName::Room,
+        views: 20,
+        width: 480,
+        height: 480,
+        lens: irradia_runs::synth::SynthLens::Fisheye,
+        ..OPTIONS
+    };
+    let capture = Capture::new(&options).unwrap();
+    let scene = options.scene.build(options.seed).0;
+    let [first, more, out] = ["first", "more", "data"].map(|name| folder.path().join(name));
+    let mut truth = 0.0;
+    let shots = capture.shots().iter().filter(|shot| shot.part == Part::Train);
+    for (i, shot) in shots.enumerate() {
+        let k = shot.camera.intrinsics;
+        truth = f64::from(k.fx);
+        let part = if i % 7 == 3 { &more } else { &first };
+        fs::create_dir_all(part).unwrap();
+        let frame = scene.trace(&shot.camera, 4, i as u64);
+        write_png(&part.join(format!("{i:02}.png")), k.width, k.height, 4, &frame.rgba()).unwrap();
+    }
+    let report = quietly(&PoseInput::new(&first, &out)).unwrap();
+    assert_eq!(report.registered, report.photos, "{report:#?}");
+    assert!(
+        (report.cameras[0].focal_px / truth - 1.0).abs() < 0.01,
+        "{report:#?}, not {truth}"
+    );
+    let faces = |name: &str| {
+        let dataset = read_dataset(&out, &DatasetOptions::default()).unwrap();
+        dataset.views.iter().filter(|view| view.name.contains(name)).count()
+    };
+    assert!(faces("00.png") > 1, "its lens is written: it is cut into faces");
+    let added = PoseInput {
+        into: true,
+        ..PoseInput::new(&more, &out)
+    };
+    let report = quietly(&added).unwrap();
+    assert_eq!(
+        (report.registered, report.left_out.len()),
+        (options.views as usize, 0),
+        "{report:#?}"
+    );
+    assert!(faces("03.png") > 1);
+}
+
+#[test]
 fn panoramas_in_folders_are_posed_by_their_faces() {
     let folder = tempfile::tempdir().unwrap();
     let options = SynthOptions {

@@ -12,6 +12,7 @@ fn world(poses: usize, points: usize, cameras: usize, noise: f64, seed: u64) -> 
             width: 640,
             height: 480,
             parameters: [500.0, 505.0, 320.0, 240.0, 0.05 + normal(0.01), -0.03, 0.001, -0.001],
+            fisheye: false,
         };
         exact.cameras.push(AdjustedCamera::new(camera, Freedom::HELD));
     }

@@ -3,18 +3,23 @@
 use glam::{DVec2, DVec3};
 use irradia_scene::Lens;
 
-/// Number of parameters: fx, fy, cx, cy, k1, k2, p1, p2.
+/// Number of parameters: fx, fy, cx, cy, then k1, k2, p1, p2, or k1 to k4 of a fisheye.
 pub const PARAMETERS: usize = 8;
 
-/// Intrinsics of a camera with OpenCV's first four lens coefficients (COLMAP's `OPENCV`).
+/// The angle from a fisheye's axis up to which it is used, radians: beyond, the plane z = 1 on which poses are found is too far out.
+const WIDEST: f64 = 1.35;
+
+/// Intrinsics of a camera with OpenCV's first four lens coefficients (COLMAP's `OPENCV`), or of a fisheye (`OPENCV_FISHEYE`).
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct DCamera {
     /// Photographs' width, px.
     pub width: u32,
     /// Photographs' height, px.
     pub height: u32,
-    /// fx, fy, cx, cy in px, then k1, k2, p1, p2; the first pixel's centre is at 0.5.
+    /// fx, fy, cx, cy in px, then k1, k2, p1, p2, or k1 to k4 of a fisheye; the first pixel's centre is at 0.5.
     pub parameters: [f64; PARAMETERS],
+    /// Whether the distance from the centre follows the angle from the axis, not its tangent.
+    pub fisheye: bool,
 }
 
 /// A projection and its derivatives.
@@ -36,6 +41,7 @@ impl DCamera {
             width,
             height,
             parameters: [focal, focal, cx, cy, 0.0, 0.0, 0.0, 0.0],
+            fisheye: false,
         }
     }
 
@@ -47,12 +53,24 @@ impl DCamera {
     /// The lens.
     pub fn lens(&self) -> Lens {
         let [.., k1, k2, p1, p2] = self.parameters;
+        if self.fisheye {
+            return Lens::fisheye([k1, k2, p1, p2]);
+        }
         if [k1, k2, p1, p2] == [0.0; 4] {
             return Lens::Pinhole;
         }
         Lens::Opencv {
             k: [k1, k2, 0.0, 0.0, 0.0, 0.0],
             p: [p1, p2],
+        }
+    }
+
+    /// Pixels per unit of the plane z = 1 at a point of it, away from the axis, where a fisheye has fewest.
+    pub fn focal_at(&self, p: DVec2) -> f64 {
+        if self.fisheye {
+            self.focal() * self.angle_slope(p.length().atan()) / (1.0 + p.length_squared())
+        } else {
+            self.focal()
         }
     }
 
@@ -65,8 +83,39 @@ impl DCamera {
         DVec2::new(fx * d.x + cx, fy * d.y + cy)
     }
 
+    /// The distance from the centre, in focal lengths, at which a fisheye shows the angle `theta` from its axis.
+    fn angle_distance(&self, theta: f64) -> f64 {
+        let [.., k1, k2, k3, k4] = self.parameters;
+        let t2 = theta * theta;
+        theta * (1.0 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
+    }
+
+    /// d [`Self::angle_distance`] / d theta.
+    fn angle_slope(&self, theta: f64) -> f64 {
+        let [.., k1, k2, k3, k4] = self.parameters;
+        let t2 = theta * theta;
+        1.0 + t2 * (3.0 * k1 + t2 * (5.0 * k2 + t2 * (7.0 * k3 + t2 * 9.0 * k4)))
+    }
+
+    /// A fisheye's distance from the centre by that on the plane z = 1, r, and its derivative by r, divided by r.
+    fn fisheye_scale(&self, x: f64, y: f64) -> [f64; 2] {
+        let r2 = x * x + y * y;
+        // The first terms of both, where their differences would cancel.
+        if r2 < 1e-8 {
+            let slope = self.parameters[4] - 1.0 / 3.0;
+            return [1.0 + slope * r2, 2.0 * slope];
+        }
+        let r = r2.sqrt();
+        let theta = r.atan();
+        let scale = self.angle_distance(theta) / r;
+        [scale, (self.angle_slope(theta) / (1.0 + r2) - scale) / r2]
+    }
+
     #[inline(always)]
     fn distort(&self, x: f64, y: f64) -> DVec2 {
+        if self.fisheye {
+            return DVec2::new(x, y) * self.fisheye_scale(x, y)[0];
+        }
         let [.., k1, k2, p1, p2] = self.parameters;
         let r2 = x * x + y * y;
         let radial = 1.0 + r2 * (k1 + r2 * k2);
@@ -79,6 +128,10 @@ impl DCamera {
     /// d distorted / d (x, y): `[[xx, xy], [yx, yy]]`; symmetric.
     #[inline(always)]
     fn distort_derivative(&self, x: f64, y: f64) -> [f64; 3] {
+        if self.fisheye {
+            let [scale, slope] = self.fisheye_scale(x, y);
+            return [scale + x * x * slope, x * y * slope, scale + y * y * slope];
+        }
         let [.., k1, k2, p1, p2] = self.parameters;
         let r2 = x * x + y * y;
         let radial = 1.0 + r2 * (k1 + r2 * k2);
@@ -100,38 +153,43 @@ impl DCamera {
         let DVec2 { x: dx, y: dy } = self.distort(x, y);
         let [xx, xy, yy] = self.distort_derivative(x, y);
         let row = |f: f64, a: f64, b: f64| DVec3::new(f * a, f * b, -f * (a * x + b * y)) * inverse;
+        let by_lens = self.by_lens(x, y, r2);
+        let [of_x, of_y] = [0, 1].map(|axis| by_lens.map(|by| [fx, fy][axis] * by[axis]));
         Projection {
             at: DVec2::new(fx * dx + cx, fy * dy + cy),
             by_point: [row(fx, xx, xy), row(fy, xy, yy)],
             by_camera: [
-                [
-                    dx,
-                    0.0,
-                    1.0,
-                    0.0,
-                    fx * x * r2,
-                    fx * x * r2 * r2,
-                    fx * 2.0 * x * y,
-                    fx * (r2 + 2.0 * x * x),
-                ],
-                [
-                    0.0,
-                    dy,
-                    0.0,
-                    1.0,
-                    fy * y * r2,
-                    fy * y * r2 * r2,
-                    fy * (r2 + 2.0 * y * y),
-                    fy * 2.0 * x * y,
-                ],
+                [dx, 0.0, 1.0, 0.0, of_x[0], of_x[1], of_x[2], of_x[3]],
+                [0.0, dy, 0.0, 1.0, of_y[0], of_y[1], of_y[2], of_y[3]],
             ],
         }
+    }
+
+    /// d distorted / d lens coefficients, of x and of y for each.
+    #[inline(always)]
+    fn by_lens(&self, x: f64, y: f64, r2: f64) -> [[f64; 2]; 4] {
+        if self.fisheye {
+            let r = r2.sqrt();
+            let theta = r.atan();
+            let t2 = theta * theta;
+            let first = if r > 1e-4 { theta * t2 / r } else { t2 };
+            return [1.0, t2, t2 * t2, t2 * t2 * t2].map(|power| [x * first * power, y * first * power]);
+        }
+        [
+            [x * r2, y * r2],
+            [x * r2 * r2, y * r2 * r2],
+            [2.0 * x * y, r2 + 2.0 * y * y],
+            [r2 + 2.0 * x * x, 2.0 * x * y],
+        ]
     }
 
     /// The point of the plane z = 1 that projects to `pixel`, by Newton's method; `None` where the lens is not invertible.
     pub fn unproject(&self, pixel: DVec2) -> Option<DVec2> {
         let [fx, fy, cx, cy, ..] = self.parameters;
         let target = DVec2::new((pixel.x - cx) / fx, (pixel.y - cy) / fy);
+        if self.fisheye {
+            return self.unproject_fisheye(target);
+        }
         let mut p = target;
         for _ in 0..20 {
             let error = self.distort(p.x, p.y) - target;
@@ -148,6 +206,25 @@ impl DCamera {
         }
         None
     }
+
+    /// As [`Self::unproject`], of a place in focal lengths from the centre.
+    fn unproject_fisheye(&self, target: DVec2) -> Option<DVec2> {
+        let distance = target.length();
+        let mut theta = distance.min(WIDEST);
+        for _ in 0..20 {
+            let slope = self.angle_slope(theta);
+            if slope.is_nan() || slope <= 1e-6 {
+                return None;
+            }
+            let step = (self.angle_distance(theta) - distance) / slope;
+            theta -= step;
+            if step.abs() < 1e-12 {
+                let scale = if distance > 1e-12 { theta.tan() / distance } else { 1.0 };
+                return (0.0..WIDEST).contains(&theta).then(|| target * scale);
+            }
+        }
+        None
+    }
 }
 
 #[cfg(test)]
@@ -159,13 +236,29 @@ mod tests {
             width: 640,
             height: 480,
             parameters: [500.0, 510.0, 322.0, 239.0, 0.06, -0.08, -0.001, 0.002],
+            fisheye: false,
+        }
+    }
+
+    fn fisheye() -> DCamera {
+        DCamera {
+            parameters: [300.0, 305.0, 322.0, 239.0, 0.03, -0.01, 0.002, -0.0005],
+            fisheye: true,
+            ..camera()
         }
     }
 
     #[test]
     fn derivatives_match_finite_differences() {
+        for p in [DVec3::new(0.7, -0.5, 2.0), DVec3::new(1e-5, 2e-5, 1.0)] {
+            check_derivatives(camera(), p);
+            check_derivatives(fisheye(), p);
+        }
+        check_derivatives(fisheye(), DVec3::new(3.0, -2.0, 1.0));
+    }
+
+    fn check_derivatives(camera: DCamera, p: DVec3) {
         const H: f64 = 1e-6;
-        let (camera, p) = (camera(), DVec3::new(0.7, -0.5, 2.0));
         let projection = camera.project(p);
         assert_eq!(projection.at, camera.pixel(p));
         for axis in 0..3 {
@@ -203,6 +296,21 @@ mod tests {
             let distorted = camera.lens().distort(p);
             assert!((pixel - DVec2::new(500.0 * distorted.x + 322.0, 510.0 * distorted.y + 239.0)).length() < 1e-10);
         }
+        let fisheye = fisheye();
+        for p in [DVec2::ZERO, DVec2::new(0.5, -0.4), DVec2::new(-3.6, 2.2)] {
+            let pixel = fisheye.pixel(p.extend(1.0));
+            assert!((fisheye.unproject(pixel).expect("invertible") - p).length() < 1e-9);
+            let distorted = fisheye.lens().distort(p);
+            assert!((pixel - DVec2::new(300.0 * distorted.x + 322.0, 305.0 * distorted.y + 239.0)).length() < 1e-9);
+            let moved = fisheye.pixel((p * 1.000_001).extend(1.0)) - pixel;
+            let slope = moved.length() / (1e-6 * p.length().max(1e-12));
+            assert!(p == DVec2::ZERO || (slope / fisheye.focal_at(p) - 1.0).abs() < 0.02);
+        }
+        assert_eq!(
+            fisheye.unproject(DVec2::new(322.0 + 300.0 * 1.5, 239.0)),
+            None,
+            "too wide"
+        );
         let mut folded = camera;
         folded.parameters[4] = -2.0;
         assert_eq!(folded.unproject(DVec2::new(5000.0, 239.0)), None);

@@ -7,6 +7,7 @@
 mod agree;
 mod distance;
 mod finish;
+mod fisheye;
 mod focal;
 mod grow;
 mod metric;
@@ -54,7 +55,18 @@ pub fn reconstruct(
     progress: &mut dyn FnMut(Progress),
 ) -> Reconstruction {
     assert_eq!(photos.len(), features.len(), "one set of features a photograph");
-    let mut found = mapped(photos, features, pairs, &known_cameras(photos), options, progress);
+    let mut known = known_cameras(photos);
+    let mut found = mapped(photos, features, pairs, &known, options, progress);
+    let fisheyes = found.models.first().map(|model| fisheye::find(photos, features, model));
+    if let Some(fisheyes) = fisheyes.filter(|fisheyes| !fisheyes.is_empty()) {
+        for (group, camera) in fisheyes {
+            known[group] = Some((camera, Source::Pairs));
+        }
+        let again = mapped(photos, features, pairs, &known, options, progress);
+        if explained(&again) > explained(&found) {
+            found = again;
+        }
+    }
     let mut grouped = photos.to_vec();
     while found.zooms.len() < MOST_ZOOMS {
         let within = found.models.first().and_then(|m| zoom::find(&grouped, features, m));
@@ -85,6 +97,17 @@ pub fn reconstruct(
         }
     }
     found
+}
+
+/// Photographs of the largest model, and what its points explain of them.
+fn explained(found: &Reconstruction) -> (usize, usize) {
+    let model = found.models.first();
+    model.map_or((0, 0), |model| {
+        (
+            model.registered(),
+            model.points.iter().map(|point| point.track.len()).sum(),
+        )
+    })
 }
 
 /// `[groups]` the cameras that are known exactly.

@@ -130,7 +130,8 @@ impl<'a> Working<'a> {
         let photo = self.tracks.observations[observation].photo;
         let pose = self.poses[photo as usize].as_ref()?;
         let at = self.plane[observation];
-        at.is_finite().then(|| Sight::new(pose, at, self.camera(photo).focal()))
+        at.is_finite()
+            .then(|| Sight::new(pose, at, self.camera(photo).focal_at(at)))
     }
 
     /// The track of an observation.

@@ -247,7 +247,8 @@ impl Working<'_> {
                 0..=3 => 0,
                 _ => 1,
             },
-            tangential: full,
+            // Those of a fisheye are its k3 and k4, which stay 0.
+            tangential: full && !self.cameras[group].fisheye,
         }
     }
 

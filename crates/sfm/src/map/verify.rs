@@ -185,6 +185,10 @@ fn calibrated(
     let group = pair.photos.map(|p| &cameras[photos[p as usize].group]);
     let [camera_a, camera_b]: [&DCamera; 2] = group.map(|g| &g.0);
     let plane = |camera: &DCamera, at: DVec2| {
+        if camera.fisheye {
+            // What is not a number is no inlier.
+            return camera.unproject(at).unwrap_or(DVec2::NAN);
+        }
         let [fx, fy, cx, cy, ..] = camera.parameters;
         DVec2::new((at.x - cx) / fx, (at.y - cy) / fy)
     };

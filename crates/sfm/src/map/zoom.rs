@@ -173,7 +173,7 @@ fn alone(camera: &DCamera) -> AdjustedCamera {
 }
 
 /// Points, those of long tracks first, that give each photograph [`ENOUGH`] observations.
-fn covering(model: &Model, photos: usize) -> Vec<usize> {
+pub(super) fn covering(model: &Model, photos: usize) -> Vec<usize> {
     let mut order: Vec<usize> = (0..model.points.len()).collect();
     order.sort_by_key(|i| std::cmp::Reverse(model.points[*i].track.len()));
     let mut seen = vec![0usize; photos];

@@ -22,6 +22,7 @@ pub const CAMERA: DCamera = DCamera {
     width: 1000,
     height: 750,
     parameters: [870.0, 870.0, 500.0, 375.0, 0.06, -0.04, 0.0, 0.0],
+    fisheye: false,
 };
 
 /// A pose at `eye` that looks at `target`; +Z is up.

@@ -330,6 +330,19 @@ impl ColmapCamera {
         };
         Some([fx, fy, cx, cy, k1, k2, p1, p2])
     }
+
+    /// `fx, fy, cx, cy, k1, k2, k3, k4` of OpenCV's fisheye; `None` for other lenses.
+    pub fn fisheye(&self) -> Option<[f64; 8]> {
+        let ([fx, fy], [cx, cy], lens) = intrinsics(self).ok()?;
+        match lens {
+            Lens::Fisheye {
+                k: [k1, k2, k3, k4],
+                p: [0.0, 0.0],
+                s: [0.0, 0.0],
+            } => Some([fx, fy, cx, cy, k1, k2, k3, k4]),
+            _ => None,
+        }
+    }
 }
 
 fn declared_camera(camera: &ColmapCamera) -> Result<DeclaredCamera, Malformed> {

@@ -4,12 +4,11 @@
 //! to a few degrees, and what is near the rim is dropped. An adjustment of the same observations with a fisheye then has a much lower cost, and the
 //! scene is mapped again with it.
 
+use super::readjust;
 use super::types::{Model, PhotoInfo};
-use super::zoom::covering;
 use crate::Features;
-use crate::adjust::{AdjustOptions, AdjustedCamera, Focal, Freedom, Loss, Observation, Problem, View};
+use crate::adjust::{AdjustedCamera, Focal, Freedom};
 use crate::geometry::camera::DCamera;
-use glam::DVec2;
 
 /// Focal length in long sides above which no fisheye is tried: that of 71 degrees along the long side.
 const WIDE: f64 = 0.7;
@@ -40,13 +39,9 @@ pub(super) fn find(photos: &[PhotoInfo], features: &[Features], model: &Model) -
         return Vec::new();
     }
     let adjusted = |fisheye: bool| {
-        let mut problem = problem(photos, features, model, &groups, fisheye);
-        let report = problem.solve(&AdjustOptions {
-            loss: Loss::Cauchy(1.0),
-            iterations: 50,
-            tolerance: 1e-4,
-        });
-        (report.final_cost, problem)
+        let cameras = cameras(model, &groups, fisheye);
+        let mut problem = readjust::problem(photos, features, model, cameras, |photo| photos[photo].group);
+        (problem.solve(&readjust::OPTIONS).final_cost, problem)
     };
     let ((perspective, _), (fisheye, found)) = (adjusted(false), adjusted(true));
     if fisheye.is_nan() || fisheye > BETTER * perspective {
@@ -58,49 +53,24 @@ pub(super) fn find(photos: &[PhotoInfo], features: &[Features], model: &Model) -
         .collect()
 }
 
-/// The adjustment of a model, in which the lenses of `groups` are free.
-fn problem(photos: &[PhotoInfo], features: &[Features], model: &Model, groups: &[usize], fisheye: bool) -> Problem {
-    let mut problem = Problem::default();
-    for (group, camera) in model.cameras.iter().enumerate() {
+/// `[groups]` the cameras of a model, of which the lenses of `groups` are free.
+fn cameras(model: &Model, groups: &[usize], fisheye: bool) -> Vec<AdjustedCamera> {
+    let camera = |(group, camera): (usize, &Option<DCamera>)| {
         let camera = camera.unwrap_or(DCamera::centered(1, 1, 1.0));
-        problem.cameras.push(if groups.contains(&group) {
-            let freedom = Freedom {
-                focal: Focal::Tied,
-                radial: 2,
-                ..Freedom::HELD
-            };
-            AdjustedCamera::new(if fisheye { as_fisheye(&camera) } else { camera }, freedom)
-        } else {
-            AdjustedCamera::new(camera, Freedom::HELD)
-        });
-    }
-    let mut number = vec![u32::MAX; photos.len()];
-    for (photo, pose) in model.poses.iter().enumerate() {
-        let Some(pose) = pose else { continue };
-        number[photo] = problem.poses.len() as u32;
-        problem.views.push(View::new(number[photo], photos[photo].group as u32));
-        problem.poses.push(*pose);
-        problem.held_poses.push(false);
-    }
-    problem.starts.push(0);
-    for point in covering(model, photos.len()) {
-        let point = &model.points[point];
-        for (photo, keypoint) in &point.track {
-            let k = &features[*photo as usize].keypoints[*keypoint as usize];
-            problem.observations.push(Observation {
-                view: number[*photo as usize],
-                at: DVec2::new(k.x.into(), k.y.into()),
-            });
+        if !groups.contains(&group) {
+            return AdjustedCamera::new(camera, Freedom::HELD);
         }
-        problem.points.push(point.position);
-        problem.held_points.push(false);
-        problem.starts.push(problem.observations.len() as u32);
-    }
-    problem
+        let freedom = Freedom {
+            focal: Focal::Tied,
+            radial: 2,
+            ..Freedom::HELD
+        };
+        AdjustedCamera::new(if fisheye { as_fisheye(&camera) } else { camera }, freedom)
+    };
+    model.cameras.iter().enumerate().map(camera).collect()
 }
 
-/// The fisheye that shows the angles up to 45 degrees from the axis where the perspective camera does: of its two radial coefficients, 1 / 3 is what
-/// the tangent has more than the angle.
+/// The fisheye that shows what is near the axis where the perspective camera does.
 fn as_fisheye(camera: &DCamera) -> DCamera {
     let [fx, fy, cx, cy, ..] = camera.parameters;
     DCamera {

@@ -12,6 +12,7 @@ mod focal;
 mod grow;
 mod metric;
 mod model;
+mod readjust;
 mod refine;
 mod seed;
 mod tracks;

@@ -6,11 +6,11 @@
 //! they are, the cost falls by 0 to 7 % and no clusters are more than 1.1 apart; enlarged, it falls by 5 to 58 %, and the clusters are 1.23
 //! to 1.58 apart before the scene is mapped again.
 
+use super::readjust::{self, posed};
 use super::types::{Model, PhotoInfo, Zoom};
-use crate::adjust::{AdjustOptions, AdjustedCamera, Belief, Focal, Freedom, Loss, Observation, Problem, View};
+use crate::adjust::{AdjustedCamera, Belief, Focal, Freedom};
 use crate::geometry::camera::DCamera;
 use crate::{Features, median};
-use glam::DVec2;
 
 /// Photographs of a cluster, at least: fewer hardly determine a camera.
 const LEAST: usize = 3;
@@ -24,8 +24,6 @@ const APART: f64 = 1.2;
 const SCATTER: f64 = 0.15;
 /// Fraction by which the cost falls with a focal length a photograph, at least.
 const BETTER: f64 = 0.02;
-/// Observations of a photograph, from long tracks, that are adjusted.
-const ENOUGH: usize = 200;
 /// Squared error, px^2, that a change of a focal length by half is worth.
 const BELIEF: f64 = 10.0;
 
@@ -117,40 +115,15 @@ fn clusters(sorted: &[(f64, usize)]) -> Option<(usize, [f64; 2])> {
 
 /// `[photos]` the focal length of each photograph, px, if each has its own; `None` if the errors hardly fall.
 fn own_focals(photos: &[PhotoInfo], features: &[Features], model: &Model) -> Option<Vec<f64>> {
-    let mut problem = Problem::default();
-    let mut number = vec![u32::MAX; photos.len()];
-    for (photo, pose) in model.poses.iter().enumerate() {
-        let (Some(pose), Some(camera)) = (pose, &model.cameras[photos[photo].group]) else {
-            continue;
-        };
-        number[photo] = problem.poses.len() as u32;
-        problem.views.push(View::new(number[photo], number[photo]));
-        problem.poses.push(*pose);
-        problem.held_poses.push(false);
-        problem.cameras.push(alone(camera));
-    }
-    problem.starts.push(0);
-    for point in covering(model, photos.len()) {
-        let point = &model.points[point];
-        for (photo, keypoint) in &point.track {
-            let k = &features[*photo as usize].keypoints[*keypoint as usize];
-            problem.observations.push(Observation {
-                view: number[*photo as usize],
-                at: DVec2::new(k.x.into(), k.y.into()),
-            });
-        }
-        problem.points.push(point.position);
-        problem.held_points.push(false);
-        problem.starts.push(problem.observations.len() as u32);
-    }
-    let report = problem.solve(&AdjustOptions {
-        loss: Loss::Cauchy(1.0),
-        iterations: 40,
-        tolerance: 3e-4,
-    });
+    let cameras = posed(model).map(|photo| Some(alone(model.cameras[photos[photo].group].as_ref()?)));
+    let cameras: Vec<AdjustedCamera> = cameras.collect::<Option<_>>()?;
+    let mut number = vec![usize::MAX; photos.len()];
+    posed(model).enumerate().for_each(|(i, photo)| number[photo] = i);
+    let mut problem = readjust::problem(photos, features, model, cameras, |photo| number[photo]);
+    let report = problem.solve(&readjust::OPTIONS);
     (report.final_cost < (1.0 - BETTER) * report.initial_cost).then(|| {
-        let focal = |number: &u32| {
-            let camera = problem.cameras.get(*number as usize);
+        let focal = |number: &usize| {
+            let camera = problem.cameras.get(*number);
             camera.map_or(f64::NAN, |camera| camera.camera.focal())
         };
         number.iter().map(focal).collect()
@@ -170,22 +143,6 @@ fn alone(camera: &DCamera) -> AdjustedCamera {
         },
         belief,
     }
-}
-
-/// Points, those of long tracks first, that give each photograph [`ENOUGH`] observations.
-pub(super) fn covering(model: &Model, photos: usize) -> Vec<usize> {
-    let mut order: Vec<usize> = (0..model.points.len()).collect();
-    order.sort_by_key(|i| std::cmp::Reverse(model.points[*i].track.len()));
-    let mut seen = vec![0usize; photos];
-    order.retain(|i| {
-        let track = &model.points[*i].track;
-        let needed = track.iter().any(|(photo, _)| seen[*photo as usize] < ENOUGH);
-        if needed {
-            track.iter().for_each(|(photo, _)| seen[*photo as usize] += 1);
-        }
-        needed
-    });
-    order
 }
 
 #[cfg(test)]

@@ -1,0 +1,73 @@
+//! A finished model adjusted once more, with other cameras, on some of its observations: whether these fit better tells what the cameras are.
+
+use super::types::{Model, PhotoInfo};
+use crate::Features;
+use crate::adjust::{AdjustOptions, AdjustedCamera, Loss, Observation, Problem, View};
+use glam::DVec2;
+
+/// Observations of a photograph, from long tracks, that are adjusted.
+const ENOUGH: usize = 200;
+
+/// The photographs of `model` with a pose.
+pub(super) fn posed(model: &Model) -> impl Iterator<Item = usize> {
+    (0..model.poses.len()).filter(|photo| model.poses[*photo].is_some())
+}
+
+/// The problem of `model` with other cameras; `camera_of` has the index into these of each posed photograph.
+pub(super) fn problem(
+    photos: &[PhotoInfo],
+    features: &[Features],
+    model: &Model,
+    cameras: Vec<AdjustedCamera>,
+    camera_of: impl Fn(usize) -> usize,
+) -> Problem {
+    let mut problem = Problem {
+        cameras,
+        starts: vec![0],
+        ..Problem::default()
+    };
+    let mut number = vec![u32::MAX; photos.len()];
+    for photo in posed(model) {
+        number[photo] = problem.poses.len() as u32;
+        problem.views.push(View::new(number[photo], camera_of(photo) as u32));
+        problem.poses.push(model.poses[photo].expect("posed"));
+        problem.held_poses.push(false);
+    }
+    for point in covering(model, photos.len()) {
+        let point = &model.points[point];
+        for (photo, keypoint) in &point.track {
+            let k = &features[*photo as usize].keypoints[*keypoint as usize];
+            problem.observations.push(Observation {
+                view: number[*photo as usize],
+                at: DVec2::new(k.x.into(), k.y.into()),
+            });
+        }
+        problem.points.push(point.position);
+        problem.held_points.push(false);
+        problem.starts.push(problem.observations.len() as u32);
+    }
+    problem
+}
+
+/// How such a problem is solved: to where costs can be compared.
+pub(super) const OPTIONS: AdjustOptions = AdjustOptions {
+    loss: Loss::Cauchy(1.0),
+    iterations: 40,
+    tolerance: 3e-4,
+};
+
+/// Points, those of long tracks first, that give each photograph [`ENOUGH`] observations.
+fn covering(model: &Model, photos: usize) -> Vec<usize> {
+    let mut order: Vec<usize> = (0..model.points.len()).collect();
+    order.sort_by_key(|i| std::cmp::Reverse(model.points[*i].track.len()));
+    let mut seen = vec![0usize; photos];
+    order.retain(|i| {
+        let track = &model.points[*i].track;
+        let needed = track.iter().any(|(photo, _)| seen[*photo as usize] < ENOUGH);
+        if needed {
+            track.iter().for_each(|(photo, _)| seen[*photo as usize] += 1);
+        }
+        needed
+    });
+    order
+}

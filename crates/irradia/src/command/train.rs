@@ -8,7 +8,7 @@ use super::{DataArgs, by_option, thread_count, use_threads, warn};
 use crate::Usage;
 use crate::interrupt::stop_flag;
 use crate::terminal::{note, one_line, say};
-use anyhow::{Result, anyhow};
+use anyhow::{Result, anyhow, ensure};
 use clap::builder::RangedU64ValueParser;
 use irradia_compute::DeviceChoice;
 use irradia_runs::scene::Dataset;
@@ -234,11 +234,6 @@ fn input(args: &Args) -> Result<TrainInput> {
 
 /// The dataset of `input`, whose photographs have poses: with these, or with new ones if they are wanted or the photographs contradict those given.
 fn with_poses(input: TrainInput, poses: Option<PosesOf>) -> Result<(TrainRequest, Dataset)> {
-    let read = |input: TrainInput| -> Result<(TrainRequest, Dataset)> {
-        let request = input.check().map_err(by_option)?;
-        let dataset = request.read_dataset()?;
-        Ok((request, dataset))
-    };
     let given = read(input.clone())?;
     RunFolder::check_free(&input.out, input.overwrite)?;
     if let Some(mapper) = poses.and_then(PosesOf::mapper) {
@@ -266,33 +261,44 @@ fn with_poses(input: TrainInput, poses: Option<PosesOf>) -> Result<(TrainRequest
     note(format_args!(
         "{line}: new ones are found; --poses given keeps those given"
     ));
-    let mut again = input;
-    let posed = pose_again(&mut again, &given.1, Poses::Irradia).and_then(|()| check(&again));
-    match posed {
-        Ok(new) if 2.0 * new.share() < found.share() => {
-            let (request, mut dataset) = read(again)?;
-            dataset
-                .warnings
-                .push(format!("{line}: new ones are used, in a world of their own"));
+    match found_anew(input, &given.1, found.share()) {
+        Ok((request, mut dataset)) => {
+            let line = format!("{line}: new ones are used, in a world of their own");
+            dataset.warnings.push(line);
             Ok((request, dataset))
         }
-        posed => {
-            let why = posed.err().map_or_else(
-                || "the photographs contradict new ones as well".to_owned(),
-                |error| one_line(&error),
-            );
-            note(format_args!("the given poses are used after all: {why}"));
+        Err(error) => {
+            note(format_args!("the given poses are used after all: {}", one_line(&error)));
             Ok(given)
         }
     }
+}
+
+/// The dataset of `input` with new poses, if they are better than those of `given`, of which the share `contradicted` of pairs is contradicted.
+fn found_anew(mut input: TrainInput, given: &Dataset, contradicted: f64) -> Result<(TrainRequest, Dataset)> {
+    pose_again(&mut input, given, Poses::Irradia)?;
+    let share = check(&input)?.share();
+    ensure!(
+        2.0 * share < contradicted,
+        "the photographs contradict new ones as well"
+    );
+    let (request, dataset) = read(input)?;
+    // A view that was cut into faces has another name than its photograph.
+    ensure!(dataset.test.len() == given.test.len(), "other views would be held out");
+    Ok((request, dataset))
+}
+
+fn read(input: TrainInput) -> Result<(TrainRequest, Dataset)> {
+    let request = input.check().map_err(by_option)?;
+    let dataset = request.read_dataset()?;
+    Ok((request, dataset))
 }
 
 /// Compares the poses of the dataset of `input` with its photographs, at a size that does not depend on that of the training.
 fn check(input: &TrainInput) -> Result<PoseCheck> {
     let mut input = input.clone();
     (input.reading.downscale, input.reading.max_side) = (1.0, Reading::default().max_side);
-    let dataset = input.check().map_err(by_option)?.read_dataset()?;
-    Ok(check_poses(&dataset))
+    Ok(check_poses(&read(input)?.1))
 }
 
 /// Begins a new run on the current threads, and finishes it; `viewer` shows it meanwhile.

@@ -10,7 +10,7 @@ use irradia_sfm::features::{Extractor, GreyPhoto, Sift};
 use irradia_sfm::geometry::camera::DCamera;
 use irradia_sfm::geometry::pose::DPose;
 use irradia_sfm::map::{
-    MapOptions, Model, PhotoInfo, VerifiedPair, agreement, contradictions, strengths, telling, verify,
+    MapOptions, Model, PairKind, PhotoInfo, VerifiedPair, agreement, contradictions, strengths, telling, verify,
 };
 use irradia_sfm::matching::{MatchOptions, PairOptions, candidate_pairs, match_pairs};
 use rayon::prelude::*;
@@ -54,26 +54,23 @@ impl PoseCheck {
 /// Matches the photographs of `dataset` and compares what they say with its poses. Photographs that cannot be read are left out.
 pub fn check_poses(dataset: &Dataset) -> PoseCheck {
     let step = dataset.views.len().div_ceil(PHOTOGRAPHS).max(1);
-    let seen: Vec<(&View, PhotoInfo, Features)> = dataset
-        .views
-        .par_iter()
-        .step_by(step)
-        .enumerate()
-        .filter_map(|(i, view)| look(i, view))
-        .collect();
-    let (photos, features): (Vec<PhotoInfo>, Vec<Features>) = seen
-        .iter()
-        .enumerate()
-        .map(|(group, (_, info, features))| (PhotoInfo { group, ..info.clone() }, features.clone()))
-        .unzip();
+    let seen: Vec<(Camera, PhotoInfo, Features)> = dataset.views.par_iter().step_by(step).filter_map(look).collect();
+    let (mut cameras, mut photos, mut features) = (Vec::new(), Vec::new(), Vec::new());
+    for (group, (camera, info, found)) in seen.into_iter().enumerate() {
+        cameras.push(camera);
+        photos.push(PhotoInfo { group, ..info });
+        features.push(found);
+    }
     let matching = MatchOptions::default();
     let candidates = candidate_pairs(&features, &PairOptions::default(), &matching);
     let matches = match_pairs(&features, &candidates, &matching, || ());
-    let (_, pairs) = verify(&photos, &features, &matches, &MapOptions::default(), &mut |_| ());
+    let (_, mut pairs) = verify(&photos, &features, &matches, &MapOptions::default(), &mut |_| ());
+    // What only turns or stands still, such as the background of a turntable, tells little of the places.
+    pairs.retain(|pair| pair.kind != PairKind::Rotation);
     let strengths = strengths(&photos, &features, &pairs);
     let model = Model {
         cameras: photos.iter().map(|photo| photo.camera).collect(),
-        poses: poses(seen.iter().map(|(view, ..)| &view.camera)),
+        poses: poses(&cameras),
         ..Model::default()
     };
     let agreement = agreement(&photos, &features, &pairs, &model);
@@ -103,7 +100,7 @@ fn in_place(photos: usize, pairs: &[VerifiedPair], strengths: &[f64], agreement:
 }
 
 /// A photograph and its features at the size at which it is compared.
-fn look(group: usize, view: &View) -> Option<(&View, PhotoInfo, Features)> {
+fn look(view: &View) -> Option<(Camera, PhotoInfo, Features)> {
     let full = view.camera.intrinsics;
     let k = full.scaled((SIDE as f32 / full.width.max(full.height) as f32).min(1.0));
     let photo = view.photo.load_at(k.width, k.height).ok()?;
@@ -112,13 +109,13 @@ fn look(group: usize, view: &View) -> Option<(&View, PhotoInfo, Features)> {
         name: view.name.clone(),
         width: k.width,
         height: k.height,
-        group,
+        group: 0,
         focal_prior_px: Some(f64::from(k.fx)),
         up: None,
         camera: Some(camera(&k)),
         mount: None,
     };
-    Some((view, info, features))
+    Some((view.camera, info, features))
 }
 
 fn features(photo: &Photo) -> Features {
@@ -146,8 +143,9 @@ fn camera(k: &Intrinsics) -> DCamera {
 }
 
 /// The poses in a world in which the cameras' median distance from their middle is 1.
-fn poses<'a>(cameras: impl Iterator<Item = &'a Camera>) -> Vec<Option<DPose>> {
+fn poses(cameras: &[Camera]) -> Vec<Option<DPose>> {
     let mut poses: Vec<DPose> = cameras
+        .iter()
         .map(|camera| DPose {
             rotation: camera.pose.rotation.as_dquat(),
             position: camera.pose.position.as_dvec3(),

@@ -219,7 +219,7 @@ impl Capture {
                     Some((_, face)) => face.turn.inverse() * DVec3::NEG_Y,
                     None => DVec3::new(right, down, 0.0),
                 }),
-                camera: face.map(|(_, face)| pinhole(face)),
+                camera: face.map(|(_, face)| DCamera::pinhole(&face.camera)),
                 mount: face.map(|(rig, face)| Mount {
                     rig: *rig,
                     rotation: face.turn,
@@ -227,16 +227,6 @@ impl Capture {
             }
         };
         used.iter().map(info).collect()
-    }
-}
-
-fn pinhole(face: &PanoramaFace) -> DCamera {
-    let k = &face.camera;
-    DCamera {
-        width: k.width,
-        height: k.height,
-        parameters: [k.fx, k.fy, k.cx, k.cy, 0.0, 0.0, 0.0, 0.0].map(f64::from),
-        fisheye: false,
     }
 }
 

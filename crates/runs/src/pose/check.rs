@@ -3,8 +3,8 @@
 //! Programs that find poses may take one part of a scene for another that looks alike, and the dataset then jumps between adjacent photographs. Their
 //! own reprojection errors do not show it, since they dropped the matches that contradict them; matching the photographs again does.
 
-use super::stages::luma;
-use irradia_scene::{Camera, Dataset, Intrinsics, Photo, View};
+use super::stages::in_grey;
+use irradia_scene::{Camera, Dataset, Photo, View};
 use irradia_sfm::Features;
 use irradia_sfm::features::{Extractor, GreyPhoto, Sift};
 use irradia_sfm::geometry::camera::DCamera;
@@ -112,14 +112,14 @@ fn look(view: &View) -> Option<(Camera, PhotoInfo, Features)> {
         group: 0,
         focal_prior_px: Some(f64::from(k.fx)),
         up: None,
-        camera: Some(camera(&k)),
+        camera: Some(DCamera::pinhole(&k)),
         mount: None,
     };
     Some((view.camera, info, features))
 }
 
 fn features(photo: &Photo) -> Features {
-    let grey: Vec<u8> = photo.data.chunks_exact(photo.channels as usize).map(luma).collect();
+    let grey = in_grey(&photo.data, photo.channels);
     let sift = Sift {
         max_features: FEATURES,
         ..Sift::default()
@@ -130,16 +130,6 @@ fn features(photo: &Photo) -> Features {
         data: &grey,
         mask: photo.alpha().as_deref().or(photo.mask.as_deref()),
     })
-}
-
-fn camera(k: &Intrinsics) -> DCamera {
-    let [fx, fy, cx, cy] = [k.fx, k.fy, k.cx, k.cy].map(f64::from);
-    DCamera {
-        width: k.width,
-        height: k.height,
-        parameters: [fx, fy, cx, cy, 0.0, 0.0, 0.0, 0.0],
-        fisheye: false,
-    }
 }
 
 /// The poses in a world in which the cameras' median distance from their middle is 1.

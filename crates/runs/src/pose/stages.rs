@@ -225,7 +225,7 @@ impl<'a> Work<'a> {
 /// Features of a photograph, in its pixels at full size, and the colours there.
 fn extract(sift: &Sift, photo: &PhotoEntry) -> Result<Looks, String> {
     let pixels = photo.read(sift.max_side).map_err(|error| error.to_string())?;
-    let grey: Vec<u8> = pixels.data.chunks_exact(pixels.channels as usize).map(luma).collect();
+    let grey = in_grey(&pixels.data, pixels.channels);
     let mask = mask_of(photo, &pixels)?;
     let features = sift.extract(&GreyPhoto {
         width: pixels.width,
@@ -259,8 +259,13 @@ fn mask_of(photo: &PhotoEntry, pixels: &Pixels) -> Result<Option<Vec<u8>>, Strin
     })
 }
 
+/// `[H, W]` the brightness of `[H, W, channels]`.
+pub(super) fn in_grey(data: &[u8], channels: u32) -> Vec<u8> {
+    data.chunks_exact(channels as usize).map(luma).collect()
+}
+
 /// Brightness of a pixel of 3 or 4 channels, with the weights of BT.709 in 1/256.
-pub(super) fn luma(pixel: &[u8]) -> u8 {
+fn luma(pixel: &[u8]) -> u8 {
     let [r, g, b] = [0, 1, 2].map(|c| u32::from(pixel[c]));
     ((54 * r + 183 * g + 19 * b + 128) >> 8) as u8
 }

@@ -1,7 +1,7 @@
 //! Intrinsics in double precision, with the derivatives that bundle adjustment needs.
 
 use glam::{DVec2, DVec3};
-use irradia_scene::Lens;
+use irradia_scene::{Intrinsics, Lens};
 
 /// Number of parameters: fx, fy, cx, cy, then k1, k2, p1, p2, or k1 to k4 of a fisheye.
 pub const PARAMETERS: usize = 8;
@@ -41,6 +41,16 @@ impl DCamera {
             width,
             height,
             parameters: [focal, focal, cx, cy, 0.0, 0.0, 0.0, 0.0],
+            fisheye: false,
+        }
+    }
+
+    /// The camera of `k`, whose lens is ignored.
+    pub fn pinhole(k: &Intrinsics) -> Self {
+        Self {
+            width: k.width,
+            height: k.height,
+            parameters: [k.fx, k.fy, k.cx, k.cy, 0.0, 0.0, 0.0, 0.0].map(f64::from),
             fisheye: false,
         }
     }

@@ -4,6 +4,8 @@
 //! (vectors of `b`) are in the lanes: a tile of 8 rows by 2 vectors of columns stays in registers over all 128 bytes. A product
 //! has at most 23 bits, which leaves 9 of 32 for an index, so that the running best of a lane is one maximum.
 
+#[cfg(target_arch = "aarch64")]
+mod neon;
 mod portable;
 #[cfg(target_arch = "x86_64")]
 mod x86;
@@ -52,7 +54,13 @@ pub fn nearest(level: Level, a: &[[u8; BYTES]], b: &[[u8; BYTES]]) -> [Vec<Neare
     match level {
         #[cfg(target_arch = "x86_64")]
         Level::Avx512(_) | Level::Avx2(_) => x86::nearest(level, a, b),
-        Level::Portable(_) => search(Arrays, a, b),
+        Level::Portable(_) => {
+            #[cfg(target_arch = "aarch64")]
+            if let Some(neon) = neon::detect() {
+                return search(neon, a, b);
+            }
+            search(Arrays, a, b)
+        }
     }
 }
 
@@ -266,6 +274,9 @@ mod tests {
             };
             for level in Level::all() {
                 assert_eq!(nearest(level, &a, &b), expected, "{} {n} {m}", level.name());
+            }
+            if n > 0 {
+                assert_eq!(search(Arrays, &a, &b), expected, "arrays {n} {m}");
             }
         }
     }

@@ -292,6 +292,7 @@ impl Sentence<'_> {
         match photos.len() {
             0 => "none".into(),
             n if n <= SHOWN => shown.join(", "),
+            n if n == SHOWN + 1 => format!("{} and 1 other", shown.join(", ")),
             n => format!("{} and {} others", shown.join(", "), n - SHOWN),
         }
     }
@@ -300,6 +301,7 @@ impl Sentence<'_> {
 impl Display for Sentence<'_> {
     fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
         let name = |photo: &usize| self.names[*photo].as_str();
+        let show = |photos: &[usize]| if photos.len() == 1 { "shows" } else { "show" };
         match self.diagnosis {
             Diagnosis::Blurred {
                 photo,
@@ -307,9 +309,10 @@ impl Display for Sentence<'_> {
                 neighbours,
             } => write!(
                 f,
-                "{} is blurred: {times:.1} times less sharp than {}, which show the same; take it again, or delete it",
+                "{} is blurred: {times:.1} times less sharp than {}, which {} the same; take it again, or delete it",
                 name(photo),
-                self.list(neighbours)
+                self.list(neighbours),
+                show(neighbours)
             ),
             Diagnosis::ExposureJump {
                 photo,
@@ -317,11 +320,12 @@ impl Display for Sentence<'_> {
                 neighbours,
             } => write!(
                 f,
-                "{} is {:.1} stops {} than {}, which show the same; lock the exposure",
+                "{} is {:.1} stops {} than {}, which {} the same; lock the exposure",
                 name(photo),
                 stops.abs(),
                 if *stops > 0.0 { "brighter" } else { "darker" },
-                self.list(neighbours)
+                self.list(neighbours),
+                show(neighbours)
             ),
             Diagnosis::Clipped {
                 photo,

@@ -306,6 +306,7 @@ impl std::fmt::Display for Reason {
                     "taken from the same place as all {partners} photographs that overlap with it: move between photographs"
                 )
             }
+            Reason::NoModel { partners: 1 } => write!(f, "it overlaps with 1 photograph, which is in no model"),
             Reason::NoModel { partners } => {
                 write!(
                     f,
@@ -313,9 +314,10 @@ impl std::fmt::Display for Reason {
                 )
             }
             Reason::NotRegistered { partners } => {
+                let s = if *partners == 1 { "" } else { "s" };
                 write!(
                     f,
-                    "it overlaps with {partners} photographs, but shows too few points of the model"
+                    "it overlaps with {partners} photograph{s}, but shows too few points of the model"
                 )
             }
         }

@@ -20,6 +20,10 @@ pub const SCENE: &str = "scene.ply";
 pub const FIELD: &str = "field.safetensors";
 /// The residual field of a run's splats.
 pub const RESIDUAL: &str = socket::FILES[1];
+/// The exposures of a run's photographs.
+pub const EXPOSURES: &str = socket::FILES[2];
+/// The appearance codes of a run's photographs.
+pub const APPEARANCE: &str = socket::FILES[4];
 /// The sky behind a run's splats.
 pub const SKY: &str = socket::FILES[3];
 

@@ -1,13 +1,14 @@
 //! A scene that can be rendered: read from a file or a run, or taken from a training.
 
 use crate::RunError;
-use crate::folder::{FIELD, RESIDUAL, SCENE, SKY, cameras_beside, world_beside};
+use crate::folder::{APPEARANCE, EXPOSURES, FIELD, RESIDUAL, SCENE, SKY, cameras_beside, world_beside};
 use crate::orbit::{Outlook, orbit, outlook};
 use irradia_edit::Draft;
 use irradia_field::{Field, Sampler};
 use irradia_formats::{SplatFormat, is_sog_folder, read_splats};
 use irradia_scene::{Camera, Dataset, Similarity};
 use irradia_splat::{RenderOptions, Renderer, Splats};
+use irradia_train::lights::Lights;
 use irradia_train::model::{Frame, Model};
 use irradia_train::recipe::RenderKnobs;
 use irradia_train::socket::background_of_sky;
@@ -47,6 +48,8 @@ pub struct Scene {
     pub cameras: Option<Arc<[Camera]>>,
     /// From the coordinates of the dataset to those of `model` and `cameras`.
     pub world_from_dataset: Similarity,
+    /// The light of each photograph of the run's dataset, if the run has learned it. The scene itself is in their mean.
+    pub lights: Option<Arc<Lights>>,
 }
 
 impl Scene {
@@ -68,6 +71,7 @@ impl Scene {
             },
             cameras: cameras_beside(path, &world_from_dataset).map(Into::into),
             world_from_dataset,
+            lights: lights_beside(path)?.map(Arc::new),
         })
     }
 
@@ -78,6 +82,7 @@ impl Scene {
             options,
             cameras: (!draft.cameras.is_empty()).then(|| draft.cameras.clone().into()),
             world_from_dataset: draft.cloud.world_from_dataset,
+            lights: None,
         }
     }
 
@@ -151,6 +156,19 @@ fn beside(scene: &Path, name: &str) -> Option<PathBuf> {
 /// The residual field beside `scene`, if there is one.
 pub(crate) fn residual_beside(scene: &Path) -> Result<Option<Field>, RunError> {
     beside(scene, RESIDUAL).as_deref().map(read_field).transpose()
+}
+
+/// The light of each photograph beside `scene`, if there is any.
+fn lights_beside(scene: &Path) -> Result<Option<Lights>, RunError> {
+    let read = |name: &str| match beside(scene, name) {
+        Some(path) => fs::read(&path).map_err(RunError::io("read", &path)).map(Some),
+        None => Ok(None),
+    };
+    let [exposures, appearance] = [read(EXPOSURES)?, read(APPEARANCE)?];
+    Lights::from_files(exposures.as_deref(), appearance.as_deref()).map_err(|source| RunError::File {
+        path: scene.with_file_name(if exposures.is_some() { EXPOSURES } else { APPEARANCE }),
+        source,
+    })
 }
 
 /// The mean colour of the sky beside `scene`, if there is one.

@@ -4,7 +4,7 @@
 mod carried;
 mod edited;
 #[cfg(test)]
-mod tests;
+pub(crate) mod tests;
 
 pub use edited::{splats_of, with_splats};
 

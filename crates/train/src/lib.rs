@@ -18,6 +18,7 @@ mod first_splats;
 mod forecast;
 mod free_space;
 pub mod half_fit;
+pub mod lights;
 pub mod memory;
 mod misfits;
 pub mod model;

@@ -1,6 +1,7 @@
 //! The result of a run: splats or a field. All code that renders them differently is here.
 
-use crate::socket::added_colors;
+use crate::lights::Light;
+use crate::socket::{added_colors, sum_of_colors};
 use irradia_field::{Field, FieldView, render_view};
 use irradia_scene::{Camera, Image};
 use irradia_splat::{FramePlanes, Renderer, Splats, ViewParams};
@@ -20,24 +21,27 @@ pub enum Model<'a> {
     Field(Cow<'a, Field>),
 }
 
-/// Renders the view of `camera` into the buffers of `renderer`, with the colours that `residual` adds.
+/// Renders the view of `camera` into the buffers of `renderer`, with the colours that `residual` and `light` add; the light's exposure is left to
+/// [`Light::developed`].
 pub fn render_splats(
     splats: &Splats,
     residual: Option<&Field>,
+    light: Option<Light>,
     renderer: &mut Renderer,
     camera: &Camera,
     options: &RenderOptions,
 ) {
     let view = ViewParams::new(camera);
-    match residual {
-        Some(field) => {
-            renderer.project(splats, &view, options);
-            let surfaces = splats.surfaces(renderer.in_view());
-            renderer.add_colors(&added_colors(field, camera.pose.position, &surfaces));
-            renderer.composite();
-        }
-        None => renderer.render(splats, &view, options),
+    let light = light.filter(Light::adds_colors);
+    if residual.is_none() && light.is_none() {
+        return renderer.render(splats, &view, options);
     }
+    renderer.project(splats, &view, options);
+    let (center, surfaces) = (camera.pose.position, splats.surfaces(renderer.in_view()));
+    let reflected = residual.map(|field| added_colors(field, center, &surfaces));
+    let lit = light.and_then(|light| light.added_colors(center, &surfaces));
+    renderer.add_colors(&sum_of_colors(reflected, lit));
+    renderer.composite();
 }
 
 /// How a [`Model`] is rendered; options that do not apply to its kind are ignored.
@@ -105,7 +109,7 @@ impl<'a> Model<'a> {
     pub fn render(&self, renderer: &mut Renderer, camera: &Camera, options: &RenderOptions) -> Frame {
         match self {
             Model::Splats { splats, residual } => {
-                render_splats(splats, residual.as_deref(), renderer, camera, options);
+                render_splats(splats, residual.as_deref(), None, renderer, camera, options);
                 Frame::of_planes(renderer.frame(), camera)
             }
             Model::Field(field) => {

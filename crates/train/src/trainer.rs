@@ -8,6 +8,7 @@ use crate::field_step::{first_field, is_field};
 use crate::first_splats::first_count;
 use crate::free_space::FreeSpace;
 use crate::half_fit::HalfFit;
+use crate::lights::Lights;
 use crate::memory::{MemoryPlan, Needs};
 use crate::model::Model;
 use crate::normal_maps::NormalMaps;
@@ -741,6 +742,11 @@ impl Trainer {
         );
         let by_memory = self.memory.warning(&self.recipe.name);
         moves.then_some(line).into_iter().chain(by_memory).collect()
+    }
+
+    /// The light of each photograph, as learned so far; `None` if none is.
+    pub fn lights(&self) -> Option<Lights> {
+        Lights::of_training(&self.sockets)
     }
 
     /// The scene as exported and evaluated: with the smoothing filter baked in.

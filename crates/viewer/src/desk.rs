@@ -349,6 +349,7 @@ mod tests {
             clip: None,
             view: None,
             highlight: false,
+            light: None,
         }
     }
 

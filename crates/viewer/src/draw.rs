@@ -40,7 +40,7 @@ pub(crate) fn draw(subject: &Subject, desk: &Desk) {
                 }
             }
             Task::Score { view } => {
-                let psnr = painter.score(&edition, &subject.views.0[view]);
+                let psnr = painter.score(&edition, view, &subject.views.0[view]);
                 let told = json!({ "tell": "score", "view": view, "psnr": psnr, "step": edition.step() });
                 desk.tell(seat, told.to_string());
             }

@@ -66,6 +66,8 @@ pub struct RawShot {
     view: Option<usize>,
     #[serde(default)]
     highlight: bool,
+    #[serde(default)]
+    light: Option<usize>,
 }
 
 /// A picture that a page wants.
@@ -85,6 +87,8 @@ pub struct Shot {
     pub view: Option<usize>,
     /// Whether selected splats are tinted.
     pub highlight: bool,
+    /// The view in whose light colours are shown; the mean light if `None`.
+    pub light: Option<usize>,
 }
 
 impl RawShot {
@@ -115,6 +119,7 @@ impl RawShot {
             clip: self.clip,
             view: self.view,
             highlight: self.highlight,
+            light: self.light,
         })
     }
 }

@@ -129,6 +129,7 @@ mod tests {
             clip: None,
             view: None,
             highlight: false,
+            light: None,
         }
     }
 

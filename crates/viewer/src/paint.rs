@@ -9,11 +9,14 @@ use crate::subject::Edition;
 use crate::views::SeenView;
 use glam::{Vec2, Vec3};
 use irradia_field::{Field, render_view};
+use irradia_runs::Scene;
 use irradia_scene::{Camera, Intrinsics, Photo, sh};
 use irradia_splat::render::Shape;
 use irradia_splat::{RenderOptions, Renderer, Splats};
+use irradia_train::lights::Light;
 use irradia_train::model::{Model, render_splats};
 use rayon::prelude::*;
+use std::borrow::Cow;
 use std::sync::Arc;
 
 /// Rows of a field that are drawn between two looks at whether the picture is still wanted.
@@ -151,8 +154,9 @@ impl Painter {
                 let altered = self.altered(edition, splats, part, few.map(|most| &most.order[..]), shot, &camera);
                 let splats = altered.as_ref().map_or(splats, |(_, splats)| splats);
                 let residual = residual.as_deref().filter(|_| mode != Mode::Normals);
-                render_splats(splats, residual, &mut self.renderer, &camera, &options);
-                let drawn = self.splats_picture(mode, &options, (width, height), shot, view);
+                let light = light_of(scene, shot.light).filter(|_| mode != Mode::Normals);
+                render_splats(splats, residual, light, &mut self.renderer, &camera, &options);
+                let drawn = self.splats_picture(mode, &options, (width, height), shot, light, view);
                 (self.altered, self.most) = (altered, most);
                 drawn?
             }
@@ -211,6 +215,7 @@ impl Painter {
         options: &RenderOptions,
         size: (u32, u32),
         shot: &Shot,
+        light: Option<Light>,
         view: Option<&SeenView>,
     ) -> Option<(Vec<u8>, Option<[f32; 2]>)> {
         let shape = match mode {
@@ -225,8 +230,9 @@ impl Painter {
         if mode == Mode::Count {
             return Some(counts_picture(&self.renderer.counts()));
         }
+        let color = developed(light, self.renderer.color());
         if mode == Mode::Color || mode == Mode::Normals {
-            return Some((to_rgb(self.renderer.color()), None));
+            return Some((to_rgb(&color), None));
         }
         let alpha = self.renderer.alpha().to_vec();
         let depth = self
@@ -237,7 +243,7 @@ impl Painter {
             .map(|(d, a)| d / a.max(1e-6))
             .collect();
         let planes = Planes {
-            color: self.renderer.color().to_vec(),
+            color: color.into_owned(),
             alpha,
             depth,
         };
@@ -279,16 +285,26 @@ impl Painter {
         Some(photo)
     }
 
-    /// PSNR of the scene against the photograph of `view`, dB; `None` if there is none.
-    pub fn score(&mut self, edition: &Edition, view: &SeenView) -> Option<f64> {
+    /// PSNR of the scene, in the light of the photograph of `view`, against it, dB; `None` if there is none. `index` is the view's.
+    pub fn score(&mut self, edition: &Edition, index: usize, view: &SeenView) -> Option<f64> {
         let scene = edition.scene();
         let photo = view.photo.as_ref()?.load().ok()?;
         let camera = placed(&view.camera, &edition.placement);
         let k = &camera.intrinsics;
         let truth = photo.resized(k.width, k.height);
         let (truth, mask) = (truth.over(scene.options.background), truth.mask);
-        let frame = scene.model.render(&mut self.renderer, &camera, &scene.options);
-        let render = frame.color.to_u8();
+        let render = match &scene.model {
+            Model::Splats { splats, residual } => {
+                let light = light_of(scene, view.trained.then_some(index));
+                let residual = residual.as_deref();
+                render_splats(splats, residual, light, &mut self.renderer, &camera, &scene.options);
+                to_rgb(&developed(light, self.renderer.color()))
+            }
+            Model::Field(_) => {
+                let frame = scene.model.render(&mut self.renderer, &camera, &scene.options);
+                frame.color.to_u8()
+            }
+        };
         let (mut sum, mut count) = (0u64, 0u64);
         for (i, (a, b)) in render.chunks_exact(3).zip(truth.chunks_exact(3)).enumerate() {
             if mask.as_ref().is_none_or(|mask| mask[i] != 0) {
@@ -333,6 +349,7 @@ impl Painter {
                 render_splats(
                     drawn,
                     residual.as_deref(),
+                    None,
                     &mut self.renderer,
                     &shot.camera,
                     &scene.options,
@@ -364,6 +381,16 @@ impl Painter {
             ..nothing
         }
     }
+}
+
+/// The light of `view` in `scene`, if it is known.
+fn light_of(scene: &Scene, view: Option<usize>) -> Option<Light<'_>> {
+    scene.lights.as_deref()?.of_view(view?)
+}
+
+/// `color` `[3, H, W]` in the exposure of `light`.
+fn developed<'c>(light: Option<Light>, color: &'c [f32]) -> Cow<'c, [f32]> {
+    light.map_or(Cow::Borrowed(color), |light| light.developed(color))
 }
 
 fn picked_splat(splats: &Splats, hit: &irradia_splat::render::Hit, of: usize) -> PickedSplat {

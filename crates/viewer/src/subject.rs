@@ -96,7 +96,7 @@ impl Subject {
             }
             return Ok(Self::of_dataset(path, reading.read(path)?));
         }
-        let scene = Scene::read(&file)?;
+        let mut scene = Scene::read(&file)?;
         let mut warnings = Vec::new();
         let dataset = match (data, &folder) {
             (Some(data), _) => Some(reading.read(data)?),
@@ -112,6 +112,15 @@ impl Subject {
             Some(dataset) => Views::of_dataset(&Arc::new(dataset), cameras.as_deref()),
             None => Views::of_cameras(cameras.as_deref().unwrap_or(&[])),
         };
+        // Lights are numbered by the views of the run's own dataset.
+        if data.is_some()
+            || scene
+                .lights
+                .as_ref()
+                .is_some_and(|lights| lights.views() != views.0.len())
+        {
+            scene.lights = None;
+        }
         let recipe = folder
             .as_ref()
             .and_then(|folder| std::fs::read_to_string(folder.file("recipe.toml")).ok());
@@ -159,6 +168,7 @@ impl Subject {
             options: RenderOptions::default(),
             cameras: Some(cameras),
             world_from_dataset: dataset.world_from_dataset,
+            lights: None,
         };
         let warnings = dataset.warnings.clone();
         Self {
@@ -198,7 +208,8 @@ impl Subject {
         edition.version += 1;
         edition.placement = placement;
         edition.selected = selected;
-        if let Some(scene) = scene {
+        if let Some(mut scene) = scene {
+            scene.lights = edition.scene().lights.clone();
             edition.splats_version = edition.version;
             edition.levels = Levels::default();
             edition.held = Held::Scene(Arc::new(scene));

@@ -5,7 +5,7 @@ use irradia_scene::{Camera, Intrinsics, Photo, PointCloud, Pose, View};
 use safetensors::tensor::TensorView;
 
 /// Two grey photographs and a few points.
-fn dataset() -> Arc<Dataset> {
+pub(crate) fn dataset() -> Arc<Dataset> {
     let positions: Vec<Vec3> = (0..12)
         .map(|i| Vec3::new(i as f32 * 0.1, (i % 3) as f32 * 0.1, 2.0))
         .collect();

@@ -2,16 +2,21 @@
 //! appearance code (NeRF-W, Martin-Brualla et al. 2021; for splats WildGaussians, Kulhanek et al. 2024), less what it outputs for the mean code: in
 //! the mean light, which held-out views and exported scenes have, it adds nothing.
 
-use super::color_field::ColorField;
+use super::color_field::{self, ColorField};
 use crate::recipe::{Param, ResidualKnobs};
 use crate::schedule::StepPlan;
 use crate::trainer::TrainError;
 use glam::Vec3;
-use irradia_field::Space;
+use irradia_field::{Field, Space};
 use irradia_splat::Surface;
 
 /// Random stream, derived from the run's seed.
 const STREAM_APPEARANCE: u64 = 9;
+
+/// The colours that `field` adds to `surfaces` seen from `center`, world, in the light of `view`.
+pub(crate) fn lit_colors(field: &Field, view: usize, center: Vec3, surfaces: &[Surface]) -> Vec<[f32; 3]> {
+    color_field::added_colors(field, &terms(view), center, surfaces)
+}
 
 /// The light of photographs in training.
 #[derive(Clone)]
@@ -33,7 +38,12 @@ impl Appearance {
 
     /// Whether it adds to the frame of `plan`. Once it has begun it stays active.
     pub fn acts(&self, plan: &StepPlan) -> bool {
-        plan.value(Param::RateCodes) > 0.0 || self.0.learnt().is_some()
+        plan.value(Param::RateCodes) > 0.0 || self.learnt().is_some()
+    }
+
+    /// The field, once trained.
+    pub fn learnt(&self) -> Option<&Field> {
+        self.0.learnt()
     }
 
     /// Forward: the colours to add to `surfaces` seen from `center` in the light of `view`.

@@ -8,6 +8,7 @@ use super::{Occupant, pieces};
 use crate::tensor_file::{NamedTensor, TensorSource, to_bytes};
 use irradia_measure::Affine;
 use rayon::prelude::*;
+use safetensors::SafeTensors;
 
 /// Parameters of a view: A row by row, then b.
 const N: usize = 12;
@@ -55,6 +56,25 @@ impl Exposure {
             }
         }
         self
+    }
+
+    /// From the file of [`Occupant::export`].
+    ///
+    /// # Errors
+    /// One line, when it is damaged.
+    pub(crate) fn from_file(bytes: &[u8]) -> Result<Self, String> {
+        let file = SafeTensors::deserialize(bytes).map_err(|error| error.to_string())?;
+        let values = TensorSource::new(&file, "").real("maps");
+        let values = values.filter(|values| values.len() % N == 0 && values.iter().all(|v| v.is_finite()));
+        let maps = values.ok_or("maps is missing or has the wrong length")?;
+        let mut exposure = Self::new(maps.len() / N, &[]);
+        exposure.maps.copy_from_slice(maps.as_chunks::<N>().0);
+        Ok(exposure)
+    }
+
+    /// Number of views.
+    pub(crate) fn views(&self) -> usize {
+        self.maps.len()
     }
 
     /// The map of `view`.

@@ -20,6 +20,7 @@ mod residual;
 mod sky;
 
 pub use appearance::Appearance;
+pub(crate) use appearance::lit_colors;
 pub use bilateral::BilateralGrid;
 pub use exposure::Exposure;
 pub(crate) use per_view::PerViewAdam;
@@ -55,6 +56,19 @@ fn pieces(frame: &mut [f32], length: usize) -> impl IndexedParallelIterator<Item
     let pieces = red.par_chunks_mut(length).zip(green.par_chunks_mut(length));
     let pieces = pieces.zip(blue.par_chunks_mut(length));
     pieces.map(|((red, green), blue)| [red, green, blue])
+}
+
+/// What is added to the colours of splats in view, by each that adds any.
+pub(crate) fn sum_of_colors(a: Option<Vec<[f32; 3]>>, b: Option<Vec<[f32; 3]>>) -> Vec<[f32; 3]> {
+    match (a, b) {
+        (Some(mut colors), Some(others)) => {
+            for (color, other) in colors.iter_mut().zip(others) {
+                *color = std::array::from_fn(|c| color[c] + other[c]);
+            }
+            colors
+        }
+        (a, b) => a.or(b).unwrap_or_default(),
+    }
 }
 
 /// The last of the `layers` that are there, else `frame`: what the next one changes.
@@ -217,15 +231,7 @@ impl Sockets {
             let surfaces = engine.surfaces_in_view();
             let reflected = residual.map(|residual| residual.colors(center, &surfaces));
             let lit = appearance.map(|appearance| appearance.colors(view, center, &surfaces));
-            engine.composite(&match (reflected, lit) {
-                (Some(mut colors), Some(lit)) => {
-                    for (color, lit) in colors.iter_mut().zip(lit) {
-                        *color = std::array::from_fn(|c| color[c] + lit[c]);
-                    }
-                    colors
-                }
-                (colors, lit) => colors.or(lit).unwrap_or_default(),
-            });
+            engine.composite(&sum_of_colors(reflected, lit));
         } else {
             engine.render(placement, options);
         }

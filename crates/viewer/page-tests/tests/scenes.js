@@ -1,6 +1,6 @@
 // Scenes to look at: trained in moments, or written here.
 
-import { existsSync, writeFileSync } from "node:fs";
+import { cpSync, existsSync, writeFileSync } from "node:fs";
 import { join } from "node:path";
 import { run, scratch } from "./harness.js";
 
@@ -17,6 +17,20 @@ export function dataset() {
 export function trained() {
   const out = join(scratch, "run");
   if (!existsSync(out)) run("train", dataset(), "--out", out, "--steps", "400");
+  return out;
+}
+
+/** A run whose view `dark` was exposed at half of the others' light. @param {number} views @param {number} dark */
+export function lit(views, dark) {
+  const out = join(scratch, "lit");
+  if (existsSync(out)) return out;
+  cpSync(trained(), out, { recursive: true });
+  const identity = [1, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0];
+  const maps = Array.from({ length: views }, (_, view) => identity.map((value) => (view === dark ? 0.5 * value : value))).flat();
+  const header = Buffer.from(JSON.stringify({ maps: { dtype: "F32", shape: [views, 12], data_offsets: [0, 4 * maps.length] } }));
+  const length = Buffer.alloc(8);
+  length.writeBigUInt64LE(BigInt(header.length));
+  writeFileSync(join(out, "exposure.safetensors"), Buffer.concat([length, header, Buffer.from(new Float32Array(maps).buffer)]));
   return out;
 }
 

@@ -6,7 +6,7 @@ import { createHash } from "node:crypto";
 import { readFileSync } from "node:fs";
 import { after, before, test } from "node:test";
 import { OUT, browse, get, open, picture, psnr, run, scratch, serve, set, sharp, stopAll, until } from "./harness.js";
-import { dataset, trained } from "./scenes.js";
+import { dataset, lit, trained } from "./scenes.js";
 
 /** @type {import("playwright-core").Browser} */
 let browser;
@@ -83,6 +83,41 @@ test("views, comparison, tools and modes", async () => {
   await page.keyboard.press("?");
   await page.getByText("Keys and gestures").waitFor();
   await page.keyboard.press("Escape");
+  assert.deepEqual(problems, []);
+  await server.stop();
+});
+
+test("a scene is shown in the light of one of its photographs", async () => {
+  const dark = 3;
+  const server = await serve("view", lit(27, dark), "--port", "0");
+  const { page, problems } = await open(browser, server.address, { width: 1000, height: 700 });
+  await set(page, { drawing: "served", axes: false });
+  await settled(page);
+  const mean = await picture(page);
+  const darker = { ...mean, data: mean.data.map((value, i) => (i % 4 === 3 ? value : Math.round(value / 2))) };
+  const select = page.getByLabel("Light", { exact: true });
+  assert.equal(await select.locator("option").count(), 25);
+  const views = await get(page, "views");
+  assert.ok(views[dark].trained);
+  await select.selectOption(`${dark}`);
+  await settled(page);
+  assert.ok(psnr(darker, await picture(page)) > 36, "half of the light");
+  // The page itself knows no lights.
+  await set(page, { drawing: "local" });
+  assert.equal(await page.evaluate(() => document.querySelector("irr-stage").drawsLocally), false);
+  await set(page, { light: null, drawing: "served" });
+  await settled(page);
+  assert.ok(psnr(mean, await picture(page)) > 45);
+  // Beside its photograph a scene has that one's light.
+  await page.evaluate((dark) => document.querySelector("irr-stage").navigation.enter(dark), dark);
+  await until(page, async (dark) => (await import("/page/js/state.js")).state.get("view") === dark, dark);
+  await settled(page);
+  const inside = await picture(page);
+  await set(page, { compare: "slider" });
+  await settled(page);
+  const compared = await picture(page);
+  const sum = (image) => image.data.reduce((total, value, i) => (i % 4 === 3 ? total : total + value), 0);
+  assert.ok(Math.abs(sum(compared) / sum(inside) - 0.5) < 0.02);
   assert.deepEqual(problems, []);
   await server.stop();
 });

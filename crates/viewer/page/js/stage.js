@@ -65,7 +65,7 @@ export class Stage extends HTMLElement {
     this.pointer = pointer;
     this.navigation = new Navigation(this.overlay, (x, y) => this.pickAt(x, y), (event) => pointer.claims(event));
     new ResizeObserver(() => this.resize()).observe(this);
-    for (const key of /** @type {const} */ (["camera", "view", "mode", "background", "clip", "drawing", "compare", "scene", "highlight"])) {
+    for (const key of /** @type {const} */ (["camera", "view", "mode", "background", "light", "clip", "drawing", "compare", "scene", "highlight"])) {
       state.addEventListener(key, () => (this.dirty = true));
     }
     const touch = () => (this.stale = true);
@@ -118,10 +118,17 @@ export class Stage extends HTMLElement {
   get drawsLocally() {
     const scene = state.get("scene");
     if (!scene?.travels || !LOCAL_MODES.includes(state.get("mode")) || state.get("compare") === "error") return false;
-    if (!this.local?.paints(state.get("mode"))) return false;
+    if (!this.local?.paints(state.get("mode")) || this.light !== null) return false;
     const drawing = state.get("drawing");
     if (drawing !== "auto") return drawing === "local";
     return this.local.accelerated && scene.count <= MANY && !state.get("hello")?.live;
+  }
+
+  /** The view in whose light the scene is shown: beside a photograph that one's. @returns {number | null} */
+  get light() {
+    if (!state.get("scene")?.lights) return null;
+    const compares = state.get("compare") !== "none" && state.insideView?.trained;
+    return compares ? state.get("view") : state.get("light");
   }
 
   /** The picture's place on the stage. */
@@ -145,6 +152,7 @@ export class Stage extends HTMLElement {
       background: background && rgb(background),
       clip: state.get("clip"),
       highlight: state.get("highlight"),
+      light: this.light,
     };
   }
 

@@ -5,7 +5,7 @@
 /** @typedef {import("./math.js").Vec3} Vec3 */
 
 /** What the server says of the scene.
- * @typedef {{ version: number, step: number | null, kind: string, count: number, sh_degree: number, travels: boolean,
+ * @typedef {{ version: number, step: number | null, kind: string, count: number, sh_degree: number, travels: boolean, lights: boolean,
  *   placement: import("./edit/placement.js").Placement, antialias: boolean, background: Vec3, center: Vec3, up: Vec3, radius: number, height: number, fov: number }} Scene */
 
 /**
@@ -20,6 +20,7 @@
  * @property {"auto" | "served" | "local"} drawing where it is drawn
  * @property {"orbit" | "fly" | "walk"} navigation
  * @property {string | null} background as #rrggbb; the scene's own if null
+ * @property {number | null} light index of the view in whose light the scene is shown; the mean of all if null
  * @property {[Vec3, Vec3] | null} clip
  * @property {"none" | "slider" | "blink" | "error"} compare
  * @property {boolean} frusta
@@ -57,7 +58,7 @@ class State extends EventTarget {
     /** @type {Values} */
     this.values = {
       scene: null, views: [], camera: { position: [0, 0, -3], rotation: [1, 0, 0, 0], fov: 0.9 }, pivot: [0, 0, 0], up: [0, -1, 0],
-      view: null, mode: "color", drawing: "auto", navigation: "orbit", background: null, clip: null, compare: "none",
+      view: null, mode: "color", drawing: "auto", navigation: "orbit", background: null, light: null, clip: null, compare: "none",
       frusta: false, axes: true, sidebar: innerWidth > 720, tab: "display", theme: "", speed: 1, tool: "none", measured: [],
       metres: null, selectMode: "replace", brush: 24, visibleOnly: false, highlight: true, transform: "none", region: null, dropped: null,
       editing: null, picked: null, train: null, hello: null, scores: new Map(), connection: "connecting", problem: null,

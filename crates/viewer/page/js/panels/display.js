@@ -49,11 +49,23 @@ class DisplayPanel extends HTMLElement {
       background.value = state.get("background") ?? `#${(state.get("scene")?.background ?? [0, 0, 0]).map(hex).join("")}`;
       own.disabled = state.get("background") === null;
     });
+    const light = el("select", { className: "grow", onchange: () => state.set({ light: light.value === "" ? null : Number(light.value) }) });
+    const lights = row("Light", light);
+    lights.title = "As a photograph shows it, whose exposure and light the training has learned";
+    state.watch(["scene", "views", "light"], () => {
+      const views = state.get("views");
+      lights.hidden = !state.get("scene")?.lights;
+      if (light.options.length !== 1 + views.filter((view) => view.trained).length) {
+        const own = views.flatMap((view, index) => view.trained ? [el("option", { value: `${index}`, textContent: view.name })] : []);
+        light.replaceChildren(el("option", { value: "", textContent: "The mean of the photographs" }), ...own);
+      }
+      light.value = `${state.get("light") ?? ""}`;
+    });
     const frusta = check("Cameras", (on) => state.set({ frusta: on }));
     const axes = check("Pivot axes", (on) => state.set({ axes: on }));
     state.watch(["frusta"], () => (frusta.input.checked = state.get("frusta")));
     state.watch(["axes"], () => (axes.input.checked = state.get("axes")));
-    return section("Picture", row("Background", background, own), el("div", { className: "columns" }, frusta.label, axes.label));
+    return section("Picture", row("Background", background, own), lights, el("div", { className: "columns" }, frusta.label, axes.label));
   }
 
   camera() {

@@ -84,7 +84,7 @@ impl Light<'_> {
         Some(lit_colors(field, self.view, center, surfaces))
     }
 
-    /// The frame `color` `[3, H, W]`, drawn with these [`Self::added_colors`], in the photograph's exposure.
+    /// The frame `color` `[3, H, W]`, drawn by [`render_splats`](crate::model::render_splats) in this light, in the photograph's exposure.
     pub fn developed<'c>(&self, color: &'c [f32]) -> Cow<'c, [f32]> {
         let Some(exposures) = &self.lights.exposures else {
             return Cow::Borrowed(color);

@@ -199,10 +199,10 @@ test("an address holds the camera", async () => {
   await server.stop();
 });
 
-test("every screen at 1440 and 360 pixels", async () => {
+test("every screen at 1440, 768 and 360 pixels", async () => {
   // SCREENS_OF names a run to take pictures of, such as that of README.md: views-1440-dark.jpg.
   const server = await serve("view", process.env.SCREENS_OF ?? trained(), "--port", "0");
-  for (const [width, height] of [[1440, 900], [360, 740]]) {
+  for (const [width, height] of [[1440, 900], [768, 1024], [360, 740]]) {
     for (const theme of ["dark", "light"]) {
       const { page, problems } = await open(browser, server.address, { width, height, theme });
       await set(page, { drawing: "served" });
@@ -211,6 +211,8 @@ test("every screen at 1440 and 360 pixels", async () => {
         await page.screenshot({ path: join(OUT, `${name}-${width}-${theme}.jpg`), quality: 80 });
         const wide = await page.evaluate(() => document.documentElement.scrollWidth);
         assert.ok(wide <= width, `${name} is ${wide} pixels wide`);
+        const ends = await page.evaluate(() => document.querySelector("irr-toolbar").getBoundingClientRect().right);
+        assert.ok(ends <= width, `the toolbar ends at ${ends}`);
       };
       await shoot("start");
       await set(page, { sidebar: true, tab: "display" });

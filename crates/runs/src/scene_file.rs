@@ -48,8 +48,6 @@ pub struct Scene {
     pub cameras: Option<Arc<[Camera]>>,
     /// From the coordinates of the dataset to those of `model` and `cameras`.
     pub world_from_dataset: Similarity,
-    /// The light of each photograph of the run's dataset, if the run has learned it. The scene itself is in their mean.
-    pub lights: Option<Arc<Lights>>,
 }
 
 impl Scene {
@@ -71,7 +69,6 @@ impl Scene {
             },
             cameras: cameras_beside(path, &world_from_dataset).map(Into::into),
             world_from_dataset,
-            lights: lights_beside(path)?.map(Arc::new),
         })
     }
 
@@ -82,7 +79,6 @@ impl Scene {
             options,
             cameras: (!draft.cameras.is_empty()).then(|| draft.cameras.clone().into()),
             world_from_dataset: draft.cloud.world_from_dataset,
-            lights: None,
         }
     }
 
@@ -158,15 +154,18 @@ pub(crate) fn residual_beside(scene: &Path) -> Result<Option<Field>, RunError> {
     beside(scene, RESIDUAL).as_deref().map(read_field).transpose()
 }
 
-/// The light of each photograph beside `scene`, if there is any.
-fn lights_beside(scene: &Path) -> Result<Option<Lights>, RunError> {
+/// The light of each photograph of the dataset of the run whose scene is the file `scene`, if the run has learned it. The scene itself is in their mean.
+///
+/// # Errors
+/// When a file of them cannot be read, or they do not belong together.
+pub fn read_lights(scene: &Path) -> Result<Option<Lights>, RunError> {
     let read = |name: &str| match beside(scene, name) {
         Some(path) => fs::read(&path).map_err(RunError::io("read", &path)).map(Some),
         None => Ok(None),
     };
     let [exposures, appearance] = [read(EXPOSURES)?, read(APPEARANCE)?];
     Lights::from_files(exposures.as_deref(), appearance.as_deref()).map_err(|source| RunError::File {
-        path: scene.with_file_name(if exposures.is_some() { EXPOSURES } else { APPEARANCE }),
+        path: scene.to_owned(),
         source,
     })
 }

@@ -3,6 +3,7 @@
 use crate::Scene;
 use irradia_scene::{Camera, Dataset};
 use irradia_train::event::{Event, Observer, Signal};
+use irradia_train::lights::Lights;
 use irradia_train::schedule::plan;
 use irradia_train::{Recipe, Trainer};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -21,6 +22,8 @@ pub struct Snapshot {
     pub stage: String,
     /// The trained scene, as used for evaluation.
     pub scene: Scene,
+    /// The light of each photograph, as learned so far.
+    pub lights: Option<Arc<Lights>>,
     /// The resolved recipe, shared by all snapshots of a run.
     pub recipe: Arc<Recipe>,
     /// The dataset, shared with the training.
@@ -147,8 +150,8 @@ impl SnapshotServer {
                     options: trainer.render_options(plan(&trainer.recipe, &trainer.clock).sh_degree),
                     cameras: Some(cameras.clone()),
                     world_from_dataset: trainer.dataset.world_from_dataset,
-                    lights: trainer.lights().map(Arc::new),
                 },
+                lights: trainer.lights().map(Arc::new),
                 recipe: recipe.clone(),
                 dataset: trainer.dataset.clone(),
             }));

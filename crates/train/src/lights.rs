@@ -7,6 +7,7 @@ use glam::Vec3;
 use irradia_field::{Field, Sampler};
 use irradia_splat::Surface;
 use std::borrow::Cow;
+use std::fmt::Display;
 
 /// What photographs make of a scene in the mean light: their exposures, and what their appearance codes add to its colours. A sky and a bilateral
 /// grid belong to a photograph's own frame and are not among them.
@@ -39,9 +40,11 @@ impl Lights {
     /// # Errors
     /// When one is damaged, or they are of different numbers of photographs.
     pub fn from_files(exposures: Option<&[u8]>, appearance: Option<&[u8]>) -> Result<Option<Self>, TrainError> {
+        let damaged = |what: &str, why: &dyn Display| TrainError::Checkpoint(format!("{what}: {why}"));
         let exposures = exposures.map(Exposure::from_file).transpose();
-        let exposures = exposures.map_err(TrainError::Checkpoint)?;
-        let appearance = appearance.map(field_file::from_bytes).transpose()?;
+        let exposures = exposures.map_err(|why| damaged("exposures", &why))?;
+        let appearance = appearance.map(field_file::from_bytes).transpose();
+        let appearance = appearance.map_err(|why| damaged("appearance codes", &why))?;
         if let Some(field) = &appearance
             && (!matches!(field.config.sampler, Sampler::Given { .. }) || field.config.images == 0)
         {

@@ -298,7 +298,7 @@ fn scene(edition: &Edition) -> Value {
         // Only plain splats travel to the browser.
         "travels": kind == "splats",
         "antialias": scene.options.antialias,
-        "lights": scene.lights.is_some(),
+        "lights": edition.lights.is_some(),
         "background": scene.options.background,
         "center": outlook.center.to_array(),
         "up": outlook.up.to_array(),

@@ -9,7 +9,6 @@ use crate::subject::Edition;
 use crate::views::SeenView;
 use glam::{Vec2, Vec3};
 use irradia_field::{Field, render_view};
-use irradia_runs::Scene;
 use irradia_scene::{Camera, Intrinsics, Photo, sh};
 use irradia_splat::render::Shape;
 use irradia_splat::{RenderOptions, Renderer, Splats};
@@ -154,7 +153,7 @@ impl Painter {
                 let altered = self.altered(edition, splats, part, few.map(|most| &most.order[..]), shot, &camera);
                 let splats = altered.as_ref().map_or(splats, |(_, splats)| splats);
                 let residual = residual.as_deref().filter(|_| mode != Mode::Normals);
-                let light = light_of(scene, shot.light).filter(|_| mode != Mode::Normals);
+                let light = light_of(edition, shot.light).filter(|_| mode != Mode::Normals);
                 render_splats(splats, residual, light, &mut self.renderer, &camera, &options);
                 let drawn = self.splats_picture(mode, &options, (width, height), shot, light, view);
                 (self.altered, self.most) = (altered, most);
@@ -295,7 +294,7 @@ impl Painter {
         let (truth, mask) = (truth.over(scene.options.background), truth.mask);
         let render = match &scene.model {
             Model::Splats { splats, residual } => {
-                let light = light_of(scene, view.trained.then_some(index));
+                let light = light_of(edition, view.trained.then_some(index));
                 let residual = residual.as_deref();
                 render_splats(splats, residual, light, &mut self.renderer, &camera, &scene.options);
                 to_rgb(&developed(light, self.renderer.color()))
@@ -383,9 +382,9 @@ impl Painter {
     }
 }
 
-/// The light of `view` in `scene`, if it is known.
-fn light_of(scene: &Scene, view: Option<usize>) -> Option<Light<'_>> {
-    scene.lights.as_deref()?.of_view(view?)
+/// The light of `view`, if it is known.
+fn light_of(edition: &Edition, view: Option<usize>) -> Option<Light<'_>> {
+    edition.lights.as_deref()?.of_view(view?)
 }
 
 /// `color` `[3, H, W]` in the exposure of `light`.

@@ -6,10 +6,11 @@ use crate::levels::Levels;
 use crate::live::{Live, Watcher};
 use crate::views::Views;
 use irradia_edit::Transform;
-use irradia_runs::{Reading, Run, RunFolder, Scene, Snapshot, TrainInput, read_levels, scene_of};
+use irradia_runs::{Reading, Run, RunFolder, Scene, Snapshot, TrainInput, read_levels, read_lights, scene_of};
 use irradia_scene::Dataset;
 use irradia_splat::Splats;
 use irradia_splat::init::{InitOptions, from_points};
+use irradia_train::lights::Lights;
 use irradia_train::model::{Model, RenderOptions};
 use std::path::Path;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -27,6 +28,8 @@ pub(crate) struct Edition {
     pub placement: Transform,
     /// Levels of detail of these splats, as far as there are any: an edit leaves none.
     pub levels: Levels,
+    /// The light of each view, if it is known.
+    pub lights: Option<Arc<Lights>>,
     held: Held,
 }
 
@@ -37,13 +40,14 @@ enum Held {
 }
 
 impl Edition {
-    fn of_scene(scene: Scene, levels: Levels) -> Self {
+    fn of_scene(scene: Scene, levels: Levels, lights: Option<Lights>) -> Self {
         Self {
             version: 1,
             splats_version: 1,
             selected: None,
             placement: Transform::IDENTITY,
             levels,
+            lights: lights.map(Arc::new),
             held: Held::Scene(Arc::new(scene)),
         }
     }
@@ -96,7 +100,7 @@ impl Subject {
             }
             return Ok(Self::of_dataset(path, reading.read(path)?));
         }
-        let mut scene = Scene::read(&file)?;
+        let scene = Scene::read(&file)?;
         let mut warnings = Vec::new();
         let dataset = match (data, &folder) {
             (Some(data), _) => Some(reading.read(data)?),
@@ -113,14 +117,12 @@ impl Subject {
             None => Views::of_cameras(cameras.as_deref().unwrap_or(&[])),
         };
         // Lights are numbered by the views of the run's own dataset.
-        if data.is_some()
-            || scene
-                .lights
-                .as_ref()
-                .is_some_and(|lights| lights.views() != views.0.len())
-        {
-            scene.lights = None;
-        }
+        let lights = if data.is_none() { read_lights(&file) } else { Ok(None) };
+        let lights = lights.unwrap_or_else(|error| {
+            warnings.push(format!("no light of photographs: {error}"));
+            None
+        });
+        let lights = lights.filter(|lights| lights.views() == views.0.len());
         let recipe = folder
             .as_ref()
             .and_then(|folder| std::fs::read_to_string(folder.file("recipe.toml")).ok());
@@ -146,7 +148,7 @@ impl Subject {
             live: None,
             folder,
             recipe,
-            edition: Mutex::new(Some(Edition::of_scene(scene, Levels::new(levels)))),
+            edition: Mutex::new(Some(Edition::of_scene(scene, Levels::new(levels), lights))),
             warnings,
         })
     }
@@ -168,7 +170,6 @@ impl Subject {
             options: RenderOptions::default(),
             cameras: Some(cameras),
             world_from_dataset: dataset.world_from_dataset,
-            lights: None,
         };
         let warnings = dataset.warnings.clone();
         Self {
@@ -178,7 +179,7 @@ impl Subject {
             live: None,
             folder: None,
             recipe: None,
-            edition: Mutex::new(Some(Edition::of_scene(scene, Levels::default()))),
+            edition: Mutex::new(Some(Edition::of_scene(scene, Levels::default(), None))),
             warnings,
         }
     }
@@ -208,8 +209,7 @@ impl Subject {
         edition.version += 1;
         edition.placement = placement;
         edition.selected = selected;
-        if let Some(mut scene) = scene {
-            scene.lights = edition.scene().lights.clone();
+        if let Some(scene) = scene {
             edition.splats_version = edition.version;
             edition.levels = Levels::default();
             edition.held = Held::Scene(Arc::new(scene));
@@ -229,6 +229,7 @@ impl Subject {
                     selected: None,
                     placement: Transform::IDENTITY,
                     levels: Levels::default(),
+                    lights: snapshot.lights.clone(),
                     held: Held::Snapshot(snapshot),
                 });
             }

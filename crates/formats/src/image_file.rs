@@ -1,9 +1,12 @@
 use crate::complete::{jpeg_file_is_complete, jpeg_is_complete, png_is_complete};
 use crate::heic::{HeicDecoder, is_heif};
+use crate::open_exr::{ExrDecoder, is_exr};
 use crate::{FormatError, write_atomic};
 use image::codecs::png::{CompressionType, FilterType, PngEncoder};
 use image::metadata::Orientation;
-use image::{DynamicImage, ExtendedColorType, GrayImage, ImageDecoder, ImageEncoder, ImageReader, RgbImage};
+use image::{
+    DynamicImage, ExtendedColorType, GrayImage, ImageDecoder, ImageEncoder, ImageReader, Rgb32FImage, RgbImage,
+};
 use irradia_scene::resize_area;
 use std::fs::File;
 use std::io::{self, BufRead, BufReader, Cursor, Read, Seek};
@@ -44,7 +47,7 @@ pub(crate) enum Colour {
     Grey,
 }
 
-/// Reads a JPEG, PNG, WebP, TIFF or HEIC of any depth as 3 or (if the file has alpha) 4 channels of 8 bits, with the EXIF orientation applied.
+/// Reads a JPEG, PNG, WebP, TIFF, HEIC or `OpenEXR` of any depth as 3 or (if the file has alpha) 4 channels of 8 bits, with the EXIF orientation applied.
 ///
 /// # Errors
 /// When the file cannot be read, is not an image, or is truncated.
@@ -194,11 +197,32 @@ pub(crate) fn decode_heic(bytes: &[u8]) -> Result<Pixels, image::ImageError> {
     Ok(upright(image, Orientation::NoTransforms, Colour::Keep))
 }
 
-/// The values of a grey image, those of 8 and 16 bits as they are stored: width, height and `[H, W]`.
+/// The pixels of an `OpenEXR` in memory.
+pub(crate) fn decode_exr(bytes: &[u8]) -> Result<Pixels, image::ImageError> {
+    let image = DynamicImage::from_decoder(ExrDecoder::new(Cursor::new(bytes))?)?;
+    Ok(upright(image, Orientation::NoTransforms, Colour::Keep))
+}
+
+/// The values of a grey image, those of 8 and 16 bits and of `OpenEXR` as they are stored: width, height and `[H, W]`.
 ///
 /// # Errors
 /// When it cannot be decoded or is in colour.
 pub(crate) fn decode_values(path: &Path, orientation: Orientation) -> Result<(u32, u32, Vec<f32>), FormatError> {
+    let in_colours = || {
+        let message = "is a picture in colours, not a map of values; store these as grey of 8 or 16 bits, as OpenEXR of one channel, or as .npy";
+        FormatError::malformed(path, message)
+    };
+    if let Some(decoder) = open_exr(path)? {
+        let read = decoder.read_depths().map_err(|error| undecodable(path, &error))?;
+        let (width, height, values) = read.ok_or_else(in_colours)?;
+        // No picture of one channel of floats can be turned.
+        let thrice = values.into_iter().flat_map(|value| [value; 3]).collect();
+        let image = Rgb32FImage::from_raw(width, height, thrice).ok_or_else(in_colours)?;
+        let mut image = DynamicImage::from(image);
+        image.apply_orientation(orientation);
+        let values = image.to_rgb32f().pixels().map(|pixel| pixel.0[0]).collect();
+        return Ok((image.width(), image.height(), values));
+    }
     let (decoder, _) = open(path)?;
     let mut image = DynamicImage::from_decoder(decoder).map_err(|error| undecodable(path, &error))?;
     image.apply_orientation(orientation);
@@ -211,24 +235,31 @@ pub(crate) fn decode_values(path: &Path, orientation: Orientation) -> Result<(u3
         rgb.pixels().map_while(|pixel| grey(pixel.0)).map(f32::from).collect()
     };
     if values.len() != width as usize * height as usize {
-        let message = "is a picture in colours, not a map of values; store these as grey of 8 or 16 bits, or as .npy";
-        return Err(FormatError::malformed(path, message));
+        return Err(in_colours());
     }
     Ok((width, height, values))
 }
 
-/// The colours of an image, each channel in \[0, 1\]: width, height and `[H, W]`.
+/// The normals that an image holds: width, height and `[H, W]`. Of `OpenEXR` the values as they are, of other files colours, `n = 2 c - 1`.
 ///
 /// # Errors
-/// When it cannot be decoded.
-pub(crate) fn decode_colors(path: &Path) -> Result<(u32, u32, Vec<[f32; 3]>), FormatError> {
+/// When it cannot be decoded, or is an `OpenEXR` without three channels of one layer.
+pub(crate) fn decode_normals(path: &Path) -> Result<(u32, u32, Vec<[f32; 3]>), FormatError> {
+    if let Some(decoder) = open_exr(path)? {
+        let vectors = decoder.read_vectors().map_err(|error| undecodable(path, &error))?;
+        return vectors
+            .ok_or_else(|| FormatError::malformed(path, "has no three channels R, G, B or X, Y, Z; make it again"));
+    }
     let (decoder, _) = open(path)?;
     let image = DynamicImage::from_decoder(decoder).map_err(|error| undecodable(path, &error))?;
     let colors = image.to_rgb32f();
     Ok((
         image.width(),
         image.height(),
-        colors.pixels().map(|pixel| pixel.0).collect(),
+        colors
+            .pixels()
+            .map(|pixel| pixel.0.map(|value| 2.0 * value - 1.0))
+            .collect(),
     ))
 }
 
@@ -311,12 +342,29 @@ fn truncated(path: &Path) -> FormatError {
 trait Source: BufRead + Seek {}
 impl<T: BufRead + Seek> Source for T {}
 
+/// The decoder of a file in `OpenEXR`; `None` if it is in another format.
+fn open_exr(path: &Path) -> Result<Option<ExrDecoder<BufReader<File>>>, FormatError> {
+    let unread = |source| FormatError::Read {
+        path: path.to_owned(),
+        source,
+    };
+    let mut reader = BufReader::new(File::open(path).map_err(unread)?);
+    if !is_exr(reader.fill_buf().map_err(unread)?) {
+        return Ok(None);
+    }
+    let decoder = ExrDecoder::new(reader).map_err(|error| undecodable(path, &error))?;
+    Ok(Some(decoder))
+}
+
 /// Opens an image that is not truncated; the format is detected by its first bytes. Returns whether it is a JPEG.
 fn open(path: &Path) -> Result<(Box<dyn ImageDecoder>, bool), FormatError> {
     let unread = |source| FormatError::Read {
         path: path.to_owned(),
         source,
     };
+    if let Some(decoder) = open_exr(path)? {
+        return Ok((Box::new(decoder), false));
+    }
     let mut reader = BufReader::new(File::open(path).map_err(unread)?);
     if is_heif(reader.fill_buf().map_err(unread)?) {
         let mut bytes = Vec::new();
@@ -351,7 +399,7 @@ fn complete_source(mut reader: BufReader<File>) -> io::Result<(Box<dyn Source>, 
 fn undecodable(path: &Path, error: &image::ImageError) -> FormatError {
     FormatError::malformed(
         path,
-        format!("not a readable JPEG, PNG, WebP, TIFF or HEIC image ({error}); restore or remove it"),
+        format!("not a readable JPEG, PNG, WebP, TIFF, HEIC or OpenEXR image ({error}); restore or remove it"),
     )
 }
 

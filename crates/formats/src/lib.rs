@@ -15,6 +15,7 @@ mod faces;
 mod heic;
 mod image_file;
 mod map_file;
+mod open_exr;
 mod pack;
 pub mod parse;
 mod photo;

@@ -1,9 +1,9 @@
-//! Maps of depth and of normals that were given beside photographs: images of 8 or 16 bits, depths also as `.npy` arrays.
+//! Maps of depth and of normals that were given beside photographs: images of 8 or 16 bits and `OpenEXR`, depths also as `.npy` arrays.
 
 use crate::FormatError;
 use crate::dataset::parse_table;
 use crate::error::read_and_parse;
-use crate::image_file::{decode_colors, decode_values, read_header};
+use crate::image_file::{decode_normals, decode_values, read_header};
 use crate::undistort::Undistortion;
 use image::metadata::Orientation;
 use irradia_scene::{Grid, GridSource, LoadError};
@@ -96,9 +96,7 @@ impl MapFile {
             let message = "is not upright, as its photograph is; make it again from the upright photograph";
             return Err(FormatError::malformed(&self.path, message));
         }
-        let (width, height, colors) = decode_colors(&self.path)?;
-        let normals = colors.into_iter().map(|color| color.map(|value| 2.0 * value - 1.0));
-        Ok((width, height, normals.collect()))
+        decode_normals(&self.path)
     }
 }
 

@@ -40,6 +40,14 @@ pub fn heic(bytes: &[u8]) -> Result<crate::Pixels, crate::Malformed> {
     crate::image_file::decode_heic(bytes).map_err(|error| crate::Malformed(error.to_string()))
 }
 
+/// The pixels of an `OpenEXR`: width, height, and 3 or 4 channels of 8 bits.
+///
+/// # Errors
+/// When it is damaged, or shows no colours.
+pub fn exr(bytes: &[u8]) -> Result<crate::Pixels, crate::Malformed> {
+    crate::image_file::decode_exr(bytes).map_err(|error| crate::Malformed(error.to_string()))
+}
+
 /// All tensors of a PyTorch state dict or a safetensors file; see [`crate::read_tensors`].
 ///
 /// # Errors

@@ -50,6 +50,15 @@ fn images_bin() -> Vec<u8> {
     bytes
 }
 
+fn exr() -> Vec<u8> {
+    use exr::prelude::{Image, SpecificChannels, Vec2, WritableImage};
+    let shade = |Vec2(x, y): Vec2<usize>| (x as f32 / 8.0, y as f32 / 8.0, 0.5f32, 1.0f32);
+    let mut bytes = std::io::Cursor::new(Vec::new());
+    let image = Image::from_channels((8, 8), SpecificChannels::rgba(shade));
+    image.write().non_parallel().to_buffered(&mut bytes).unwrap();
+    bytes.into_inner()
+}
+
 fn points_bin() -> Vec<u8> {
     let mut bytes = 2u64.to_le_bytes().to_vec();
     for id in 0..2u64 {
@@ -207,6 +216,7 @@ fn cases() -> Vec<Case> {
                 .into(),
             |b| parse::nerfies_camera(b).is_ok(),
         ),
+        case("EXR", exr(), |b| parse::exr(b).is_ok()),
     ]
 }
 

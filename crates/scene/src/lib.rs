@@ -22,6 +22,7 @@ mod resize;
 pub mod rng;
 pub mod sh;
 mod similarity;
+mod srgb;
 
 pub use camera::{Camera, Intrinsics};
 pub use cloud::GaussianCloud;
@@ -36,3 +37,4 @@ pub use pose::Pose;
 pub use resize::resize_area;
 pub use rng::Rng;
 pub use similarity::Similarity;
+pub use srgb::{srgb_from_linear, srgb_slope};

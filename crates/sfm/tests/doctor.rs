@@ -341,3 +341,31 @@ fn something_that_moves_is_named_and_nothing_else() {
         );
     }
 }
+
+#[test]
+fn places_that_are_one_by_a_part_alone_share_nothing_else() {
+    let mut rng = irradia_scene::Rng::new(4, 4);
+    let mut uniform = move || f64::from(rng.range(-1.0, 1.0));
+    let mut direction = move || DVec3::new(uniform(), uniform(), uniform());
+    let mut some =
+        |n: usize| -> Vec<(DVec3, DVec3)> { (0..n).map(|_| (2.5 * direction(), direction().normalize())).collect() };
+    // Below the pictures of the first place.
+    let below = DVec3::new(0.0, 0.0, -1000.0);
+    let moved = |points: &[(DVec3, DVec3)]| points.iter().map(|p| (p.0 + below, p.1)).collect::<Vec<_>>();
+    let (alike, own, others) = (some(160), some(2600), some(2600));
+    let points = [alike.clone(), moved(&alike), own, moved(&others)].concat();
+    let first = around(16, 1.0);
+    let second = first.iter().map(|pose| DPose {
+        position: pose.position + below,
+        ..*pose
+    });
+    let poses = first.iter().copied().chain(second).collect();
+    let world = World::of_points(world::CAMERA, poses, &points, 160, 0.5, 0.0, 21);
+    let [found, alone] = plainly(&world);
+    assert!(
+        matches!(&found[..], [Diagnosis::Missing { photos, .. }] if photos.len() == 32),
+        "{found:?}, {:?} posed",
+        world.map().models.iter().map(Model::registered).collect::<Vec<_>>()
+    );
+    assert_eq!(alone, []);
+}

@@ -7,7 +7,7 @@ use crate::scene::{Hit, SynthScene};
 use crate::shape::Ray;
 use crate::sky;
 use glam::{Vec2, Vec3};
-use irradia_scene::{Camera, Image, Rng};
+use irradia_scene::{Camera, Image, Rng, srgb_from_linear};
 use rayon::prelude::*;
 use std::f32::consts::TAU;
 
@@ -237,18 +237,11 @@ fn around(axis: Vec3, offset: Vec2) -> Vec3 {
     (axis + s * offset.x + t * offset.y).normalize()
 }
 
-/// Linear radiance to sRGB: Narkowicz's fit (2015) of the ACES film curve, then the sRGB transfer (IEC 61966-2-1).
+/// Linear radiance to sRGB: Narkowicz's fit (2015) of the ACES film curve, then sRGB.
 fn develop(linear: Vec3) -> Vec3 {
     let x = linear * EXPOSURE;
     let film = (x * (2.51 * x + 0.03)) / (x * (2.43 * x + 0.59) + 0.14);
-    Vec3::from_array(film.to_array().map(|v| {
-        let v = v.clamp(0.0, 1.0);
-        if v <= 0.003_130_8 {
-            12.92 * v
-        } else {
-            1.055 * v.powf(1.0 / 2.4) - 0.055
-        }
-    }))
+    Vec3::from_array(film.to_array().map(|v| srgb_from_linear(v.clamp(0.0, 1.0))))
 }
 
 #[cfg(test)]

@@ -4,9 +4,9 @@ use crate::FormatError;
 use std::io::Read;
 use std::path::{Component, Path, PathBuf};
 
-const EXTENSIONS: [&str; 18] = [
+const EXTENSIONS: [&str; 20] = [
     "png", "jpg", "jpeg", "PNG", "JPG", "JPEG", "webp", "tif", "tiff", "WEBP", "TIF", "TIFF", "heic", "heif", "hif",
-    "HEIC", "HEIF", "HIF",
+    "HEIC", "HEIF", "HIF", "exr", "EXR",
 ];
 
 /// The image file for a dataset's `path`: that file, or that name with an extension added or replaced.

@@ -24,7 +24,7 @@ const LINE_EVERY: Duration = Duration::from_secs(5);
 
 #[derive(clap::Args)]
 pub struct Args {
-    /// Folders of photographs (JPEG, PNG, WebP, TIFF, HEIC; masks, if any, in their folders masks) and of films, or films, which need ffmpeg;
+    /// Folders of photographs (JPEG, PNG, WebP, TIFF, HEIC, OpenEXR; masks, if any, in their folders masks) and of films, or films, which need ffmpeg;
     /// panoramas of the whole sphere (equirectangular) are recognised and cut into faces
     #[arg(required = true)]
     pub photos: Vec<PathBuf>,

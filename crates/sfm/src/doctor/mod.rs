@@ -7,6 +7,7 @@ mod appearance;
 mod folds;
 mod lens;
 mod looks;
+mod missing;
 mod motion;
 mod moving;
 mod overlap;
@@ -186,6 +187,7 @@ pub fn diagnose(evidence: &Evidence) -> Vec<Diagnosis> {
     let contradiction = folds::contradiction(evidence, &moving.iter().flat_map(Diagnosis::photos).collect::<Vec<_>>());
     let known = [
         contradiction,
+        missing::missing(evidence),
         rotation_only,
         still,
         overlap,

@@ -35,6 +35,8 @@ pub enum Kind {
     Twice,
     /// [`Diagnosis::Contradiction`]
     Contradiction,
+    /// [`Diagnosis::Missing`]
+    Missing,
     /// [`Diagnosis::LeftOut`]
     LeftOut,
 }
@@ -58,6 +60,7 @@ impl Kind {
             Kind::Moving => "moving",
             Kind::Twice => "twice",
             Kind::Contradiction => "contradiction",
+            Kind::Missing => "missing-matches",
             Kind::LeftOut => "left-out",
         }
     }
@@ -200,6 +203,15 @@ pub enum Diagnosis {
         /// Verified pairs in all.
         of: usize,
     },
+    /// Photographs that share nothing with others from nearly the same place.
+    Missing {
+        /// The pair with most points that should be matched.
+        first: [usize; 2],
+        /// The photographs of all such pairs, those in most of them first.
+        photos: Vec<usize>,
+        /// The points that should be matched in the first.
+        expected: usize,
+    },
     /// A photograph without a pose.
     LeftOut {
         /// The photograph.
@@ -228,6 +240,7 @@ impl Diagnosis {
             Diagnosis::Moving { .. } => Kind::Moving,
             Diagnosis::Twice { .. } => Kind::Twice,
             Diagnosis::Contradiction { .. } => Kind::Contradiction,
+            Diagnosis::Missing { .. } => Kind::Missing,
             Diagnosis::LeftOut { .. } => Kind::LeftOut,
         }
     }
@@ -246,7 +259,8 @@ impl Diagnosis {
             | Diagnosis::FocalUnknown { photos }
             | Diagnosis::RotationOnly { photos, .. }
             | Diagnosis::StandsStill { photos, .. }
-            | Diagnosis::Moving { photos, .. } => photos.clone(),
+            | Diagnosis::Moving { photos, .. }
+            | Diagnosis::Missing { photos, .. } => photos.clone(),
             Diagnosis::ZoomSettings { settings } => settings.iter().flat_map(|s| s.1.clone()).collect(),
             Diagnosis::SeparateParts { parts } => parts.iter().skip(1).flatten().copied().collect(),
             Diagnosis::Bridge { photos, .. } | Diagnosis::Twice { photos } => photos.to_vec(),
@@ -264,6 +278,7 @@ impl Diagnosis {
             Diagnosis::CutPoint { photo, behind } => (*photo, behind.first().copied()),
             Diagnosis::FewPartners { photo, partners } => (*photo, partners.first().copied()),
             Diagnosis::SeparateParts { parts } => (parts[0][0], parts.get(1).map(|part| part[0])),
+            Diagnosis::Missing { first: [a, b], .. } => (*a, Some(*b)),
             Diagnosis::ZoomSettings { settings } => (settings[0].1[0], settings.get(1).map(|other| other.1[0])),
             other => {
                 let photos = other.photos();
@@ -460,6 +475,19 @@ impl Display for Sentence<'_> {
                 name(&pairs[0][0]),
                 name(&pairs[0][1]),
                 100.0 * agree
+            ),
+            Diagnosis::Missing {
+                first: [a, b],
+                photos,
+                expected,
+            } => write!(
+                f,
+                "{} photographs share nothing with others from nearly the same place, such as {} and {}, with {expected} points that should be \
+                 in both: parts that look alike are taken for one and the model is folded, or a thing was moved between them; pose them apart, \
+                 or mask what stayed",
+                photos.len(),
+                name(a),
+                name(b)
             ),
             Diagnosis::LeftOut { photo, reason } => write!(f, "{} is left out: {reason}", name(photo)),
         }

@@ -7,7 +7,7 @@ use crate::splats::quantize::logit;
 use crate::splats::rows::{decode_splats, plausible_count};
 use crate::splats::spz;
 use crate::{Malformed, zip};
-use irradia_scene::{GaussianCloud, base64, sh};
+use irradia_scene::{GaussianCloud, base64, sh, srgb_from_linear, srgb_slope};
 use rayon::prelude::*;
 use std::borrow::Cow;
 
@@ -216,15 +216,8 @@ fn encode_srgb(cloud: &mut GaussianCloud) {
     cloud.sh.par_chunks_mut(width).for_each(|values| {
         for c in 0..3 {
             let linear = sh::color_from_dc(values[c]);
-            let (encoded, slope) = match linear {
-                // IEC 61966-2-1.
-                ..0.003_130_8 => (12.92 * linear, 12.92),
-                _ => (
-                    1.055 * linear.powf(1.0 / 2.4) - 0.055,
-                    1.055 / 2.4 * linear.powf(1.0 / 2.4 - 1.0),
-                ),
-            };
-            values[c] = sh::dc_from_color(encoded);
+            values[c] = sh::dc_from_color(srgb_from_linear(linear));
+            let slope = srgb_slope(linear);
             values[3..]
                 .iter_mut()
                 .skip(c)

@@ -291,3 +291,27 @@ fn folders_are_read_together_and_names_stay_apart() {
     assert_eq!(found.left_out.len(), 1);
     assert!(found.left_out[0].0 == "first_1.png" && found.left_out[0].1.contains("copy of 3.png"));
 }
+
+#[test]
+fn photographs_at_a_fraction_of_their_size_have_the_masks_of_that_size() {
+    let root = tempfile::tempdir().unwrap();
+    let root = root.path();
+    for folder in ["images_4", "images_8", "masks", "masks_4"] {
+        fs::create_dir(root.join(folder)).unwrap();
+    }
+    picture(40, 30, 10).save(root.join("images_4/a.png")).unwrap();
+    picture(20, 15, 10).save(root.join("images_8/a.png")).unwrap();
+    for masks in ["masks", "masks_4"] {
+        image::GrayImage::new(40, 30)
+            .save(root.join(masks).join("a_mask.png"))
+            .unwrap();
+    }
+    for folder in [root.to_owned(), root.join("images_4")] {
+        let found = read_photo_folder(&folder).unwrap();
+        assert_eq!(found.photos.len(), 1);
+        assert_eq!(found.photos[0].width, 40);
+        assert_eq!(found.photos[0].mask, Some(root.join("masks_4/a_mask.png")));
+    }
+    let smaller = read_photo_folder(&root.join("images_8")).unwrap();
+    assert_eq!(smaller.photos[0].mask, Some(root.join("masks/a_mask.png")));
+}

@@ -5,6 +5,7 @@ use irradia_scene::{Dataset, LoadError, Photo};
 use irradia_train::recipe::{Knob, Param};
 use irradia_train::{Recipe, TrainError};
 use serde::{Deserialize, Serialize};
+use std::fmt::{self, Display, Formatter};
 use std::str::FromStr;
 
 /// Photographs that are asked about their border.
@@ -13,36 +14,61 @@ const SAMPLES: usize = 8;
 const BORDER_SHARE: f64 = 0.9;
 /// Least value of a white pixel: compression leaves some noise.
 const WHITE: u8 = 250;
-/// Largest value of a dark pixel: a black cloth under a flash is no perfect black.
-const DARK: u8 = 64;
-/// Share of the outermost pixels that are dark where objects stand before black: in the mean of the photographs, and in each. Of 40 captures, one such had
-/// 0.93 and 0.71, the others at most 0.41 in the median of their photographs.
-const DARK_SHARES: [f64; 2] = [0.8, 0.5];
+/// Least value of the channels of a white backdrop, which has shades and a tint, and largest of those of a black one, which is brightened by a flash. Floors
+/// and tables between them are surfaces.
+const WHITE_BACKDROP: u8 = 224;
+const BLACK_BACKDROP: u8 = 64;
+/// Largest difference of a backdrop's pixels from its colour, in each channel: cloth and paper have folds and shades.
+const SHADE: u8 = 24;
+/// Share of the outermost pixels that show the backdrop: in the mean of the photographs, and in each.
+const BACKDROP_SHARES: [f64; 2] = [0.8, 0.5];
 
-/// The share of the outermost pixels of `photo` of which each value `holds`.
-fn border_share(photo: &Photo, holds: impl Fn(u8) -> bool) -> f64 {
+/// Colours of the outermost pixels of a photograph.
+type Border = Vec<[u8; 3]>;
+
+fn border(photo: &Photo) -> Border {
     let channels = photo.channels as usize;
-    let all_hold = |at: &usize| {
-        photo.data[at * channels..][..channels]
-            .iter()
-            .all(|value| holds(*value))
-    };
-    photo.border().filter(all_hold).count() as f64 / photo.border().count().max(1) as f64
+    let color = |at: usize| std::array::from_fn(|c| photo.data[at * channels + c]);
+    photo.border().map(color).collect()
 }
 
-/// Whether nearly all of the outermost pixels of `photo` are white.
-fn has_white_border(photo: &Photo) -> bool {
-    border_share(photo, |value| value >= WHITE) >= BORDER_SHARE
+/// The share of the pixels that `holds`.
+fn share(border: &Border, holds: impl Fn([u8; 3]) -> bool) -> f64 {
+    border.iter().filter(|color| holds(**color)).count() as f64 / border.len().max(1) as f64
 }
 
-/// The share of dark ones.
-fn dark_share(photo: &Photo) -> f64 {
-    border_share(photo, |value| value <= DARK)
+/// Whether nearly all of the pixels are white.
+fn is_white(border: &Border) -> bool {
+    share(border, |color| color.iter().all(|value| *value >= WHITE)) >= BORDER_SHARE
+}
+
+/// The median of each channel.
+fn median(colors: &[[u8; 3]]) -> [u8; 3] {
+    std::array::from_fn(|c| {
+        let mut values: Vec<u8> = colors.iter().map(|color| color[c]).collect();
+        values.sort_unstable();
+        values.get(values.len() / 2).copied().unwrap_or(0)
+    })
+}
+
+/// The colour of the white or black cloth, paper or box that all photographs have around their object, if there is one.
+fn backdrop(borders: &[Border]) -> Option<[u8; 3]> {
+    let medians: Vec<[u8; 3]> = borders.iter().map(|border| median(border)).collect();
+    let color = median(&medians);
+    let is_possible =
+        color.iter().all(|value| *value >= WHITE_BACKDROP) || color.iter().all(|value| *value <= BLACK_BACKDROP);
+    let is_near = |other: [u8; 3]| other.iter().zip(color).all(|(a, b)| a.abs_diff(b) <= SHADE);
+    let shares: Vec<f64> = borders.iter().map(|border| share(border, is_near)).collect();
+    let [in_mean, in_each] = BACKDROP_SHARES;
+    let is_backdrop = is_possible
+        && shares.iter().all(|share| *share >= in_each)
+        && shares.iter().sum::<f64>() >= in_mean * shares.len() as f64;
+    is_backdrop.then_some(color)
 }
 
 /// Background of photographs with alpha, and of a scene's splats or field.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
+#[serde(into = "String", try_from = "String")]
 pub enum Background {
     /// White in training and evaluation, like the published figures of NeRF's synthetic scenes.
     White,
@@ -52,6 +78,8 @@ pub enum Background {
     Grey,
     /// A random colour per training step, white in evaluation.
     Random,
+    /// This colour, sRGB, in training and evaluation.
+    Color([u8; 3]),
 }
 
 impl Background {
@@ -61,16 +89,7 @@ impl Background {
             Self::White | Self::Random => [1.0; 3],
             Self::Black => [0.0; 3],
             Self::Grey => [0.5; 3],
-        }
-    }
-
-    /// The name on the command line.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::White => "white",
-            Self::Black => "black",
-            Self::Grey => "grey",
-            Self::Random => "random",
+            Self::Color(color) => color.map(|value| f32::from(value) / 255.0),
         }
     }
 
@@ -88,8 +107,8 @@ impl Background {
     }
 
     /// The default for a dataset: white for Blender scenes with transparent photographs, judged by the first one, and for
-    /// photographs without alpha of objects cut out on white, judged by eight of them; black where photographs without alpha are dark around their object; grey
-    /// for others without alpha if the recipe wants surfaces to cover it (`covers`); otherwise the recipe's own.
+    /// photographs without alpha of objects cut out on white, judged by eight of them; the colour of the backdrop where photographs without alpha
+    /// have one around their object; grey for others without alpha if the recipe wants surfaces to cover it (`covers`); otherwise the recipe's own.
     ///
     /// # Errors
     /// When one of these photographs cannot be read.
@@ -106,26 +125,45 @@ impl Background {
             let transparent = dataset.kind == "Blender" && alpha.iter().any(|a| *a < 255);
             return Ok(transparent.then_some(Self::White));
         }
-        let grey = covers.then_some(Self::Grey);
         let every = dataset.train.len().div_ceil(SAMPLES);
-        let (mut first, mut dark) = (Some(first), Vec::new());
-        let (mut all_white, mut all_dark) = (true, true);
-        for view in dataset.train.iter().step_by(every) {
-            let photo = first.take().map_or_else(|| load(view), Ok)?;
-            let share = dark_share(&photo);
-            dark.push(share);
-            all_white &= has_white_border(&photo);
-            all_dark &= share >= DARK_SHARES[1];
-            if !all_white && !all_dark {
-                return Ok(grey);
-            }
+        let others = dataset.train.iter().step_by(every).skip(1);
+        let others = others.map(|view| load(view).map(|photo| border(&photo)));
+        let borders: Vec<Border> = std::iter::once(Ok(border(&first)))
+            .chain(others)
+            .collect::<Result<_, _>>()?;
+        if borders.iter().all(is_white) {
+            return Ok(Some(Self::White));
         }
-        let is_dark = all_dark && dark.iter().sum::<f64>() >= DARK_SHARES[0] * dark.len() as f64;
-        Ok(match (all_white, is_dark) {
-            (true, _) => Some(Self::White),
-            (_, true) => Some(Self::Black),
-            _ => grey,
-        })
+        // What masks leave out is no part of the scene.
+        let backdrop = first.mask.is_none().then(|| backdrop(&borders)).flatten();
+        Ok(backdrop.map(Self::Color).or(covers.then_some(Self::Grey)))
+    }
+}
+
+/// The name on the command line.
+impl Display for Background {
+    fn fmt(&self, f: &mut Formatter) -> fmt::Result {
+        match self {
+            Self::White => f.write_str("white"),
+            Self::Black => f.write_str("black"),
+            Self::Grey => f.write_str("grey"),
+            Self::Random => f.write_str("random"),
+            Self::Color([r, g, b]) => write!(f, "#{r:02x}{g:02x}{b:02x}"),
+        }
+    }
+}
+
+impl From<Background> for String {
+    fn from(background: Background) -> Self {
+        background.to_string()
+    }
+}
+
+impl TryFrom<String> for Background {
+    type Error = String;
+
+    fn try_from(text: String) -> Result<Self, String> {
+        text.parse()
     }
 }
 
@@ -133,10 +171,19 @@ impl FromStr for Background {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
-        let found = [Self::White, Self::Black, Self::Grey, Self::Random]
+        let named = [Self::White, Self::Black, Self::Grey, Self::Random]
             .into_iter()
-            .find(|background| background.name() == text);
-        found.ok_or_else(|| "expected white, black, grey or random".into())
+            .find(|background| background.to_string() == text);
+        let color = || {
+            let is_hex = |digits: &&str| digits.len() == 6 && digits.bytes().all(|byte| byte.is_ascii_hexdigit());
+            let digits = text.strip_prefix('#').filter(is_hex)?;
+            let value = u32::from_str_radix(digits, 16).ok()?;
+            let [_, color @ ..] = value.to_be_bytes();
+            Some(Self::Color(color))
+        };
+        named
+            .or_else(color)
+            .ok_or_else(|| "expected white, black, grey, random or a colour such as #c8c0b4".into())
     }
 }
 
@@ -146,7 +193,7 @@ pub(crate) fn in_words(recipe: &Recipe) -> String {
         [1.0, 1.0, 1.0] => "white".to_owned(),
         [0.0, 0.0, 0.0] => "black".to_owned(),
         [0.5, 0.5, 0.5] => "grey".to_owned(),
-        [r, g, b] => format!("sRGB {r}, {g}, {b}"),
+        color => Background::Color(color.map(|value| (255.0 * value).round() as u8)).to_string(),
     };
     if recipe.uses(Param::RandomBackground) {
         format!("{color}; trained over random colours if photographs have alpha")
@@ -162,27 +209,54 @@ mod tests {
     use irradia_scene::{Camera, Intrinsics, Pose, View};
     use std::sync::Arc;
 
-    #[test]
-    fn a_cut_out_object_may_touch_the_border_of_its_photograph() {
-        let photo = |value: &dyn Fn(u32, u32) -> u8| Photo {
+    /// The border of a photograph of 40 x 20 grey values.
+    fn border_of(value: &dyn Fn(u32, u32) -> u8) -> Border {
+        border(&Photo {
             width: 40,
             height: 20,
             channels: 3,
             data: (0..800).flat_map(|i| [value(i % 40, i / 40); 3]).collect(),
             mask: None,
-        };
-        assert!(has_white_border(&photo(&|_, _| 252)));
-        assert!(has_white_border(&photo(&|x, y| if (15..25).contains(&x) && y > 5 {
+        })
+    }
+
+    #[test]
+    fn a_cut_out_object_may_touch_the_border_of_its_photograph() {
+        assert!(is_white(&border_of(&|_, _| 252)));
+        assert!(is_white(&border_of(&|x, y| if (15..25).contains(&x) && y > 5 {
             90
         } else {
             255
         })));
         // A table in the lower third.
-        assert!(!has_white_border(&photo(&|_, y| if y > 13 { 200 } else { 255 })));
-        assert!(!has_white_border(&photo(&|_, _| 240)));
-        assert_eq!(dark_share(&photo(&|_, _| 30)), 1.0);
-        let table = dark_share(&photo(&|_, y| if y > 13 { 200 } else { 30 }));
-        assert!((0.5..0.6).contains(&table), "{table}");
+        assert!(!is_white(&border_of(&|_, y| if y > 13 { 200 } else { 255 })));
+        assert!(!is_white(&border_of(&|_, _| 240)));
+    }
+
+    #[test]
+    fn a_backdrop_is_around_the_object_in_every_photograph() {
+        let cloth = |shade: u8| border_of(&move |x, _| shade + (x % 20) as u8);
+        assert_eq!(backdrop(&[cloth(10), cloth(14), cloth(6)]), Some([20; 3]));
+        let table = border_of(&|_, y| if y > 13 { 200 } else { 20 });
+        assert_eq!(backdrop(&[cloth(10), cloth(10), table.clone()]), Some([20; 3]));
+        assert_eq!(backdrop(&[table.clone(), table.clone(), cloth(10)]), None);
+        assert_eq!(backdrop(&[cloth(10), cloth(60), cloth(10), cloth(10)]), None);
+        assert_eq!(backdrop(&[cloth(230), cloth(226)]), Some([240; 3]));
+        assert_eq!(backdrop(&[cloth(170), cloth(170)]), None, "a floor");
+    }
+
+    #[test]
+    fn colours_are_written_as_they_are_read() {
+        for text in ["white", "black", "grey", "random", "#0c0b0d"] {
+            let background: Background = text.parse().unwrap();
+            assert_eq!(background.to_string(), text);
+            let json = serde_json::to_string(&background).unwrap();
+            assert_eq!(json, format!("\"{text}\""));
+            assert_eq!(serde_json::from_str::<Background>(&json).unwrap(), background);
+        }
+        for text in ["pink", "#fff", "#+12345", "#0c0b0é", ""] {
+            assert!(text.parse::<Background>().is_err(), "{text}");
+        }
     }
 
     #[test]
@@ -199,12 +273,12 @@ mod tests {
 
     #[test]
     fn photographs_without_alpha_get_grey_from_recipes_that_cover_it_and_what_they_show_around_objects() {
-        let dataset = |value: u8, channels: u32| {
+        let dataset = |value: &dyn Fn(usize) -> u8, channels: u32| {
             let photo = Photo {
                 width: 8,
                 height: 8,
                 channels,
-                data: vec![value; 64 * channels as usize],
+                data: (0..64 * channels as usize).map(value).collect(),
                 mask: None,
             };
             let view = View::new(
@@ -221,12 +295,16 @@ mod tests {
                 ..Dataset::default()
             }
         };
-        let usual = |value, channels, covers| Background::usual(&dataset(value, channels), covers).unwrap();
-        assert_eq!(usual(90, 3, true), Some(Background::Grey));
-        assert_eq!(usual(90, 3, false), None);
-        assert_eq!(usual(255, 3, true), Some(Background::White));
-        assert_eq!(usual(25, 3, true), Some(Background::Black));
-        assert_eq!(usual(90, 4, true), None, "alpha shows what is empty");
+        let usual = |value: &dyn Fn(usize) -> u8, channels, covers| {
+            Background::usual(&dataset(value, channels), covers).unwrap()
+        };
+        let uniform = |value: u8| move |_: usize| value;
+        let striped = |i: usize| if (i / 3) % 2 == 0 { 20 } else { 160 };
+        assert_eq!(usual(&striped, 3, true), Some(Background::Grey));
+        assert_eq!(usual(&striped, 3, false), None);
+        assert_eq!(usual(&uniform(255), 3, true), Some(Background::White));
+        assert_eq!(usual(&uniform(25), 3, true), Some(Background::Color([25; 3])));
+        assert_eq!(usual(&uniform(90), 4, true), None, "alpha shows what is empty");
     }
 
     #[test]

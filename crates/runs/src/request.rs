@@ -177,7 +177,7 @@ pub struct TrainInput {
     /// How the dataset is read.
     #[serde(flatten)]
     pub reading: Reading,
-    /// Background of photographs with alpha. `None`: white for Blender scenes and objects cut out on white, otherwise the recipe's.
+    /// What is behind the scene. `None`: what [`Background::usual`] finds in the photographs, otherwise the recipe's.
     #[serde(default)]
     pub background: Option<Background>,
     /// A scene whose splats the training begins with, a file or a run's folder, in the coordinates of the dataset.

@@ -115,7 +115,8 @@ impl PhotoFolder {
     }
 }
 
-/// The photographs in `folder` itself, or in its folder `images`, with their masks in its folder `masks`. Hidden files and those that are not pictures by their extension
+/// The photographs in `folder` itself, or in its folder `images` or, without one, the first of `images_2`, `images_4` and so on that has some, with their masks in
+/// `masks` or `masks_4` beside them. Hidden files and those that are not pictures by their extension
 /// are ignored; pictures that cannot be read, and copies, are left out.
 ///
 /// # Errors
@@ -131,14 +132,15 @@ pub fn read_photo_folder(folder: &Path) -> Result<PhotoFolder, FormatError> {
 pub fn read_photo_folders(folders: &[impl AsRef<Path>]) -> Result<PhotoFolder, FormatError> {
     let mut files: Vec<Found> = Vec::new();
     for folder in folders.iter().map(AsRef::as_ref) {
-        let mut here = list_pictures(folder)?;
-        if here.is_empty() && folder.join("images").is_dir() {
-            here = list_pictures(&folder.join("images"))?;
-        }
+        let Pictures {
+            root,
+            images,
+            files: here,
+        } = pictures_of(folder)?;
         let beside = [
-            Beside::masks(folder, "images"),
-            Beside::depths(folder),
-            Beside::normals(folder),
+            Beside::masks(&root, &images),
+            Beside::depths(&root),
+            Beside::normals(&root),
         ];
         files.extend(here.into_iter().map(|path| {
             let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
@@ -194,8 +196,50 @@ pub fn read_photo_folders(folders: &[impl AsRef<Path>]) -> Result<PhotoFolder, F
 
 /// Whether `path` is a folder with at least one picture that can be read by its extension, itself or in `images`.
 pub fn has_photos(path: &Path) -> bool {
-    let any = |folder: &Path| list_pictures(folder).is_ok_and(|files| files.iter().any(|file| is_image_name(file)));
-    any(path) || any(&path.join("images"))
+    pictures_of(path).is_ok_and(|pictures| pictures.files.iter().any(|file| is_image_name(file)))
+}
+
+/// Folders of photographs below that of a capture: as they are, or at a fraction of their size, as benchmarks have them.
+const IMAGES: [&str; 5] = ["images", "images_1", "images_2", "images_4", "images_8"];
+
+/// The pictures of a capture.
+struct Pictures {
+    /// The folder beside whose `images` masks and maps lie.
+    root: PathBuf,
+    /// The name of the folder of the pictures, `images` if they lie in `root` itself.
+    images: String,
+    files: Vec<PathBuf>,
+}
+
+/// The pictures in `folder` itself, else in the first of its [`IMAGES`] that has some.
+fn pictures_of(folder: &Path) -> Result<Pictures, FormatError> {
+    let files = list_pictures(folder)?;
+    let own = folder
+        .file_name()
+        .and_then(|name| IMAGES.into_iter().find(|images| name == *images));
+    if let (false, Some(images), Some(root)) = (files.is_empty(), own, folder.parent()) {
+        return Ok(Pictures {
+            root: root.to_owned(),
+            images: images.to_owned(),
+            files,
+        });
+    }
+    let mut found = Pictures {
+        root: folder.to_owned(),
+        images: IMAGES[0].to_owned(),
+        files,
+    };
+    for images in IMAGES {
+        let below = folder.join(images);
+        if found.files.is_empty() && below.is_dir() {
+            found = Pictures {
+                images: images.to_owned(),
+                files: list_pictures(&below)?,
+                ..found
+            };
+        }
+    }
+    Ok(found)
 }
 
 /// A photograph and what lies beside it, before any of it is opened.

@@ -65,8 +65,8 @@ pub struct Args {
     /// LPIPS weights: a file, or a folder of them; see irradia lpips
     #[arg(long, value_name = "PATH")]
     pub lpips: Option<PathBuf>,
-    /// Background of photographs with alpha: white, black or random (random colours in training, white in evaluation); when
-    /// absent white for Blender scenes and objects cut out on white, the recipe's own for others
+    /// What is behind the scene: white, black, grey, a colour such as '#c8c0b4', or random (random colours in training, white in evaluation); when absent
+    /// white for Blender scenes and objects cut out on white, the colour of a white or black backdrop, the recipe's own for others
     #[arg(long, value_name = "COLOR")]
     pub background: Option<Background>,
     /// Read and score the datasets as the papers do, and show their figures: blender, llff, mipnerf360 or tandt; a dataset's folder is
@@ -366,7 +366,7 @@ fn request(args: &Args, program: &str, source: &Source, variant: &Variant, seed:
         None => option("--downscale", Some(reading.downscale.to_string())),
     }
     option("--holdout", reading.holdout.clone());
-    option("--background", args.background().map(|b| b.name().to_owned()));
+    option("--background", args.background().map(|b| b.to_string()));
     // Published figures are those of the given poses.
     option("--poses", args.protocol.map(|_| "given".to_owned()));
     Request {
@@ -526,7 +526,7 @@ fn conditions(args: &Args) -> Vec<String> {
         None if reading.downscale > 1.0 => Some(format!("images downscaled by {}", reading.downscale)),
         None => None,
     };
-    let background = args.background.map(|b| format!("background {}", b.name()));
+    let background = args.background.map(|b| format!("background {b}"));
     let holdout = reading.holdout.map(|holdout| format!("held out: {holdout}"));
     let seeds = format!("{} seed{}", args.seeds, if args.seeds == 1 { "" } else { "s" });
     let splats = args.max_splats.map(|n| format!("at most {n} splats"));

@@ -43,7 +43,7 @@ pub struct Args {
     /// Threads; all cores when absent
     #[arg(long, value_parser = thread_count())]
     pub threads: Option<usize>,
-    /// Background of the scene: white, black or grey; when absent that of its run, or white for Blender scenes with alpha and objects cut out on white
+    /// Background of the scene: white, black, grey or a colour such as '#c8c0b4'; when absent that of its run, or what training would choose
     #[arg(long, value_name = "COLOR")]
     pub background: Option<Background>,
     #[command(flatten)]

@@ -84,8 +84,8 @@ pub struct Args {
     /// LPIPS weights: a file, or a folder of them; see irradia lpips
     #[arg(long, value_name = "PATH")]
     pub lpips: Option<PathBuf>,
-    /// Background of photographs with alpha: white, black or random (random colours in training, white in evaluation); when
-    /// absent white for Blender scenes and objects cut out on white, the recipe's own for others
+    /// What is behind the scene: white, black, grey, a colour such as '#c8c0b4', or random (random colours in training, white in evaluation); when absent
+    /// white for Blender scenes and objects cut out on white, the colour of a white or black backdrop, the recipe's own for others
     #[arg(long, value_name = "COLOR", conflicts_with = "resume")]
     pub background: Option<Background>,
     /// Serve a page on which the training can be looked at and paused; see irradia view

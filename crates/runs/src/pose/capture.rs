@@ -53,9 +53,8 @@ impl Sources {
             self.folders.push(path.to_owned());
         } else if depth > 0 {
             let is_beside = |entry: &Path| {
-                ["masks", "depths", "depth", "normals", "normal"]
-                    .iter()
-                    .any(|name| entry.ends_with(name))
+                let name = entry.file_name().unwrap_or_default().to_string_lossy();
+                ["masks", "depths", "depth", "normals", "normal"].contains(&&*name) || name.starts_with("masks_")
             };
             entries.retain(|entry| entry.is_dir() && !is_beside(entry));
             // A folder of datasets is no capture.

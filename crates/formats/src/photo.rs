@@ -3,7 +3,7 @@ use crate::image_file::{Colour, decode, decode_jpeg_at, read_header};
 use crate::undistort::Undistortion;
 use crate::{FormatError, Pixels};
 use image::metadata::Orientation;
-use irradia_scene::{LoadError, Photo, PhotoSource, resize_area};
+use irradia_scene::{LoadError, Part, Photo, PhotoSource, resize_area, resize_part};
 use std::path::{Path, PathBuf};
 
 /// Mask values from here on include the pixel in training.
@@ -60,8 +60,9 @@ impl PhotoFile {
             let pinhole = plan.pinhole();
             (pinhole.width, pinhole.height)
         });
-        let is_whole = |divisor: u32| self.upright.0.is_multiple_of(divisor) && self.upright.1.is_multiple_of(divisor);
-        let suffices = |divisor: &u32| is_whole(*divisor) && width / divisor >= size.0 && height / divisor >= size.1;
+        let wraps = self.undistortion.is_some_and(|plan| plan.wraps());
+        let joins = |divisor: &u32| !wraps || self.upright.0.is_multiple_of(*divisor);
+        let suffices = |divisor: &u32| joins(divisor) && width / divisor >= size.0 && height / divisor >= size.1;
         [8, 4, 2].into_iter().find(suffices).unwrap_or(1)
     }
 
@@ -84,7 +85,7 @@ impl PhotoFile {
                 ),
             ));
         }
-        let pixels = self.bring_to_size(pixels, size);
+        let pixels = self.bring_to_size(pixels, self.part(divisor), size);
         let mask = self
             .mask
             .as_deref()
@@ -99,12 +100,30 @@ impl PhotoFile {
         })
     }
 
-    fn bring_to_size(&self, mut pixels: Pixels, size: (u32, u32)) -> Pixels {
+    /// Where the photograph lies in the file decoded at 1 / `divisor` of its size: pixels at the right and the lower edge of the file are partly beyond it
+    /// if the divisor does not divide its sides.
+    fn part(&self, divisor: u32) -> Part {
+        let size = [self.upright.0, self.upright.1].map(|side| f64::from(side) / f64::from(divisor));
+        let beyond = size.map(|side| side.ceil() - side);
+        use Orientation::{FlipHorizontal, FlipVertical, Rotate90, Rotate180, Rotate270, Rotate270FlipH};
+        let flipped = [
+            matches!(self.orientation, Rotate90 | Rotate180 | FlipHorizontal | Rotate270FlipH),
+            matches!(self.orientation, Rotate180 | Rotate270 | FlipVertical | Rotate270FlipH),
+        ];
+        let start = [0, 1].map(|axis| if flipped[axis] { beyond[axis] } else { 0.0 });
+        Part { start, size }
+    }
+
+    fn bring_to_size(&self, mut pixels: Pixels, mut part: Part, size: (u32, u32)) -> Pixels {
         if let Some(undistortion) = &self.undistortion {
-            pixels = undistortion.apply(&pixels);
+            pixels = undistortion.apply_to_part(&pixels, part);
+            part = Part::whole([pixels.width, pixels.height]);
         }
-        if (pixels.width, pixels.height) != size {
-            pixels = resized(pixels, size);
+        let to = [size.0, size.1];
+        if part != Part::whole(to) {
+            let from = [pixels.width, pixels.height];
+            pixels.data = resize_part(&pixels.data, pixels.channels, from, part, to);
+            [pixels.width, pixels.height] = to;
         }
         pixels
     }
@@ -112,22 +131,15 @@ impl PhotoFile {
     fn read_mask(&self, path: &Path, size: (u32, u32)) -> Result<Vec<u8>, FormatError> {
         let orientation = read_header(path)?.turned_with(self.orientation, self.upright);
         let mut mask = decode(path, orientation, Colour::Grey)?;
-        if (mask.width, mask.height) != self.upright {
-            mask = resized(mask, self.upright);
+        let upright = [self.upright.0, self.upright.1];
+        if [mask.width, mask.height] != upright {
+            mask.data = resize_area(&mask.data, mask.channels, [mask.width, mask.height], upright);
+            [mask.width, mask.height] = upright;
         }
-        let mut mask = self.bring_to_size(mask, size).data;
+        let mut mask = self.bring_to_size(mask, Part::whole(upright), size).data;
         mask.iter_mut()
             .for_each(|v| *v = if *v >= MASK_THRESHOLD { 255 } else { 0 });
         Ok(mask)
-    }
-}
-
-fn resized(from: Pixels, (width, height): (u32, u32)) -> Pixels {
-    Pixels {
-        width,
-        height,
-        channels: from.channels,
-        data: resize_area(&from.data, from.channels, [from.width, from.height], [width, height]),
     }
 }
 
@@ -162,11 +174,6 @@ mod tests {
             };
             let (file, whole) = (photo(true), photo(false));
             assert!([(960, 672), (480, 336), (240, 168)].map(|size| file.divisor(size)) == [2, 4, 8]);
-            let odd = PhotoFile {
-                upright: (2001, 1400),
-                ..file.clone()
-            };
-            assert_eq!(odd.divisor((240, 168)), 1);
             assert!(whole.divisor((240, 168)) == 1 && whole.is_shrunk_from_full(240, 168));
             assert!(!file.is_shrunk_from_full(480, 336) && file.is_shrunk_from_full(900, 630));
             for (width, height) in [(960, 672), (480, 336), (240, 168), (900, 630)] {
@@ -176,6 +183,61 @@ mod tests {
                 let mean = a.data.iter().zip(&b.data).map(off).sum::<f64>() / a.data.len() as f64;
                 // A shift by half a pixel of the coarsest would be 2 to 3.
                 assert!(mean < 1.0, "{width}x{height}: {mean}");
+            }
+        }
+    }
+
+    #[test]
+    fn sides_that_no_fraction_divides_keep_their_pixels_in_place_in_every_orientation() {
+        use Orientation::*;
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("odd.jpg");
+        let (stored_width, stored_height) = (2003, 1389);
+        let wave = |v: u32, length: f32| (127.0 + 100.0 * (v as f32 / length).sin()) as u8;
+        let color = |x, y| image::Rgb([wave(x, 25.0), wave(y, 30.0), wave(x + y, 50.0)]);
+        image::RgbImage::from_fn(stored_width, stored_height, color)
+            .save(&path)
+            .unwrap();
+        for orientation in [
+            NoTransforms,
+            Rotate90,
+            Rotate180,
+            Rotate270,
+            FlipHorizontal,
+            FlipVertical,
+            Rotate90FlipH,
+            Rotate270FlipH,
+        ] {
+            let turned = matches!(orientation, Rotate90 | Rotate270 | Rotate90FlipH | Rotate270FlipH);
+            let upright = if turned {
+                (stored_height, stored_width)
+            } else {
+                (stored_width, stored_height)
+            };
+            let bent = Intrinsics {
+                lens: Lens::Opencv {
+                    k: [0.05, 0.0, 0.0, 0.0, 0.0, 0.0],
+                    p: [0.0; 2],
+                },
+                ..Intrinsics::from_fov_x(upright.0, upright.1, 1.0)
+            };
+            for undistortion in [None, Undistortion::plan(&bent)] {
+                let photo = |jpeg: bool| PhotoFile {
+                    image: path.clone(),
+                    mask: None,
+                    orientation,
+                    jpeg,
+                    upright,
+                    undistortion,
+                    size: (upright.0 / 9, upright.1 / 9),
+                };
+                let (file, whole) = (photo(true), photo(false));
+                assert_eq!((file.divisor(file.size), whole.divisor(whole.size)), (8, 1));
+                let [a, b] = [&file, &whole].map(|photo| photo.load().unwrap());
+                let off = |(a, b): (&u8, &u8)| f64::from(a.abs_diff(*b));
+                let mean = a.data.iter().zip(&b.data).map(off).sum::<f64>() / a.data.len() as f64;
+                // On the wrong side by what lies beyond the file they differ by 10.
+                assert!(mean < 1.5, "{orientation:?}: {mean}");
             }
         }
     }

@@ -2,7 +2,7 @@
 
 use crate::Pixels;
 use glam::{DQuat, DVec2, DVec3};
-use irradia_scene::{Intrinsics, Lens};
+use irradia_scene::{Intrinsics, Lens, Part};
 
 /// Spacing of the grid on which the lens is evaluated, pixels; in between, it is interpolated. The error is the second
 /// derivative of the mapping times 8, a few thousandths of a pixel for photographic lenses.
@@ -147,6 +147,11 @@ impl Undistortion {
         place.iter().all(|at| (0.0..=1.0).contains(at)).then_some(place)
     }
 
+    /// Whether the left and the right edge of the photographs are one.
+    pub fn wraps(&self) -> bool {
+        self.source.lens == Lens::Equirectangular
+    }
+
     /// Position in the photograph, pixels, of a position in the results; `None` where the lens has none.
     fn source_position(&self, x: f64, y: f64) -> Option<DVec2> {
         let direction = self.turn * plane_point(&self.pinhole, x, y).extend(1.0);
@@ -156,26 +161,30 @@ impl Undistortion {
     /// Whether a position in the results lies between the centres of the photograph's outermost pixels; the left and the right edge of a panorama
     /// are one.
     fn is_in_photograph(&self, x: f64, y: f64) -> bool {
-        let wraps = self.source.lens == Lens::Equirectangular;
         let within = |at: f64, side: u32| (0.5..=f64::from(side) - 0.5).contains(&at);
         self.source_position(x, y)
-            .is_some_and(|at| wraps || within(at.x, self.source.width) && within(at.y, self.source.height))
+            .is_some_and(|at| self.wraps() || within(at.x, self.source.width) && within(at.y, self.source.height))
     }
 
     /// Undistorts an image of the source's size, or of a fraction of it, bilinearly; the result has the same fraction of the size.
     pub fn apply(&self, from: &Pixels) -> Pixels {
+        self.apply_to_part(from, Part::whole([from.width, from.height]))
+    }
+
+    /// As [`Undistortion::apply`], of an image of which `part` is the photograph.
+    pub fn apply_to_part(&self, from: &Pixels, part: Part) -> Pixels {
         match from.channels {
-            1 => self.apply_channels::<1>(from),
-            3 => self.apply_channels::<3>(from),
-            _ => self.apply_channels::<4>(from),
+            1 => self.apply_channels::<1>(from, part),
+            3 => self.apply_channels::<3>(from, part),
+            _ => self.apply_channels::<4>(from, part),
         }
     }
 
-    fn apply_channels<const C: usize>(&self, from: &Pixels) -> Pixels {
+    fn apply_channels<const C: usize>(&self, from: &Pixels, part: Part) -> Pixels {
         // Pixels of the source for each of `from`, and of the whole result for each of this one; 1 at full size.
         let per_source = [
-            f64::from(self.source.width) / f64::from(from.width),
-            f64::from(self.source.height) / f64::from(from.height),
+            f64::from(self.source.width) / part.size[0],
+            f64::from(self.source.height) / part.size[1],
         ];
         let side = |full: u32, step: f64| ((f64::from(full) / step) as u32).max(1);
         let (width, height) = (
@@ -187,7 +196,7 @@ impl Undistortion {
             f64::from(self.pinhole.height) / f64::from(height),
         ];
         // Longitudes jump behind the camera, and all meet at the poles.
-        let wraps = self.source.lens == Lens::Equirectangular;
+        let wraps = self.wraps();
         let grid = if wraps { 1 } else { GRID };
         let grid_columns = width.div_ceil(grid) + 1;
         let grid_row = |y: u32| -> Vec<[f32; 2]> {
@@ -197,7 +206,7 @@ impl Undistortion {
                     let at = self.source_position(center[0] * per_result[0], center[1] * per_result[1]);
                     // Only of the grid beyond the result.
                     let at = at.unwrap_or(DVec2::new(f64::from(self.source.cx), f64::from(self.source.cy)));
-                    [0, 1].map(|axis| (at[axis] / per_source[axis] - 0.5) as f32)
+                    [0, 1].map(|axis| (part.start[axis] + at[axis] / per_source[axis] - 0.5) as f32)
                 })
                 .collect()
         };

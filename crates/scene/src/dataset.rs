@@ -1,6 +1,6 @@
 use crate::{Camera, PointCloud, Similarity, resize_area};
 use glam::Vec3;
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 
 /// Why a photograph could not be loaded, in one line: what, where and what to do.
 #[derive(Debug, thiserror::Error)]
@@ -97,6 +97,47 @@ pub trait PhotoSource: Send + Sync {
     /// Memory used by [`Self::load`] beyond its result, bytes.
     fn working_bytes(&self) -> usize {
         0
+    }
+}
+
+/// A photograph that stays in memory once it has been loaded.
+pub struct Kept {
+    source: Arc<dyn PhotoSource>,
+    photo: OnceLock<Photo>,
+}
+
+impl Kept {
+    /// Nothing is loaded yet.
+    pub fn new(source: Arc<dyn PhotoSource>) -> Self {
+        Self {
+            source,
+            photo: OnceLock::new(),
+        }
+    }
+}
+
+impl PhotoSource for Kept {
+    fn load(&self) -> Result<Photo, LoadError> {
+        if let Some(photo) = self.photo.get() {
+            return Ok(photo.clone());
+        }
+        let photo = self.source.load()?;
+        Ok(self.photo.get_or_init(|| photo).clone())
+    }
+
+    fn load_at(&self, width: u32, height: u32) -> Result<Photo, LoadError> {
+        match self.photo.get().filter(|_| self.is_shrunk_from_full(width, height)) {
+            Some(photo) => Ok(photo.resized(width, height)),
+            None => self.source.load_at(width, height),
+        }
+    }
+
+    fn is_shrunk_from_full(&self, width: u32, height: u32) -> bool {
+        self.source.is_shrunk_from_full(width, height)
+    }
+
+    fn working_bytes(&self) -> usize {
+        self.source.working_bytes()
     }
 }
 
@@ -211,6 +252,14 @@ pub struct Dataset {
 }
 
 impl Dataset {
+    /// Keeps held-out photographs in memory once they have been loaded.
+    pub fn keep_held_out(&mut self) {
+        for view in &self.test {
+            let photo = &mut self.views[*view].photo;
+            *photo = Arc::new(Kept::new(photo.clone()));
+        }
+    }
+
     /// The same dataset in the world of `world_from_dataset`.
     pub fn in_world(mut self, world_from_dataset: Similarity) -> Self {
         let old = std::mem::replace(&mut self.world_from_dataset, world_from_dataset);
@@ -236,4 +285,36 @@ impl Dataset {
 /// Returns `(train, test)`.
 pub fn every_eighth(count: usize) -> (Vec<usize>, Vec<usize>) {
     (0..count).partition(|index| !index.is_multiple_of(8))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::sync::atomic::{AtomicUsize, Ordering};
+
+    /// A photograph that can be loaded once.
+    struct Once(AtomicUsize);
+
+    impl PhotoSource for Once {
+        fn load(&self) -> Result<Photo, LoadError> {
+            if self.0.fetch_add(1, Ordering::Relaxed) > 0 {
+                return Err(LoadError("loaded again".into()));
+            }
+            Ok(Photo {
+                width: 2,
+                height: 1,
+                channels: 3,
+                data: vec![10, 20, 30, 30, 40, 50],
+                mask: None,
+            })
+        }
+    }
+
+    #[test]
+    fn what_is_kept_is_loaded_once_and_shrunk_from_memory() {
+        let kept = Kept::new(Arc::new(Once(AtomicUsize::new(0))));
+        let first = kept.load().unwrap();
+        assert_eq!(kept.load().unwrap(), first);
+        assert_eq!(kept.load_at(1, 1).unwrap().data, [20, 30, 40]);
+    }
 }

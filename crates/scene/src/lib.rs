@@ -27,14 +27,14 @@ mod srgb;
 pub use camera::{Camera, Intrinsics};
 pub use cloud::GaussianCloud;
 pub use dataset::{
-    Dataset, DepthGrid, Grid, GridSource, LoadError, NormalGrid, Photo, PhotoSource, View, every_eighth,
+    Dataset, DepthGrid, Grid, GridSource, Kept, LoadError, NormalGrid, Photo, PhotoSource, View, every_eighth,
 };
 pub use extra::{ExtraColumn, Scalar};
 pub use image::Image;
 pub use lens::Lens;
 pub use points::PointCloud;
 pub use pose::Pose;
-pub use resize::resize_area;
+pub use resize::{Part, resize_area, resize_part};
 pub use rng::Rng;
 pub use similarity::Similarity;
 pub use srgb::{srgb_from_linear, srgb_slope};

@@ -6,6 +6,33 @@
 /// # Panics
 /// When the length does not match, a size is zero, or the channels are not 1, 3 or 4.
 pub fn resize_area(from: &[u8], channels: u32, size: [u32; 2], to: [u32; 2]) -> Vec<u8> {
+    resize_part(from, channels, size, Part::whole(size), to)
+}
+
+/// A rectangle of an image, pixels; its edges may lie within pixels.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Part {
+    /// Left and upper edge.
+    pub start: [f64; 2],
+    /// Width and height.
+    pub size: [f64; 2],
+}
+
+impl Part {
+    /// All of an image of `size`.
+    pub fn whole(size: [u32; 2]) -> Self {
+        Self {
+            start: [0.0; 2],
+            size: size.map(f64::from),
+        }
+    }
+}
+
+/// As [`resize_area`], of a part of the pixels.
+///
+/// # Panics
+/// As [`resize_area`].
+pub fn resize_part(from: &[u8], channels: u32, size: [u32; 2], part: Part, to: [u32; 2]) -> Vec<u8> {
     let channels = channels as usize;
     assert_eq!(
         from.len(),
@@ -13,8 +40,7 @@ pub fn resize_area(from: &[u8], channels: u32, size: [u32; 2], to: [u32; 2]) -> 
         "pixel data matches the size"
     );
     assert!(!size.contains(&0) && !to.contains(&0), "sizes are positive");
-    let across = spans(size[0], to[0]);
-    let down = spans(size[1], to[1]);
+    let [across, down] = [0, 1].map(|axis| spans(size[axis], part.start[axis], part.size[axis], to[axis]));
     let stride = size[0] as usize * channels;
     let mut data = Vec::with_capacity(to[0] as usize * to[1] as usize * channels);
     let mut sums = vec![0f32; to[0] as usize * channels];
@@ -86,11 +112,12 @@ impl Span {
     }
 }
 
-fn spans(from: u32, to: u32) -> Vec<Span> {
-    let scale = f64::from(from) / f64::from(to);
+/// Of `to` output pixels over `length` of `from` source pixels, beginning at `begin`.
+fn spans(from: u32, begin: f64, length: f64, to: u32) -> Vec<Span> {
+    let scale = length / f64::from(to);
     (0..to)
         .map(|i| {
-            let (start, end) = (f64::from(i) * scale, f64::from(i + 1) * scale);
+            let (start, end) = (begin + f64::from(i) * scale, begin + f64::from(i + 1) * scale);
             let first = (start as usize).min(from as usize - 1);
             // An end on a pixel border, up to rounding, belongs to the previous pixel.
             let last = ((end - 1e-6).max(start) as usize).clamp(first, from as usize - 1);
@@ -127,6 +154,18 @@ mod tests {
             resize_area(&[10, 20], 1, [2, 1], [4, 2]),
             [10, 10, 20, 20, 10, 10, 20, 20]
         );
+    }
+
+    #[test]
+    fn a_part_may_begin_and_end_within_pixels() {
+        let part = |start: f64, size: f64| Part {
+            start: [start, 0.0],
+            size: [size, 1.0],
+        };
+        let row = [80, 40, 0, 200];
+        assert_eq!(resize_part(&row, 1, [4, 1], part(0.5, 2.0), [1, 1]), [40]);
+        assert_eq!(resize_part(&row, 1, [4, 1], part(0.5, 3.0), [3, 1]), [60, 20, 100]);
+        assert_eq!(resize_part(&row, 1, [4, 1], part(1.0, 2.5), [1, 1]), [56]);
     }
 
     #[test]

@@ -8,11 +8,15 @@ use irradia_measure::{Evaluation, Networks, evaluate, psnr_masked};
 use irradia_scene::{Camera, Dataset, Image, Photo, View};
 use irradia_splat::Renderer;
 use irradia_splat::init::camera_extent;
+use rayon::prelude::*;
 use std::ops::ControlFlow;
 
 /// Upper limit of PSNR, dB: that of equal images is infinite. A frame of 8 bits in which one value in 2,000 is off by one has
 /// 81 dB.
 pub const MAX_PSNR: f64 = 100.0;
+
+/// Photographs that are loaded at the same time, on as many threads.
+const LOADED_AT_ONCE: usize = 4;
 
 /// The result of one view with its images, `[H, W, 3]`.
 pub struct EvaluatedView {
@@ -69,9 +73,11 @@ pub fn evaluate_views(
     let mut renderer = Renderer::new();
     let cameras: Vec<Camera> = dataset.train.iter().map(|i| dataset.views[*i].camera).collect();
     let extent = camera_extent(&cameras);
-    for index in indices {
-        let view = &dataset.views[*index];
-        let photo = view.photo.load()?;
+    let load = |index: &usize| (*index, dataset.views[*index].photo.load());
+    let batches = indices.chunks(LOADED_AT_ONCE);
+    let loaded = batches.flat_map(|batch| batch.par_iter().map(load).collect::<Vec<_>>());
+    for (index, photo) in loaded {
+        let (view, photo) = (&dataset.views[index], photo?);
         let truth = truth_image(&photo, view, options.render.background);
         let render = model.render(&mut renderer, &view.camera, &options.render).color;
         let mask = photo.mask.as_deref();

@@ -35,6 +35,8 @@ const POINT: usize = 15;
 const PHOTO_SHARE: usize = 4;
 /// Photographs without which training would wait for each.
 const FEW_PHOTOS: usize = 8;
+/// Fraction of the memory for photographs, as a divisor, that held-out ones may take if the free memory is unknown.
+const HELD_OUT_SHARE: usize = 8;
 /// For photographs if the free memory is unknown: 5,500 of 360 x 360.
 const UNKNOWN: usize = 2 << 30;
 
@@ -51,6 +53,8 @@ pub struct MemoryPlan {
     pub photos: usize,
     /// What all photographs would take.
     pub all_photos: usize,
+    /// For held-out photographs, which stay in memory between evaluations; 0 if there is not enough for all.
+    pub held_out: usize,
     /// Maximum number of splats.
     pub splats: usize,
     /// The maximum without a limit on memory.
@@ -67,6 +71,8 @@ pub(crate) struct Needs {
     pub few_photos: usize,
     /// All photographs, and those being decoded, bytes.
     pub all_photos: usize,
+    /// Held-out photographs, bytes.
+    pub held_out: usize,
     /// Splats to begin with.
     pub first_splats: usize,
     /// The recipe's limit for this dataset.
@@ -86,7 +92,8 @@ impl Needs {
             .max()
             .unwrap_or(0);
         // Four channels, or three and a mask.
-        let all: usize = dataset.train.iter().map(|view| 4 * pixels(view)).sum();
+        let bytes = |views: &[usize]| views.iter().map(|view| 4 * pixels(view)).sum::<usize>();
+        let all = bytes(&dataset.train);
         let has_field = (0..recipe.stage.len()).any(|stage| is_field(recipe, stage));
         let all_at_once = has_field && all <= ALL_PHOTOS;
         let perceptual = match lpips {
@@ -106,6 +113,7 @@ impl Needs {
                     all.min(FEW_PHOTOS * 4 * largest)
                 },
             all_photos: working + all,
+            held_out: bytes(&dataset.test),
             first_splats: 0,
             most_splats: 0,
         }
@@ -118,17 +126,19 @@ impl MemoryPlan {
     /// # Errors
     /// When the first splats and a few photographs do not fit: the error says what would.
     pub(crate) fn new(needs: &Needs, limit: Option<usize>) -> Result<Self, TrainError> {
-        let plan = |splats, photos| Self {
+        let plan = |splats, photos, held_out| Self {
             limit,
             program: needs.program,
             images: needs.images,
             photos,
             all_photos: needs.all_photos,
+            held_out,
             splats,
             wanted_splats: needs.most_splats,
         };
         let Some(memory) = limit else {
-            return Ok(plan(needs.most_splats, UNKNOWN));
+            let held_out = Some(needs.held_out).filter(|bytes| *bytes <= UNKNOWN / HELD_OUT_SHARE);
+            return Ok(plan(needs.most_splats, UNKNOWN, held_out.unwrap_or(0)));
         };
         let fixed = needs.program + needs.images;
         let least = fixed + needs.few_photos + SPLAT * needs.first_splats.max(1);
@@ -150,11 +160,10 @@ impl MemoryPlan {
             .min(needs.few_photos.max((memory - fixed) / PHOTO_SHARE));
         let fitting = (memory - fixed).saturating_sub(photos) / SPLAT;
         let splats = needs.most_splats.min(fitting.max(needs.first_splats)).max(1);
+        let rest = memory - fixed - SPLAT * splats;
+        let held_out = Some(needs.held_out).filter(|bytes| photos + bytes <= rest).unwrap_or(0);
         // Photographs at full size, and at the scale of a stage.
-        Ok(plan(
-            splats,
-            (2 * needs.all_photos).min(memory - fixed - SPLAT * splats),
-        ))
+        Ok(plan(splats, (2 * needs.all_photos).min(rest - held_out), held_out))
     }
 
     /// The limit on the number of splats while a frame has `intersections` of splats and tiles with `splats` splats and `pixels`
@@ -243,6 +252,7 @@ mod tests {
             images: PIXEL * 1_000_000,
             few_photos: 50 << 20,
             all_photos: 10 * GIB,
+            held_out: GIB,
             first_splats,
             most_splats,
         }
@@ -254,8 +264,9 @@ mod tests {
             for first in [0, 200_000, 1_000_000, 5_000_000] {
                 match MemoryPlan::new(&needs(first, 6_000_000), Some(limit)) {
                     Ok(plan) => {
-                        let used = plan.program + plan.images + plan.photos + SPLAT * plan.splats;
+                        let used = plan.program + plan.images + plan.photos + plan.held_out + SPLAT * plan.splats;
                         assert!(used <= limit && plan.splats >= first && plan.photos >= 50 << 20);
+                        assert!([0, GIB].contains(&plan.held_out) && (limit < 32 * GIB || plan.held_out > 0));
                     }
                     Err(TrainError::Memory { needed, .. }) => {
                         let gib: f64 = needed.trim_end_matches("GiB").parse().unwrap();

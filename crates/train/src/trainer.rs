@@ -224,7 +224,7 @@ impl Trainer {
 
     /// A trainer whose state is yet to be filled in with `first_splats` splats, by a checkpoint for example.
     pub(crate) fn unfilled(
-        dataset: Arc<Dataset>,
+        mut dataset: Arc<Dataset>,
         recipe: Recipe,
         options: TrainOptions,
         first_splats: usize,
@@ -244,6 +244,9 @@ impl Trainer {
             ..Needs::of(&dataset, &recipe, options.lpips.as_ref().map(|lpips| lpips.net()))
         };
         let memory = MemoryPlan::new(&needs, options.memory)?;
+        if memory.held_out > 0 {
+            Arc::make_mut(&mut dataset).keep_held_out();
+        }
         let mut engine = Engine::new(SplatState::new(Splats::zeros(0, sh::MAX_DEGREE)));
         let decisions = use_device(&mut engine, &options.device, &recipe, first_splats)?;
         let extent = init::camera_extent(&cameras);

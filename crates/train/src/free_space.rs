@@ -1,6 +1,8 @@
 //! The empty space around cameras. A camera stands in free space, and nothing that its view is known to see is closer than its
-//! nearest points; splats closer than a fraction of that explain one photograph each, and veil the views between.
+//! nearest points; splats closer than a fraction of that explain one photograph each, and veil the views between. Only what is around a nearer point
+//! that many views see, such as the tip of a leaf, stays.
 
+use glam::Vec3;
 use irradia_scene::{Dataset, PointCloud, View};
 use irradia_splat::SplatState;
 use rayon::prelude::*;
@@ -11,12 +13,35 @@ const ENOUGH_POINTS: usize = 20;
 const OUTLIERS: f64 = 0.02;
 /// The fraction of all points that may lie in a sphere.
 const STRAY: f64 = 0.001;
+/// Views that see a point which is certainly there. Held-out PSNR without support and with that of points seen by 3 and 6: a plant in a room, at which some
+/// photographs are taken from among its leaves, 23.25, 23.54, 23.38 dB; mouse, whose table has wrong points, 24.23, 23.82, 24.23; lund_door and maryRose the same.
+const WITNESSES: u32 = 6;
+/// Distance from such a point, relative to its distance from the camera, up to which splats may belong to the same surface.
+const SUPPORT: f32 = 0.15;
 
 /// A sphere around each training camera of which the nearest depth is known.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct FreeSpace {
-    /// Centre and squared radius, world units.
-    spheres: Vec<([f32; 3], f32)>,
+    spheres: Vec<Sphere>,
+}
+
+#[derive(Clone, Debug)]
+struct Sphere {
+    center: Vec3,
+    radius: f32,
+    /// Points within that many views see, such as the tips of leaves, and the distance up to which they support splats; world units.
+    points: Vec<(Vec3, f32)>,
+}
+
+impl Sphere {
+    /// Whether a splat at `position` explains one photograph.
+    fn hides(&self, position: Vec3) -> bool {
+        position.distance_squared(self.center) < self.radius * self.radius
+            && !self
+                .points
+                .iter()
+                .any(|(point, reach)| point.distance_squared(position) < reach * reach)
+    }
 }
 
 impl FreeSpace {
@@ -25,13 +50,23 @@ impl FreeSpace {
         if fraction <= 0.0 {
             return Self::default();
         }
+        let certain = certain_points(dataset);
         let sphere = |view: &usize| {
             let view = &dataset.views[*view];
             let mut radius = fraction * nearest_depth(dataset, view)?;
             if let Some(points) = &dataset.points {
                 radius = radius.min(distance_to_points(points, view));
             }
-            Some((view.camera.pose.position.to_array(), radius * radius))
+            let center = view.camera.pose.position;
+            let certain = certain.iter().flatten();
+            let near = certain.map(|point| (*point, SUPPORT * point.distance(center)));
+            Some(Sphere {
+                center,
+                radius,
+                points: near
+                    .filter(|(point, reach)| point.distance(center) < radius + reach)
+                    .collect(),
+            })
         };
         Self {
             spheres: dataset.train.par_iter().filter_map(sphere).collect(),
@@ -51,11 +86,8 @@ impl FreeSpace {
             .with_min_len(1024)
             .filter(|i| {
                 let i = *i as usize;
-                let outside = |(center, square): &([f32; 3], f32)| {
-                    let d = [x[i] - center[0], y[i] - center[1], z[i] - center[2]];
-                    d[0] * d[0] + d[1] * d[1] + d[2] * d[2] >= *square
-                };
-                self.spheres.iter().all(outside)
+                let position = Vec3::new(x[i], y[i], z[i]);
+                !self.spheres.iter().any(|sphere| sphere.hides(position))
             })
             .collect();
         if kept.len() < n {
@@ -63,6 +95,20 @@ impl FreeSpace {
         }
         n - kept.len()
     }
+}
+
+/// `[points]` those that enough training views see to be certain.
+fn certain_points(dataset: &Dataset) -> Vec<Option<Vec3>> {
+    let positions = dataset.points.as_ref().map_or(&[][..], |points| &points.positions);
+    let mut witnesses = vec![0u32; positions.len()];
+    let seen = |view: &usize| dataset.views[*view].points_seen.iter();
+    for point in dataset.train.iter().flat_map(seen) {
+        if let Some(count) = witnesses.get_mut(*point as usize) {
+            *count += 1;
+        }
+    }
+    let certain = |(position, count): (&Vec3, u32)| (count >= WITNESSES).then_some(*position);
+    positions.iter().zip(witnesses).map(certain).collect()
 }
 
 /// Distance from a view's camera to the nearest of all points but a few outliers: a wall behind the camera stays.
@@ -99,7 +145,7 @@ pub(crate) fn seen_depths(dataset: &Dataset, view: &View) -> Option<Vec<f32>> {
 #[cfg(test)]
 pub(crate) mod tests {
     use super::*;
-    use glam::{Quat, Vec3};
+    use glam::Quat;
     use irradia_scene::{Camera, Intrinsics, Photo, Pose};
     use irradia_splat::Splats;
     use std::sync::Arc;
@@ -163,6 +209,20 @@ pub(crate) mod tests {
         points.positions.extend([Vec3::new(0.0, 0.0, 50.0); 3000]);
         let space = FreeSpace::new(&open, 0.3);
         assert_eq!(left(&space, &depths), [10.0], "2 of 102 points are outliers");
+    }
+
+    #[test]
+    fn what_surrounds_a_nearer_point_that_many_views_see_stays() {
+        let mut data = dataset(102, None);
+        let points = data.points.as_mut().unwrap();
+        points.positions.truncate(102);
+        points.positions.extend([Vec3::new(0.0, 0.0, 50.0); 3000]);
+        // The points at a depth of 1 are seen by one view, then by six.
+        let depths = [0.5, 0.8, 0.9, 1.1, 1.2, 2.9];
+        assert_eq!(left(&FreeSpace::new(&data, 0.3), &depths), Vec::<f32>::new());
+        data.views = vec![data.views[0].clone(); 6];
+        data.train = (0..6).collect();
+        assert_eq!(left(&FreeSpace::new(&data, 0.3), &depths), [0.9, 1.1]);
     }
 
     #[test]

@@ -27,6 +27,9 @@ pub(crate) struct ExrDecoder<R> {
 /// Values of a channel, `[H, W]`.
 type Plane = Vec<f32>;
 
+/// Width, height and values of three channels, `[H, W, 3]`.
+type Vectors = (u32, u32, Vec<[f32; 3]>);
+
 /// Whether a file that begins with `start` is in this format.
 pub(crate) fn is_exr(start: &[u8]) -> bool {
     start.starts_with(&[0x76, 0x2F, 0x31, 0x01])
@@ -60,8 +63,8 @@ impl<R: BufRead + Seek> ExrDecoder<R> {
         Ok((!is_color).then(|| (size[0], size[1], channels.of.swap_remove(at).1)))
     }
 
-    /// Three channels as they are stored: width, height and `[H, W, 3]`. `None` if there are not three.
-    pub fn read_vectors(self) -> ImageResult<Option<(u32, u32, Vec<[f32; 3]>)>> {
+    /// Three channels as they are stored. `None` if there are not three.
+    pub fn read_vectors(self) -> ImageResult<Option<Vectors>> {
         let size = self.size.map(|side| side as u32);
         let channels = self.read_channels().map_err(undecodable)?;
         let Some(three) = channels.colors().or_else(|| channels.three(["X", "Y", "Z"])) else {
@@ -363,7 +366,7 @@ mod tests {
         for i in 0..bytes.len() {
             damaged[i] ^= 0x5A;
             let _ = decoder(&damaged).and_then(DynamicImage::from_decoder);
-            damaged[i] = bytes[i];
+            damaged[i] ^= 0x5A;
         }
     }
 }

@@ -8,8 +8,9 @@ use serde::{Deserialize, Serialize};
 use std::fmt::{self, Display, Formatter};
 use std::str::FromStr;
 
-/// Photographs that are asked about their border.
+/// Photographs that are asked about their border, and their longer side, pixels.
 const SAMPLES: usize = 8;
+const SIDE: f32 = 400.0;
 /// Share of a photograph's outermost pixels that are white if its object is cut out: it may touch the border.
 const BORDER_SHARE: f64 = 0.9;
 /// Least value of a white pixel: compression leaves some noise.
@@ -114,7 +115,10 @@ impl Background {
     /// When one of these photographs cannot be read.
     pub fn usual(dataset: &Dataset, covers: bool) -> Result<Option<Self>, RunError> {
         let load = |view: &usize| {
-            let photo = dataset.views[*view].photo.load();
+            let view = &dataset.views[*view];
+            let k = view.camera.intrinsics;
+            let small = k.scaled((SIDE / k.width.max(k.height) as f32).min(1.0));
+            let photo = view.photo.load_at(small.width, small.height);
             photo.map_err(|error: LoadError| RunError::Train(TrainError::Photo(error)))
         };
         let Some(first) = dataset.train.first() else {
@@ -299,7 +303,7 @@ mod tests {
             Background::usual(&dataset(value, channels), covers).unwrap()
         };
         let uniform = |value: u8| move |_: usize| value;
-        let striped = |i: usize| if (i / 3) % 2 == 0 { 20 } else { 160 };
+        let striped = |i: usize| if (i / 3).is_multiple_of(2) { 20 } else { 160 };
         assert_eq!(usual(&striped, 3, true), Some(Background::Grey));
         assert_eq!(usual(&striped, 3, false), None);
         assert_eq!(usual(&uniform(255), 3, true), Some(Background::White));

@@ -132,7 +132,7 @@ fn blender_scenes_have_a_white_background_by_default() {
             "white; trained over random colours",
             255,
         ),
-        ("set", "--set render.background=[0.0,0.0,1.0]", "sRGB 0, 0, 1", 0),
+        ("set", "--set render.background=[0.0,0.0,1.0]", "#0000ff", 0),
     ] {
         let ended = irradia(folder.path(), &format!("train data --out {run} --steps 5 {option}")).success();
         assert!(ended.stderr.contains(&format!("background: {said}")), "{ended:?}");

@@ -362,11 +362,13 @@ fn open(path: &Path) -> Result<(Box<dyn ImageDecoder>, bool), FormatError> {
         path: path.to_owned(),
         source,
     };
-    if let Some(decoder) = open_exr(path)? {
+    let mut reader = BufReader::new(File::open(path).map_err(unread)?);
+    let start = reader.fill_buf().map_err(unread)?;
+    if is_exr(start) {
+        let decoder = ExrDecoder::new(reader).map_err(|error| undecodable(path, &error))?;
         return Ok((Box::new(decoder), false));
     }
-    let mut reader = BufReader::new(File::open(path).map_err(unread)?);
-    if is_heif(reader.fill_buf().map_err(unread)?) {
+    if is_heif(start) {
         let mut bytes = Vec::new();
         reader.read_to_end(&mut bytes).map_err(unread)?;
         let decoder = HeicDecoder::new(bytes).map_err(|error| undecodable(path, &error))?;

@@ -29,18 +29,15 @@ pub(crate) struct FreeSpace {
 struct Sphere {
     center: Vec3,
     radius: f32,
-    /// Points within that many views see, such as the tips of leaves, and the distance up to which they support splats; world units.
+    /// Points within or near it that many views see, such as the tips of leaves, and the distance up to which they support splats; world units.
     points: Vec<(Vec3, f32)>,
 }
 
 impl Sphere {
-    /// Whether a splat at `position` explains one photograph.
-    fn hides(&self, position: Vec3) -> bool {
-        position.distance_squared(self.center) < self.radius * self.radius
-            && !self
-                .points
-                .iter()
-                .any(|(point, reach)| point.distance_squared(position) < reach * reach)
+    /// Whether a splat may be at `position`; nowhere if that is not a number.
+    fn allows(&self, position: Vec3) -> bool {
+        let supports = |(point, reach): &(Vec3, f32)| point.distance_squared(position) < reach * reach;
+        position.distance_squared(self.center) >= self.radius * self.radius || self.points.iter().any(supports)
     }
 }
 
@@ -58,8 +55,7 @@ impl FreeSpace {
                 radius = radius.min(distance_to_points(points, view));
             }
             let center = view.camera.pose.position;
-            let certain = certain.iter().flatten();
-            let near = certain.map(|point| (*point, SUPPORT * point.distance(center)));
+            let near = certain.iter().map(|point| (*point, SUPPORT * point.distance(center)));
             Some(Sphere {
                 center,
                 radius,
@@ -87,7 +83,7 @@ impl FreeSpace {
             .filter(|i| {
                 let i = *i as usize;
                 let position = Vec3::new(x[i], y[i], z[i]);
-                !self.spheres.iter().any(|sphere| sphere.hides(position))
+                self.spheres.iter().all(|sphere| sphere.allows(position))
             })
             .collect();
         if kept.len() < n {
@@ -97,8 +93,8 @@ impl FreeSpace {
     }
 }
 
-/// `[points]` those that enough training views see to be certain.
-fn certain_points(dataset: &Dataset) -> Vec<Option<Vec3>> {
+/// Points that enough training views see to be certain.
+fn certain_points(dataset: &Dataset) -> Vec<Vec3> {
     let positions = dataset.points.as_ref().map_or(&[][..], |points| &points.positions);
     let mut witnesses = vec![0u32; positions.len()];
     let seen = |view: &usize| dataset.views[*view].points_seen.iter();
@@ -108,7 +104,7 @@ fn certain_points(dataset: &Dataset) -> Vec<Option<Vec3>> {
         }
     }
     let certain = |(position, count): (&Vec3, u32)| (count >= WITNESSES).then_some(*position);
-    positions.iter().zip(witnesses).map(certain).collect()
+    positions.iter().zip(witnesses).filter_map(certain).collect()
 }
 
 /// Distance from a view's camera to the nearest of all points but a few outliers: a wall behind the camera stays.

@@ -31,13 +31,13 @@ const PAIRS: usize = 12;
 pub(super) fn missing(evidence: &Evidence) -> Vec<Diagnosis> {
     let Some(model) = evidence.model else { return Vec::new() };
     let seen = points_of_photos(model, evidence.photos.len());
-    let close = |a: usize, b: usize| Some((a, b, expected(evidence, model, &seen, a, b)?));
     let mut found: Vec<([u32; 2], usize)> = (0..seen.len())
         .into_par_iter()
         .flat_map_iter(|a| (a + 1..seen.len()).map(move |b| (a, b)))
         .filter_map(|(a, b)| {
             // Either must lack what the other shows: behind a corner, one does.
-            let [there, back] = [close(a, b)?.2, close(b, a)?.2];
+            let there = expected(evidence, model, &seen, a, b)?;
+            let back = expected(evidence, model, &seen, b, a)?;
             let shares_none = |[shared, of]: [usize; 2]| (shared as f64) < NONE * of as f64;
             (shares_none(there) && shares_none(back)).then_some(([a as u32, b as u32], there[1].min(back[1])))
         })

@@ -185,18 +185,18 @@ impl Planes {
         self.clear();
     }
 
-    /// A copy, made by all threads.
-    pub fn copied(&self) -> Self {
-        let mut data = vec![0.0; self.data.len()];
-        data.par_chunks_mut(PIECE)
-            .zip(self.data.par_chunks(PIECE))
-            .for_each(|(to, from)| to.copy_from_slice(from));
-        Self {
-            data,
-            count: self.count,
-            len: self.len,
-            stride: self.stride,
+    /// Becomes a copy of `from`, made by all threads; reuses memory where possible.
+    pub fn copy_from(&mut self, from: &Self) {
+        if self.data.capacity() < from.data.len() {
+            // Fresh pages are zero already: all threads touch them first as they copy.
+            self.data = vec![0.0; from.data.len()];
         }
+        self.data.resize(from.data.len(), 0.0);
+        (self.count, self.len, self.stride) = (from.count, from.len, from.stride);
+        self.data
+            .par_chunks_mut(PIECE)
+            .zip(from.data.par_chunks(PIECE))
+            .for_each(|(to, from)| to.copy_from_slice(from));
     }
 
     /// Sets all values to zero, including padding.
@@ -259,6 +259,7 @@ mod tests {
                 .iter()
                 .flat_map(|i| all[2 * *i as usize..][..2].to_vec())
                 .collect();
+            let mut copy = Planes::zeros(1, 3);
             for threads in [1, 2] {
                 let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
                 let mut planes = Planes::from_interleaved(2, &items(0, n));
@@ -268,7 +269,8 @@ mod tests {
                     Planes::from_interleaved(2, &expected),
                     "{len}, {threads} threads"
                 );
-                assert_eq!(planes.copied(), planes);
+                copy.copy_from(&planes);
+                assert_eq!(copy, planes);
             }
         }
     }

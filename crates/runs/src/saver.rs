@@ -1,7 +1,9 @@
-//! Writes checkpoints, large ones in the background: the training is held up while its splats are copied, a second for five
-//! million, and not while 3.7 GB are written.
+//! Writes checkpoints, large ones in the background: the training is held up while its splats are copied, and not while they are
+//! written. Most of a first copy's time is the system's, for fresh pages, so that its memory is kept for the next one: with five million
+//! splats 4.8 s, then 0.2 s each.
 
 use crate::RunFolder;
+use irradia_splat::SplatState;
 use irradia_train::checkpoint::Checkpoint;
 use irradia_train::memory;
 use std::thread::JoinHandle;
@@ -15,8 +17,10 @@ type Outcome = Result<(u64, String), String>;
 /// The writer of a run's checkpoints, at most one at a time. Dropping it waits for the last one.
 #[derive(Default)]
 pub(crate) struct Saver {
-    writing: Option<JoinHandle<Outcome>>,
+    writing: Option<JoinHandle<(Outcome, SplatState)>>,
     outcome: Option<Outcome>,
+    /// The memory of the last copy.
+    spare: SplatState,
 }
 
 impl Saver {
@@ -26,8 +30,11 @@ impl Saver {
     /// # Errors
     /// One line.
     pub fn save(&mut self, folder: &RunFolder, checkpoint: Checkpoint) -> Result<Option<String>, String> {
+        self.wait();
         let bytes = checkpoint.bytes();
-        if bytes < BACKGROUND_FROM || memory::free().is_none_or(|free| (free as u64) < 2 * bytes) {
+        let held = self.spare.bytes() as u64;
+        if bytes < BACKGROUND_FROM || memory::free().is_none_or(|free| free as u64 + held < 2 * bytes) {
+            self.spare = SplatState::default();
             return self.save_now(folder, &checkpoint).map(Some);
         }
         self.save_behind(folder, &checkpoint);
@@ -45,15 +52,22 @@ impl Saver {
 
     fn save_behind(&mut self, folder: &RunFolder, checkpoint: &Checkpoint) {
         self.wait();
-        let (folder, copy) = (folder.clone(), checkpoint.copied());
-        self.writing = Some(std::thread::spawn(move || write(&folder, &copy)));
+        let spare = std::mem::take(&mut self.spare);
+        let (folder, copy) = (folder.clone(), checkpoint.copied_into(spare));
+        self.writing = Some(std::thread::spawn(move || (write(&folder, &copy), copy.into_state())));
     }
 
     /// Waits for the checkpoint that is being written.
     pub fn wait(&mut self) {
         if let Some(writing) = self.writing.take() {
-            let outcome = writing.join();
-            self.outcome = Some(outcome.unwrap_or_else(|_| Err("no checkpoint: its writer failed".to_owned())));
+            let failed = |_| {
+                (
+                    Err("no checkpoint: its writer failed".to_owned()),
+                    SplatState::default(),
+                )
+            };
+            let (outcome, spare) = writing.join().unwrap_or_else(failed);
+            (self.outcome, self.spare) = (Some(outcome), spare);
         }
     }
 

@@ -152,9 +152,11 @@ impl Splats {
         Self::from_columns(self.columns().map(|c| c.gather(indices)))
     }
 
-    /// A copy, made by all threads.
-    pub fn copied(&self) -> Self {
-        Self::from_columns(self.columns().map(Planes::copied))
+    /// Becomes a copy of `from`, made by all threads; reuses memory where possible.
+    pub fn copy_from(&mut self, from: &Self) {
+        for (to, from) in self.columns_mut().into_iter().zip(from.columns()) {
+            to.copy_from(from);
+        }
     }
 
     /// Centre of splat `i`, world units.

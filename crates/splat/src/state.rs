@@ -172,14 +172,14 @@ impl SplatState {
         self.all_columns_mut().split_off(COLUMN_NAMES.len())
     }
 
-    /// A copy, made by all threads.
-    pub fn copied(&self) -> Self {
-        Self {
-            splats: self.splats.copied(),
-            moments: [self.moments[0].copied(), self.moments[1].copied()],
-            statistics: self.statistics.copied(),
-            filter: self.filter.copied(),
+    /// Becomes a copy of `from`, made by all threads; reuses memory where possible.
+    pub fn copy_from(&mut self, from: &Self) {
+        self.splats.copy_from(&from.splats);
+        for (to, from) in self.moments.iter_mut().zip(&from.moments) {
+            to.copy_from(from);
         }
+        self.statistics.copy_from(&from.statistics);
+        self.filter.copy_from(&from.filter);
     }
 
     /// Allocated bytes.

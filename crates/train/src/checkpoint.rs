@@ -107,16 +107,22 @@ impl<'a> Checkpoint<'a> {
         }
     }
 
+    /// The copied splats; a copy if they are borrowed.
+    pub fn into_state(self) -> SplatState {
+        self.state.into_owned()
+    }
+
     /// Memory that a copy of the splats takes, bytes.
     pub fn bytes(&self) -> u64 {
         self.state.bytes() as u64
     }
 
-    /// With a copy of the splats.
-    pub fn copied(&self) -> Checkpoint<'static> {
+    /// With a copy of the splats, in the memory of `spare`.
+    pub fn copied_into(&self, mut spare: SplatState) -> Checkpoint<'static> {
+        spare.copy_from(&self.state);
         Checkpoint {
             step: self.step,
-            state: Cow::Owned(self.state.copied()),
+            state: Cow::Owned(spare),
             others: self.others.clone(),
             metadata: self.metadata.clone(),
         }

@@ -248,8 +248,13 @@ fn save(trainer: &Trainer, state_bytes: f64) -> Result<()> {
         state_bytes / wall / 1e3,
         machine::resident()[1].saturating_sub(before) as f64 / state_bytes
     );
-    let (_, (wall, cpu)) = once(|| Checkpoint::of(trainer).copied());
-    println!(" copy for a checkpoint in the background: {wall:.0} ms wall, {cpu:.0} ms CPU");
+    let mut spare = SplatState::default();
+    for what in ["first copy", "another copy"] {
+        let copy = || Checkpoint::of(trainer).copied_into(std::mem::take(&mut spare));
+        let (copied, (wall, cpu)) = once(copy);
+        spare = copied.into_state();
+        println!(" {what} for a checkpoint in the background: {wall:.0} ms wall, {cpu:.0} ms CPU");
+    }
     Ok(())
 }
 

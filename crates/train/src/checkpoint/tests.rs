@@ -125,7 +125,7 @@ fn a_streamed_checkpoint_has_the_bytes_of_the_format_and_a_copy_is_that_of_its_m
     let order = |bytes: &[u8]| SafeTensors::read_metadata(bytes).unwrap().1.offset_keys();
     assert_eq!(order(&bytes), order(&theirs));
     assert!(data(&bytes) == data(&theirs) && bytes.len() == theirs.len());
-    let copy = Checkpoint::of(&trainer).copied();
+    let copy = Checkpoint::of(&trainer).copied_into(SplatState::default());
     trainer.step(&mut Vec::new()).unwrap();
     let mut later = Vec::new();
     copy.write(&mut later).unwrap();

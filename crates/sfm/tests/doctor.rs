@@ -30,11 +30,13 @@ fn examine(world: &World, appearances: &[Appearance], colors: &[Vec<[u8; 3]>]) -
         cameras: &cameras,
         model: found.models.first(),
         zooms: &found.zooms,
+        apart: found.apart.as_ref(),
         left_out: &found.left_out,
     };
     let alone = Evidence {
         model: None,
         zooms: &[],
+        apart: None,
         left_out: &[],
         ..evidence
     };
@@ -343,7 +345,7 @@ fn something_that_moves_is_named_and_nothing_else() {
 }
 
 #[test]
-fn places_that_are_one_by_a_part_alone_share_nothing_else() {
+fn places_that_are_one_by_a_part_alone_are_mapped_apart() {
     let mut rng = irradia_scene::Rng::new(4, 4);
     let mut uniform = move || f64::from(rng.range(-1.0, 1.0));
     let mut direction = move || DVec3::new(uniform(), uniform(), uniform());
@@ -363,9 +365,12 @@ fn places_that_are_one_by_a_part_alone_share_nothing_else() {
     let world = World::of_points(world::CAMERA, poses, &points, 160, 0.5, 0.0, 21);
     let [found, alone] = plainly(&world);
     assert!(
-        matches!(&found[..], [Diagnosis::Missing { photos, .. }] if photos.len() == 32),
-        "{found:?}, {:?} posed",
-        world.map().models.iter().map(Model::registered).collect::<Vec<_>>()
+        matches!(&found[..], [Diagnosis::Missing { photos, models: 2, .. }] if photos.len() == 32),
+        "{found:?}"
     );
     assert_eq!(alone, []);
+    let models = world.map().models;
+    let of_first = |model: &Model| model.poses.iter().take(16).flatten().count();
+    assert_eq!(models.iter().map(Model::registered).collect::<Vec<_>>(), [16, 16]);
+    assert!(models.iter().all(|model| [0, 16].contains(&of_first(model))));
 }

@@ -154,6 +154,7 @@ pub(super) fn examine(
         cameras: &found.cameras,
         model,
         zooms: &found.zooms,
+        apart: found.apart.as_ref(),
         left_out: &found.left_out,
     };
     let names: Vec<String> = infos.iter().map(|info| info.name.clone()).collect();

@@ -211,6 +211,8 @@ pub enum Diagnosis {
         photos: Vec<usize>,
         /// The points that should be matched in the first.
         expected: usize,
+        /// Models of the parts that look alike; 1 if they are in one.
+        models: usize,
     },
     /// A photograph without a pose.
     LeftOut {
@@ -480,11 +482,25 @@ impl Display for Sentence<'_> {
                 first: [a, b],
                 photos,
                 expected,
+                models: 1,
             } => write!(
                 f,
                 "{} photographs share nothing with others from nearly the same place, such as {} and {}, with {expected} points that should be \
                  in both: parts that look alike are taken for one and the model is folded, or a thing was moved between them; pose them apart, \
                  or mask what stayed",
+                photos.len(),
+                name(a),
+                name(b)
+            ),
+            Diagnosis::Missing {
+                first: [a, b],
+                photos,
+                expected,
+                models,
+            } => write!(
+                f,
+                "{} photographs such as {} and {} would have been from nearly the same place and share nothing, with {expected} points that \
+                 should be in both: parts that look alike are {models} models now; take photographs that lead from one to the other",
                 photos.len(),
                 name(a),
                 name(b)

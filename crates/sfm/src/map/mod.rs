@@ -4,7 +4,9 @@
 //! models from seed pairs (`grow`), adjusting as they grow (`refine`). It depends on nothing but its input: no clock, no
 //! threads, no order of hashing.
 
+mod absent;
 mod agree;
+mod apart;
 mod distance;
 mod finish;
 mod fisheye;
@@ -22,6 +24,7 @@ mod unfold;
 mod verify;
 mod zoom;
 
+pub use absent::{ABSENT_PAIRS, absent};
 pub use agree::{agreement, contradictions, strengths, telling};
 pub use distance::{Distance, DistanceFit, to_distances};
 pub(crate) use finish::up;
@@ -29,8 +32,8 @@ pub use focal::Source;
 pub use metric::{Metric, to_metres};
 pub(crate) use types::rigs;
 pub use types::{
-    Known, LeftOut, MapOptions, Model, ModelPoint, Mount, PairKind, PhotoInfo, Progress, Reason, Reconstruction,
-    VerifiedPair, Zoom,
+    Absent, Apart, Known, LeftOut, MapOptions, Model, ModelPoint, Mount, PairKind, PhotoInfo, Progress, Reason,
+    Reconstruction, VerifiedPair, Zoom,
 };
 pub use verify::{Cameras, verify};
 
@@ -139,6 +142,7 @@ fn mapped(
         options,
     };
     let found = unfold::unfolded(&input, grown(&input, &verified, progress), progress);
+    let (found, apart) = apart::parted(&input, found, progress);
     let Grown { models, taken, tried } = found;
     let left_out = finish::left_out(photos, features, pairs, &verified, &taken, &tried, options);
     Reconstruction {
@@ -147,6 +151,7 @@ fn mapped(
         pairs: verified,
         cameras,
         zooms: Vec::new(),
+        apart,
     }
 }
 
@@ -179,6 +184,7 @@ pub fn extend(
         pairs: verified,
         cameras,
         zooms: Vec::new(),
+        apart: None,
     }
 }
 

@@ -176,6 +176,8 @@ pub struct Reconstruction {
     pub cameras: Vec<(DCamera, Source)>,
     /// Photographs of one group that turned out to have two focal lengths: each `Zoom` makes a further group.
     pub zooms: Vec<Zoom>,
+    /// Parts of the scene that were taken for one another at first, if there are such.
+    pub apart: Option<Apart>,
 }
 
 impl Reconstruction {
@@ -185,6 +187,24 @@ impl Reconstruction {
             zoom.photos.iter().for_each(|photo| photos[*photo].group = zoom.group);
         }
     }
+}
+
+/// Photographs that share next to nothing, though by their poses in a model they see the same.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Absent {
+    /// Their indices, ascending.
+    pub photos: [usize; 2],
+    /// Points of the model that should be matched.
+    pub expected: usize,
+}
+
+/// Parts of a scene that were taken for one another at first, and are mapped apart.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Apart {
+    /// Models of the parts.
+    pub models: usize,
+    /// What was absent in one model of them.
+    pub absent: Vec<Absent>,
 }
 
 /// Photographs that have another focal length than the rest of their group, which no metadata tell.

@@ -1,0 +1,114 @@
+//! Parts of a scene that were taken for one another, told by matches that are absent, are mapped apart.
+//!
+//! Photographs of one part hang together by their strongest pairs, and what looks alike joins the parts by weaker ones. So parts are grown
+//! from the strongest pairs on, and those are not joined of which many pairs should share points and do not. After Heinly, Dunn and Frahm,
+//! "Correcting for duplicate scene structure in sparse 3D reconstruction" (ECCV 2014), who split a model by what is seen and
+//! should not be.
+
+use super::absent::{ABSENT_PAIRS, Overlap, absent_of, overlaps};
+use super::agree::strengths;
+use super::types::{Apart, Model, Progress, VerifiedPair};
+use super::{Grown, Input, grown};
+use std::collections::BTreeMap;
+
+/// Fraction of the pairs between two parts that should share points and do not, from which on the parts are not the same.
+const APART: f64 = 0.25;
+/// Photographs that the models must hold together, of those before.
+const KEEPS: f64 = 0.9;
+/// Rounds in which photographs move to other parts.
+const ROUNDS: usize = 10;
+
+/// Models of the parts, where photographs of `found` should share points and do not, and those of the parts have at most half as many such
+/// pairs; else `found`.
+pub(super) fn parted(input: &Input, found: Grown, progress: &mut dyn FnMut(Progress)) -> (Grown, Option<Apart>) {
+    let Input {
+        photos,
+        features,
+        pairs,
+        ..
+    } = *input;
+    let seen = found.models.first().map_or(Vec::new(), |model| overlaps(photos, model));
+    let absent = absent_of(&seen);
+    if absent.len() < ABSENT_PAIRS {
+        return (found, None);
+    }
+    let part = parts(photos.len(), pairs, &strengths(photos, features, pairs), &seen);
+    let within = |pair: &&VerifiedPair| part[pair.photos[0] as usize] == part[pair.photos[1] as usize];
+    let kept: Vec<VerifiedPair> = pairs.iter().filter(within).cloned().collect();
+    let parts = grown(input, &kept, progress);
+    let registered = |found: &Grown| found.models.iter().map(Model::registered).sum::<usize>() as f64;
+    let left: usize = parts.models.iter().map(|m| absent_of(&overlaps(photos, m)).len()).sum();
+    if registered(&parts) < KEEPS * registered(&found) || 2 * left > absent.len() {
+        return (found, None);
+    }
+    let models = parts.models.len();
+    (parts, Some(Apart { models, absent }))
+}
+
+/// `[photos]` the part of each photograph: joined by pairs, strongest first, unless [`APART`] of what should overlap between two parts does
+/// not. Then each photograph moves to the part to which its pairs are strongest: a chain of few pairs may have pulled it away.
+fn parts(photos: usize, pairs: &[VerifiedPair], strengths: &[f64], overlaps: &[Overlap]) -> Vec<usize> {
+    let mut order: Vec<usize> = (0..pairs.len()).collect();
+    order.sort_by(|a, b| strengths[*b].total_cmp(&strengths[*a]).then(a.cmp(b)));
+    // Between two photographs, then parts, [absent, all] pairs that should share points.
+    let mut single = vec![[0u32; 2]; photos * photos];
+    for overlap in overlaps {
+        let [a, b] = overlap.photos;
+        for at in [a * photos + b, b * photos + a] {
+            single[at] = [u32::from(overlap.is_absent), 1];
+        }
+    }
+    let differ = |[absent, all]: [u32; 2]| absent > 0 && f64::from(absent) >= APART * f64::from(all);
+    let sum = |a: [u32; 2], b: [u32; 2]| [a[0] + b[0], a[1] + b[1]];
+    let mut between = single.clone();
+    let mut part: Vec<usize> = (0..photos).collect();
+    let mut joined = true;
+    while joined {
+        joined = false;
+        for i in &order {
+            let [to, from] = pairs[*i].photos.map(|p| part[p as usize]);
+            if to == from || differ(between[to * photos + from]) {
+                continue;
+            }
+            part.iter_mut()
+                .filter(|part| **part == from)
+                .for_each(|part| *part = to);
+            for other in 0..photos {
+                let both = sum(between[to * photos + other], between[from * photos + other]);
+                (between[to * photos + other], between[other * photos + to]) = (both, both);
+            }
+            joined = true;
+        }
+    }
+    let mut partners = vec![Vec::new(); photos];
+    for (pair, strength) in pairs.iter().zip(strengths) {
+        let [a, b] = pair.photos.map(|p| p as usize);
+        partners[a].push((b, *strength));
+        partners[b].push((a, *strength));
+    }
+    for _ in 0..ROUNDS {
+        let before = part.clone();
+        for photo in 0..photos {
+            let mut strength = BTreeMap::new();
+            for (other, of_pair) in &partners[photo] {
+                *strength.entry(part[*other]).or_insert(0.0) += of_pair;
+            }
+            let overlaps = |to: &usize| {
+                let of_part = (0..photos).filter(|other| part[*other] == *to);
+                of_part.map(|other| single[photo * photos + other]).fold([0, 0], sum)
+            };
+            let own = strength.get(&part[photo]).copied().unwrap_or(0.0);
+            let best = strength
+                .into_iter()
+                .filter(|(to, total)| *total > own && !differ(overlaps(to)))
+                .max_by(|a, b| a.1.total_cmp(&b.1));
+            if let Some((to, _)) = best {
+                part[photo] = to;
+            }
+        }
+        if part == before {
+            break;
+        }
+    }
+    part
+}

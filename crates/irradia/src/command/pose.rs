@@ -189,8 +189,20 @@ fn pose_with_progress(input: &PoseInput) -> Result<PoseReport> {
             .iter()
             .any(|f| f.kind == "left-out" && f.photos == [name])
     };
+    // One line a reason.
+    let mut left_out: Vec<(&str, &str, usize)> = Vec::new();
     for left in report.left_out.iter().filter(|left| unread(&left.name)) {
-        note(format_args!("left out: {}: {}", left.name, left.reason));
+        match left_out.iter_mut().find(|(_, reason, _)| *reason == left.reason) {
+            Some((_, _, others)) => *others += 1,
+            None => left_out.push((&left.name, &left.reason, 0)),
+        }
+    }
+    for (first, reason, others) in left_out {
+        match others {
+            0 => note(format_args!("left out: {first}: {reason}")),
+            1 => note(format_args!("left out: {first} and 1 other: {reason}")),
+            _ => note(format_args!("left out: {first} and {others} others: {reason}")),
+        }
     }
     tell_findings(&report.findings, |line| {
         note(line);

@@ -197,7 +197,7 @@ impl Capture {
                 Expected::Capture { kinds: &["moving"] }
             }
             "twin" => Expected::Capture {
-                kinds: &["contradiction", "separate-parts"],
+                kinds: &["contradiction", "separate-parts", "missing-matches"],
             },
             _ => Expected::Nothing { photographs: n },
         };

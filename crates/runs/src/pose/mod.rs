@@ -280,7 +280,7 @@ pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Resu
         successors: if capture.has_films { FILM_SUCCESSORS } else { 0 },
         ..PairOptions::default()
     };
-    let pairs = work.match_pairs(&pair_options)?;
+    let mut pairs = work.match_pairs(&pair_options)?;
     clock.end("matches");
 
     progress(PoseProgress::Stage {
@@ -301,6 +301,14 @@ pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Resu
             extend(&infos, work.features(), &pairs, &known, &input.mapping, &mut tell)
         }
     };
+    let unmatched = reconstruction.absent_and_unmatched(&infos, &pairs);
+    if is_new && !unmatched.is_empty() {
+        // Of many photographs not all pairs are matched: where too much is absent, the rest must be as well.
+        let mut all: Vec<[u32; 2]> = pairs.iter().map(|pair| pair.photos).chain(unmatched).collect();
+        all.sort_unstable();
+        pairs = work.matches_of(all)?;
+        reconstruction = reconstruct(&infos, work.features(), &pairs, &input.mapping, &mut tell);
+    }
     reconstruction.regroup(&mut infos);
     let scale = match reconstruction.models.first_mut() {
         // What is known keeps its unit.

@@ -186,10 +186,14 @@ impl<'a> Work<'a> {
         Ok(store::write(path, self.settings, photos, &self.known.matches)?)
     }
 
-    /// Matches of the pairs worth it, those that are not known yet in parallel.
+    /// Matches of the pairs worth it.
     pub fn match_pairs(&mut self, options: &PairOptions) -> Result<Vec<PairMatches>, RunError> {
+        self.matches_of(candidate_pairs(&self.features, options, &MatchOptions::default()))
+    }
+
+    /// Matches of `pairs`, those that are not known yet in parallel.
+    pub fn matches_of(&mut self, pairs: Vec<[u32; 2]>) -> Result<Vec<PairMatches>, RunError> {
         let matching = MatchOptions::default();
-        let pairs = candidate_pairs(&self.features, options, &matching);
         let hash = |pair: &[u32; 2]| pair.map(|i| self.hashes[i as usize]);
         let new: Vec<[u32; 2]> = pairs
             .iter()

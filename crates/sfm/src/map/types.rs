@@ -1,9 +1,11 @@
+use super::absent::{ABSENT_PAIRS, absent};
 use super::focal::Source;
+use crate::PairMatches;
 use crate::geometry::camera::DCamera;
 use crate::geometry::essential::Motion;
 use crate::geometry::pose::DPose;
 use glam::{DQuat, DVec3};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 /// What is known of a photograph beside its features.
 #[derive(Clone, Debug, PartialEq)]
@@ -181,6 +183,21 @@ pub struct Reconstruction {
 }
 
 impl Reconstruction {
+    /// Pairs of photographs that should share points and do not, where they are too many to be chance, and that are not among `matched`.
+    pub fn absent_and_unmatched(&self, photos: &[PhotoInfo], matched: &[PairMatches]) -> Vec<[u32; 2]> {
+        let found = match (&self.apart, self.models.first()) {
+            (Some(apart), _) => apart.absent.clone(),
+            (None, Some(model)) => absent(photos, model),
+            (None, None) => Vec::new(),
+        };
+        if found.len() < ABSENT_PAIRS {
+            return Vec::new();
+        }
+        let matched: BTreeSet<[u32; 2]> = matched.iter().map(|pair| pair.photos).collect();
+        let pairs = found.iter().map(|pair| pair.photos.map(|photo| photo as u32));
+        pairs.filter(|pair| !matched.contains(pair)).collect()
+    }
+
     /// Puts photographs that were zoomed into the groups by which `cameras` and those of the models are numbered.
     pub fn regroup(&self, photos: &mut [PhotoInfo]) {
         for zoom in &self.zooms {

@@ -133,8 +133,8 @@ pub fn pose_first(input: &mut TrainInput, poses: Poses, anyway: bool) -> Result<
 }
 
 /// As [`pose_first`], for photographs whose poses in `dataset` are not to be used; the same views are held out. Fails if a held-out view, or more than
-/// a few of the others, find no pose.
-pub fn pose_again(input: &mut TrainInput, dataset: &Dataset, poses: Poses) -> Result<()> {
+/// a few of the others, find no pose, but `anyway` trains on those that do.
+pub fn pose_again(input: &mut TrainInput, dataset: &Dataset, poses: Poses, anyway: bool) -> Result<()> {
     if let Some(images) = input.reading.images.take() {
         input.data = images;
     }
@@ -147,9 +147,9 @@ pub fn pose_again(input: &mut TrainInput, dataset: &Dataset, poses: Poses) -> Re
         names.filter(|name| left_out.contains(name.as_str())).count()
     };
     let (train, test) = (lost(&dataset.train), lost(&dataset.test));
-    if test > 0 || train as f64 > (1.0 - ENOUGH) * dataset.train.len() as f64 {
+    if !anyway && (test > 0 || train as f64 > (1.0 - ENOUGH) * dataset.train.len() as f64) {
         return Err(Usage(format!(
-            "{train} of {} training views and {test} of {} held-out ones find no pose again; train with --poses given",
+            "{train} of {} training views and {test} of {} held-out ones find no pose again; train with --poses given, or --anyway on the others",
             dataset.train.len(),
             dataset.test.len()
         ))
@@ -160,9 +160,13 @@ pub fn pose_again(input: &mut TrainInput, dataset: &Dataset, poses: Poses) -> Re
             .test
             .iter()
             .map(|view| file_name(&dataset.views[*view].name))
+            .filter(|name| !left_out.contains(name.as_str()))
             .collect();
-        let list = input.data.join("test.txt");
-        std::fs::write(&list, names.join("\n") + "\n").with_context(|| format!("cannot write {}", list.display()))?;
+        if !names.is_empty() {
+            let list = input.data.join("test.txt");
+            std::fs::write(&list, names.join("\n") + "\n")
+                .with_context(|| format!("cannot write {}", list.display()))?;
+        }
     }
     Ok(())
 }

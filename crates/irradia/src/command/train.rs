@@ -39,7 +39,7 @@ pub struct Args {
     /// given, unless the photographs contradict them, else irradia's
     #[arg(long, value_name = "WHO", value_enum, conflicts_with_all = ["resume", "replay"])]
     pub poses: Option<PosesOf>,
-    /// Train although fewer than 80 % of the photographs could be posed
+    /// Train although fewer than 80 % of the photographs could be posed, or some that would be held out could not
     #[arg(long)]
     pub anyway: bool,
     /// Override one key of the recipe, such as stage.grow.params.ssim_weight=0.3
@@ -178,7 +178,7 @@ pub fn run(args: &Args) -> Result<()> {
                 pose_first(&mut input, mapper, args.anyway)?;
                 return begin(input, args.viewer());
             }
-            let (request, dataset) = with_poses(input, args.poses)?;
+            let (request, dataset) = with_poses(input, args.poses, args.anyway)?;
             begin_on(request, dataset, args.viewer())
         }
     }
@@ -233,12 +233,12 @@ fn input(args: &Args) -> Result<TrainInput> {
 }
 
 /// The dataset of `input`, whose photographs have poses: with these, or with new ones if they are wanted or the photographs contradict those given.
-fn with_poses(input: TrainInput, poses: Option<PosesOf>) -> Result<(TrainRequest, Dataset)> {
+fn with_poses(input: TrainInput, poses: Option<PosesOf>, anyway: bool) -> Result<(TrainRequest, Dataset)> {
     let given = read(input.clone())?;
     RunFolder::check_free(&input.out, input.overwrite)?;
     if let Some(mapper) = poses.and_then(PosesOf::mapper) {
         let mut again = input;
-        pose_again(&mut again, &given.1, mapper)?;
+        pose_again(&mut again, &given.1, mapper, anyway)?;
         return read(again);
     }
     // Rendered scenes are exact, our own poses have been examined, and the splats of --from lie in the world of those given.
@@ -253,6 +253,14 @@ fn with_poses(input: TrainInput, poses: Option<PosesOf>) -> Result<(TrainRequest
             "{agree} of {} pairs of photographs agree with the given poses",
             found.pairs
         ));
+        let mut given = given;
+        if let Some([a, b]) = found.absent.first() {
+            let n = found.absent.len();
+            given.1.warnings.push(format!(
+                "by the given poses {n} pairs of photographs, such as {a} and {b}, are from nearly the same place, and share nothing: parts that \
+                 look alike may be taken for one; see whether --poses irradia --anyway tells them apart"
+            ));
+        }
         return Ok(given);
     }
     let [a, b] = &found.contradicting[0];
@@ -276,7 +284,7 @@ fn with_poses(input: TrainInput, poses: Option<PosesOf>) -> Result<(TrainRequest
 
 /// The dataset of `input` with new poses, if they are better than those of `given`, of which the share `contradicted` of pairs is contradicted.
 fn found_anew(mut input: TrainInput, given: &Dataset, contradicted: f64) -> Result<(TrainRequest, Dataset)> {
-    pose_again(&mut input, given, Poses::Irradia)?;
+    pose_again(&mut input, given, Poses::Irradia, false)?;
     let share = check(&input)?.share();
     ensure!(
         2.0 * share < contradicted,

@@ -1,7 +1,8 @@
 //! Whether the poses of a dataset agree with its photographs.
 //!
 //! Programs that find poses may take one part of a scene for another that looks alike, and the dataset then jumps between adjacent photographs. Their
-//! own reprojection errors do not show it, since they dropped the matches that contradict them; matching the photographs again does.
+//! own reprojection errors do not show it, since they dropped the matches that contradict them; matching the photographs again does. Where nothing else matches,
+//! nothing contradicts: there the points tell, which photographs from nearly the same place do not share.
 
 use super::stages::in_grey;
 use irradia_scene::{Camera, Dataset, Photo, View};
@@ -10,10 +11,12 @@ use irradia_sfm::features::{Extractor, GreyPhoto, Sift};
 use irradia_sfm::geometry::camera::DCamera;
 use irradia_sfm::geometry::pose::DPose;
 use irradia_sfm::map::{
-    MapOptions, Model, PairKind, PhotoInfo, VerifiedPair, agreement, contradictions, strengths, telling, verify,
+    ABSENT_PAIRS, MapOptions, Model, ModelPoint, PairKind, PhotoInfo, VerifiedPair, absent, agreement, contradictions,
+    strengths, telling, verify,
 };
 use irradia_sfm::matching::{MatchOptions, PairOptions, candidate_pairs, match_pairs};
 use rayon::prelude::*;
+use std::collections::BTreeSet;
 
 /// Long side of the photographs that are compared, px, and the most features of each: neighbours are told by a fraction of what poses need.
 const SIDE: u32 = 480;
@@ -37,6 +40,9 @@ pub struct PoseCheck {
     pub contradicting: Vec<[String; 2]>,
     /// Those of them whose photographs agree with others: there the poses jump.
     pub jumps: Vec<[String; 2]>,
+    /// Names of those that by their poses see the same and share nothing, neither points of the dataset nor matches, those that should share most
+    /// first; none where they are so few that it may be chance.
+    pub absent: Vec<[String; 2]>,
 }
 
 impl PoseCheck {
@@ -54,23 +60,29 @@ impl PoseCheck {
 /// Matches the photographs of `dataset` and compares what they say with its poses. Photographs that cannot be read are left out.
 pub fn check_poses(dataset: &Dataset) -> PoseCheck {
     let step = dataset.views.len().div_ceil(PHOTOGRAPHS).max(1);
-    let seen: Vec<(Camera, PhotoInfo, Features)> = dataset.views.par_iter().step_by(step).filter_map(look).collect();
-    let (mut cameras, mut photos, mut features) = (Vec::new(), Vec::new(), Vec::new());
-    for (group, (camera, info, found)) in seen.into_iter().enumerate() {
-        cameras.push(camera);
+    let seen: Vec<(&View, PhotoInfo, Features)> = dataset.views.par_iter().step_by(step).filter_map(look).collect();
+    let (mut views, mut photos, mut features) = (Vec::new(), Vec::new(), Vec::new());
+    for (group, (view, info, found)) in seen.into_iter().enumerate() {
+        views.push(view);
         photos.push(PhotoInfo { group, ..info });
         features.push(found);
     }
     let matching = MatchOptions::default();
-    let candidates = candidate_pairs(&features, &PairOptions::default(), &matching);
+    let mut candidates = candidate_pairs(&features, &PairOptions::default(), &matching);
+    let absent = absent_pairs(dataset, &views, &photos);
+    candidates.extend(&absent);
+    candidates.sort_unstable();
+    candidates.dedup();
     let matches = match_pairs(&features, &candidates, &matching, || ());
     let (_, mut pairs) = verify(&photos, &features, &matches, &MapOptions::default(), &mut |_| ());
+    let related: BTreeSet<[u32; 2]> = pairs.iter().map(|pair| pair.photos).collect();
+    let absent: Vec<[u32; 2]> = absent.into_iter().filter(|pair| !related.contains(pair)).collect();
     // What only turns or stands still, such as the background of a turntable, tells little of the places.
     pairs.retain(|pair| pair.kind != PairKind::Rotation);
     let strengths = strengths(&photos, &features, &pairs);
     let model = Model {
         cameras: photos.iter().map(|photo| photo.camera).collect(),
-        poses: poses(&cameras),
+        poses: poses(&views),
         ..Model::default()
     };
     let agreement = agreement(&photos, &features, &pairs, &model);
@@ -85,7 +97,50 @@ pub fn check_poses(dataset: &Dataset) -> PoseCheck {
         pairs: telling(&pairs, &strengths).count(),
         jumps: contradicting.iter().filter(jump).copied().map(names).collect(),
         contradicting: contradicting.into_iter().map(names).collect(),
+        absent: match absent.len() >= ABSENT_PAIRS {
+            true => absent.into_iter().map(names).collect(),
+            false => Vec::new(),
+        },
     }
+}
+
+/// Pairs of `views` that by their poses see the same and share no points of the dataset.
+fn absent_pairs(dataset: &Dataset, views: &[&View], photos: &[PhotoInfo]) -> Vec<[u32; 2]> {
+    let Some(points) = &dataset.points else {
+        return Vec::new();
+    };
+    let mut tracks = vec![Vec::new(); points.len()];
+    for (photo, view) in (0u32..).zip(views) {
+        // Which feature it was is not known, and does not matter.
+        view.points_seen
+            .iter()
+            .for_each(|i| tracks[*i as usize].push((photo, 0)));
+    }
+    let seen = points
+        .positions
+        .iter()
+        .zip(tracks)
+        .filter(|(_, track)| !track.is_empty());
+    let model = Model {
+        cameras: views
+            .iter()
+            .map(|view| Some(DCamera::pinhole(&view.camera.intrinsics)))
+            .collect(),
+        poses: views.iter().map(|view| Some(pose(&view.camera))).collect(),
+        points: seen
+            .map(|(position, track)| ModelPoint {
+                position: position.as_dvec3(),
+                track,
+                error: 0.0,
+            })
+            .collect(),
+        ..Model::default()
+    };
+    let absent = absent(photos, &model);
+    absent
+        .iter()
+        .map(|pair| pair.photos.map(|photo| photo as u32))
+        .collect()
 }
 
 /// `[photos]` whether several neighbours of a photograph agree with its pose: one that is wrong on its own contradicts all of them, while a jump leaves
@@ -100,7 +155,7 @@ fn in_place(photos: usize, pairs: &[VerifiedPair], strengths: &[f64], agreement:
 }
 
 /// A photograph and its features at the size at which it is compared.
-fn look(view: &View) -> Option<(Camera, PhotoInfo, Features)> {
+fn look(view: &View) -> Option<(&View, PhotoInfo, Features)> {
     let full = view.camera.intrinsics;
     let k = full.scaled((SIDE as f32 / full.width.max(full.height) as f32).min(1.0));
     let photo = view.photo.load_at(k.width, k.height).ok()?;
@@ -115,7 +170,7 @@ fn look(view: &View) -> Option<(Camera, PhotoInfo, Features)> {
         camera: Some(DCamera::pinhole(&k)),
         mount: None,
     };
-    Some((view.camera, info, features))
+    Some((view, info, features))
 }
 
 fn features(photo: &Photo) -> Features {
@@ -133,14 +188,8 @@ fn features(photo: &Photo) -> Features {
 }
 
 /// The poses in a world in which the cameras' median distance from their middle is 1.
-fn poses(cameras: &[Camera]) -> Vec<Option<DPose>> {
-    let mut poses: Vec<DPose> = cameras
-        .iter()
-        .map(|camera| DPose {
-            rotation: camera.pose.rotation.as_dquat(),
-            position: camera.pose.position.as_dvec3(),
-        })
-        .collect();
+fn poses(views: &[&View]) -> Vec<Option<DPose>> {
+    let mut poses: Vec<DPose> = views.iter().map(|view| pose(&view.camera)).collect();
     let middle = poses.iter().map(|pose| pose.position).sum::<glam::DVec3>() / poses.len().max(1) as f64;
     let mut distances: Vec<f64> = poses.iter().map(|pose| pose.position.distance(middle)).collect();
     distances.sort_by(f64::total_cmp);
@@ -151,4 +200,11 @@ fn poses(cameras: &[Camera]) -> Vec<Option<DPose>> {
         .iter_mut()
         .for_each(|pose| pose.position = (pose.position - middle) / scale);
     poses.into_iter().map(Some).collect()
+}
+
+fn pose(camera: &Camera) -> DPose {
+    DPose {
+        rotation: camera.pose.rotation.as_dquat(),
+        position: camera.pose.position.as_dvec3(),
+    }
 }

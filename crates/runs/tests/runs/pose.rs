@@ -1,9 +1,9 @@
 //! Photographs in, a dataset out: ray-traced photographs whose poses are known, and folders with which nothing can be done.
 
-use glam::Quat;
+use glam::{Quat, Vec3};
 use irradia_runs::formats::{DatasetFormat, DatasetOptions, read_dataset, read_image, write_png};
-use irradia_runs::scene::{Camera, Dataset, Photo, View};
-use irradia_runs::synth::{Capture, Part, Shot, SynthOptions};
+use irradia_runs::scene::{Camera, Dataset, Photo, PointCloud, Rng, View};
+use irradia_runs::synth::{Capture, Part, SceneName, Shot, SynthOptions};
 use irradia_runs::{
     DoctorInput, Finding, KnownDistance, Mapper, PoseInput, PoseProgress, PoseReport, RunError, check_poses, doctor,
     pose,
@@ -17,7 +17,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;
 
 const OPTIONS: SynthOptions = SynthOptions {
-    scene: irradia_runs::synth::SceneName::Demo,
+    scene: SceneName::Demo,
     views: 40,
     width: 320,
     height: 240,
@@ -46,10 +46,10 @@ fn quietly(input: &PoseInput) -> Result<PoseReport, RunError> {
     pose(input, &|_| {})
 }
 
-#[test]
-fn wrong_poses_are_told_from_sound_ones_and_from_a_single_wrong_one() {
+/// The training views of the cameras of [`OPTIONS`], of another `scene`.
+fn views_of(scene: SceneName) -> Vec<View> {
     let capture = Capture::new(&OPTIONS).unwrap();
-    let scene = OPTIONS.scene.build(OPTIONS.seed).0;
+    let scene = scene.build(OPTIONS.seed).0;
     let view = |shot: &Shot| {
         let frame = scene.trace(&shot.camera, 4, 1);
         let photo = Photo {
@@ -61,12 +61,57 @@ fn wrong_poses_are_told_from_sound_ones_and_from_a_single_wrong_one() {
         };
         View::new(shot.name(), shot.camera, Arc::new(photo))
     };
-    let sound: Vec<View> = capture
-        .shots()
-        .iter()
-        .filter(|shot| shot.part == Part::Train)
-        .map(view)
-        .collect();
+    let shots = capture.shots().iter().filter(|shot| shot.part == Part::Train);
+    shots.map(view).collect()
+}
+
+#[test]
+fn photographs_that_share_nothing_with_others_from_their_place_are_told() {
+    let mut rng = Rng::new(5, 5);
+    let mut points = PointCloud::default();
+    for _ in 0..1200 {
+        points
+            .positions
+            .push(Vec3::from_array([0; 3].map(|_| rng.range(-0.5, 0.5))));
+        points.colors.push([128; 3]);
+    }
+    let seen = |view: &View, range: std::ops::Range<u32>| -> Vec<u32> {
+        range
+            .filter(|i| view.camera.sees(points.positions[*i as usize]).is_some())
+            .collect()
+    };
+    let mut views = Vec::new();
+    let others = views_of(SceneName::Outdoor);
+    for (view, other) in views_of(OPTIONS.scene).into_iter().zip(others).take(16) {
+        views.push(View {
+            points_seen: seen(&view, 0..600),
+            ..view
+        });
+        views.push(View {
+            name: format!("other/{}", other.name),
+            points_seen: seen(&other, 600..1200),
+            ..other
+        });
+    }
+    let check = |views: Vec<View>| {
+        let points = Some(points.clone());
+        check_poses(&Dataset {
+            views,
+            points,
+            ..Dataset::default()
+        })
+    };
+    let one = views.iter().step_by(2).cloned().collect();
+    assert_eq!(check(one).absent, [[""; 2]; 0]);
+    let both = check(views).absent;
+    assert!(both.len() >= 12, "{both:?}");
+    let is_other = |name: &String| name.starts_with("other");
+    assert!(both.iter().all(|[a, b]| is_other(a) != is_other(b)), "{both:?}");
+}
+
+#[test]
+fn wrong_poses_are_told_from_sound_ones_and_from_a_single_wrong_one() {
+    let sound = views_of(OPTIONS.scene);
     let turned = |is_turned: &dyn Fn(&View) -> bool| {
         let mut views = sound.clone();
         let turn = Quat::from_rotation_z(0.4);
@@ -396,7 +441,7 @@ fn a_fisheye_is_found_without_metadata_and_photographs_are_added_to_it() {
 fn panoramas_in_folders_are_posed_by_their_faces() {
     let folder = tempfile::tempdir().unwrap();
     let options = SynthOptions {
-        scene: irradia_runs::synth::SceneName::Demo,
+        scene: SceneName::Demo,
         views: 14,
         width: 768,
         height: 384,

@@ -30,12 +30,14 @@ fn examine(world: &World, appearances: &[Appearance], colors: &[Vec<[u8; 3]>]) -
         cameras: &cameras,
         model: found.models.first(),
         zooms: &found.zooms,
-        apart: found.apart.as_ref(),
+        absent: &found.absent,
+        apart: found.apart,
         left_out: &found.left_out,
     };
     let alone = Evidence {
         model: None,
         zooms: &[],
+        absent: &[],
         apart: None,
         left_out: &[],
         ..evidence

@@ -136,11 +136,7 @@ fn absent_pairs(dataset: &Dataset, views: &[&View], photos: &[PhotoInfo]) -> Vec
             .collect(),
         ..Model::default()
     };
-    let absent = absent(photos, &model);
-    absent
-        .iter()
-        .map(|pair| pair.photos.map(|photo| photo as u32))
-        .collect()
+    absent(photos, &model).iter().map(|pair| pair.photos).collect()
 }
 
 /// `[photos]` whether several neighbours of a photograph agree with its pose: one that is wrong on its own contradicts all of them, while a jump leaves

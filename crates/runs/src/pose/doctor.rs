@@ -154,7 +154,8 @@ pub(super) fn examine(
         cameras: &found.cameras,
         model,
         zooms: &found.zooms,
-        apart: found.apart.as_ref(),
+        absent: &found.absent,
+        apart: found.apart,
         left_out: &found.left_out,
     };
     let names: Vec<String> = infos.iter().map(|info| info.name.clone()).collect();

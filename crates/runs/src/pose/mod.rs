@@ -301,7 +301,7 @@ pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Resu
             extend(&infos, work.features(), &pairs, &known, &input.mapping, &mut tell)
         }
     };
-    let unmatched = reconstruction.absent_and_unmatched(&infos, &pairs);
+    let unmatched = reconstruction.absent_and_unmatched(&pairs);
     if is_new && !unmatched.is_empty() {
         // Of many photographs not all pairs are matched: where too much is absent, the rest must be as well.
         let mut all: Vec<[u32; 2]> = pairs.iter().map(|pair| pair.photos).chain(unmatched).collect();

@@ -23,7 +23,7 @@ pub use turns::{Turns, turns};
 pub use types::{Diagnosis, Kind};
 
 use crate::geometry::camera::DCamera;
-use crate::map::{Apart, LeftOut, Model, PairKind, PhotoInfo, Reason, Source, VerifiedPair, Zoom, rigs};
+use crate::map::{Absent, LeftOut, Model, PairKind, PhotoInfo, Reason, Source, VerifiedPair, Zoom, rigs};
 use crate::{Features, PairMatches};
 use std::collections::BTreeMap;
 
@@ -48,8 +48,10 @@ pub struct Evidence<'a> {
     pub model: Option<&'a Model>,
     /// What the mapper found of focal lengths that no metadata tell.
     pub zooms: &'a [Zoom],
-    /// What the mapper took apart, because it looks alike.
-    pub apart: Option<&'a Apart>,
+    /// Photographs that should share points of a model and do not.
+    pub absent: &'a [Absent],
+    /// Models of what the mapper took apart therefore, if it did.
+    pub apart: Option<usize>,
     /// What became of photographs without a pose, if the photographs were mapped.
     pub left_out: &'a [LeftOut],
 }

@@ -24,13 +24,12 @@ const NONE: f64 = 0.1;
 /// Absent pairs from which on this is no chance. Of the models of 62 captures, three that are wrong have 13, 27 and 1,201; one of panoramas
 /// 10, all others at most 2.
 pub const ABSENT_PAIRS: usize = 12;
+
 /// Photographs that by their poses see the same.
 pub(super) struct Overlap {
-    /// Indices, ascending.
-    pub photos: [usize; 2],
-    /// Points that should be matched.
-    pub expected: usize,
-    /// Whether next to none of them are.
+    /// The pair.
+    pub pair: Absent,
+    /// Whether next to none of its points are matched.
     pub is_absent: bool,
 }
 
@@ -45,8 +44,10 @@ pub(super) fn overlaps(photos: &[PhotoInfo], model: &Model) -> Vec<Overlap> {
             let back = expected(photos, model, &seen, b, a)?;
             let shares_none = |[shared, of]: [usize; 2]| (shared as f64) < NONE * of as f64;
             Some(Overlap {
-                photos: [a, b],
-                expected: there[1].min(back[1]),
+                pair: Absent {
+                    photos: [a as u32, b as u32],
+                    expected: there[1].min(back[1]),
+                },
                 // Either must lack what the other shows: behind a corner, one does.
                 is_absent: shares_none(there) && shares_none(back),
             })
@@ -56,13 +57,7 @@ pub(super) fn overlaps(photos: &[PhotoInfo], model: &Model) -> Vec<Overlap> {
 
 /// What is absent, pairs with most expected points first.
 pub(super) fn absent_of(overlaps: &[Overlap]) -> Vec<Absent> {
-    let absent = overlaps.iter().filter(|o| o.is_absent);
-    let mut found: Vec<Absent> = absent
-        .map(|o| Absent {
-            photos: o.photos,
-            expected: o.expected,
-        })
-        .collect();
+    let mut found: Vec<Absent> = overlaps.iter().filter(|o| o.is_absent).map(|o| o.pair).collect();
     found.sort_by_key(|pair| (std::cmp::Reverse(pair.expected), pair.photos));
     found
 }

@@ -127,10 +127,16 @@ pub fn contradictions(pairs: &[VerifiedPair], strengths: &[f64], agreement: &[Op
     found
 }
 
+/// Indices of pairs, those of greater strength first.
+pub(super) fn strongest_first(strengths: &[f64]) -> Vec<usize> {
+    let mut order: Vec<usize> = (0..strengths.len()).collect();
+    order.sort_by(|a, b| strengths[*b].total_cmp(&strengths[*a]).then(a.cmp(b)));
+    order
+}
+
 /// The strongest pairs that join all photographs, without loops.
 pub fn spanning_tree(photos: usize, pairs: &[VerifiedPair], strengths: &[f64]) -> Vec<usize> {
-    let mut order: Vec<usize> = (0..pairs.len()).collect();
-    order.sort_by(|a, b| strengths[*b].total_cmp(&strengths[*a]).then(a.cmp(b)));
+    let mut order = strongest_first(strengths);
     let mut part: Vec<u32> = (0..photos as u32).collect();
     order.retain(|i| {
         let [to, from] = pairs[*i].photos.map(|p| part[p as usize]);

@@ -5,9 +5,9 @@
 //! "Correcting for duplicate scene structure in sparse 3D reconstruction" (ECCV 2014), who split a model by what is seen and
 //! should not be.
 
-use super::absent::{ABSENT_PAIRS, Overlap, absent_of, overlaps};
-use super::agree::strengths;
-use super::types::{Apart, Model, Progress, VerifiedPair};
+use super::absent::{ABSENT_PAIRS, Overlap, absent, absent_of, overlaps};
+use super::agree::{strengths, strongest_first};
+use super::types::{Absent, Model, Progress, VerifiedPair};
 use super::{Grown, Input, grown};
 use std::collections::BTreeMap;
 
@@ -18,9 +18,19 @@ const KEEPS: f64 = 0.9;
 /// Rounds in which photographs move to other parts.
 const ROUNDS: usize = 10;
 
+/// What became of a model in which matches are absent.
+pub(super) struct Parted {
+    /// Models of the parts, or what there was.
+    pub found: Grown,
+    /// What was absent before.
+    pub absent: Vec<Absent>,
+    /// Models of the parts, if there are such.
+    pub apart: Option<usize>,
+}
+
 /// Models of the parts, where photographs of `found` should share points and do not, and those of the parts have at most half as many such
 /// pairs; else `found`.
-pub(super) fn parted(input: &Input, found: Grown, progress: &mut dyn FnMut(Progress)) -> (Grown, Option<Apart>) {
+pub(super) fn parted(input: &Input, found: Grown, progress: &mut dyn FnMut(Progress)) -> Parted {
     let Input {
         photos,
         features,
@@ -28,32 +38,37 @@ pub(super) fn parted(input: &Input, found: Grown, progress: &mut dyn FnMut(Progr
         ..
     } = *input;
     let seen = found.models.first().map_or(Vec::new(), |model| overlaps(photos, model));
-    let absent = absent_of(&seen);
-    if absent.len() < ABSENT_PAIRS {
-        return (found, None);
+    let absent_pairs = absent_of(&seen);
+    if absent_pairs.len() >= ABSENT_PAIRS {
+        let part = parts(photos.len(), pairs, &strengths(photos, features, pairs), &seen);
+        let within = |pair: &&VerifiedPair| part[pair.photos[0] as usize] == part[pair.photos[1] as usize];
+        let kept: Vec<VerifiedPair> = pairs.iter().filter(within).cloned().collect();
+        let parts = grown(input, &kept, progress);
+        let registered = |found: &Grown| found.models.iter().map(Model::registered).sum::<usize>() as f64;
+        let left: usize = parts.models.iter().map(|model| absent(photos, model).len()).sum();
+        if registered(&parts) >= KEEPS * registered(&found) && 2 * left <= absent_pairs.len() {
+            return Parted {
+                apart: Some(parts.models.len()),
+                found: parts,
+                absent: absent_pairs,
+            };
+        }
     }
-    let part = parts(photos.len(), pairs, &strengths(photos, features, pairs), &seen);
-    let within = |pair: &&VerifiedPair| part[pair.photos[0] as usize] == part[pair.photos[1] as usize];
-    let kept: Vec<VerifiedPair> = pairs.iter().filter(within).cloned().collect();
-    let parts = grown(input, &kept, progress);
-    let registered = |found: &Grown| found.models.iter().map(Model::registered).sum::<usize>() as f64;
-    let left: usize = parts.models.iter().map(|m| absent_of(&overlaps(photos, m)).len()).sum();
-    if registered(&parts) < KEEPS * registered(&found) || 2 * left > absent.len() {
-        return (found, None);
+    Parted {
+        found,
+        absent: absent_pairs,
+        apart: None,
     }
-    let models = parts.models.len();
-    (parts, Some(Apart { models, absent }))
 }
 
 /// `[photos]` the part of each photograph: joined by pairs, strongest first, unless [`APART`] of what should overlap between two parts does
 /// not. Then each photograph moves to the part to which its pairs are strongest: a chain of few pairs may have pulled it away.
 fn parts(photos: usize, pairs: &[VerifiedPair], strengths: &[f64], overlaps: &[Overlap]) -> Vec<usize> {
-    let mut order: Vec<usize> = (0..pairs.len()).collect();
-    order.sort_by(|a, b| strengths[*b].total_cmp(&strengths[*a]).then(a.cmp(b)));
+    let order = strongest_first(strengths);
     // Between two photographs, then parts, [absent, all] pairs that should share points.
     let mut single = vec![[0u32; 2]; photos * photos];
     for overlap in overlaps {
-        let [a, b] = overlap.photos;
+        let [a, b] = overlap.pair.photos.map(|p| p as usize);
         for at in [a * photos + b, b * photos + a] {
             single[at] = [u32::from(overlap.is_absent), 1];
         }

@@ -32,13 +32,14 @@ pub use focal::Source;
 pub use metric::{Metric, to_metres};
 pub(crate) use types::rigs;
 pub use types::{
-    Absent, Apart, Known, LeftOut, MapOptions, Model, ModelPoint, Mount, PairKind, PhotoInfo, Progress, Reason,
+    Absent, Known, LeftOut, MapOptions, Model, ModelPoint, Mount, PairKind, PhotoInfo, Progress, Reason,
     Reconstruction, VerifiedPair, Zoom,
 };
 pub use verify::{Cameras, verify};
 
 use crate::geometry::camera::DCamera;
 use crate::{Features, PairMatches};
+use apart::Parted;
 use tracks::Tracks;
 
 /// Settings of a zoom that are told apart, beside the first.
@@ -142,7 +143,7 @@ fn mapped(
         options,
     };
     let found = unfold::unfolded(&input, grown(&input, &verified, progress), progress);
-    let (found, apart) = apart::parted(&input, found, progress);
+    let Parted { found, absent, apart } = apart::parted(&input, found, progress);
     let Grown { models, taken, tried } = found;
     let left_out = finish::left_out(photos, features, pairs, &verified, &taken, &tried, options);
     Reconstruction {
@@ -151,6 +152,7 @@ fn mapped(
         pairs: verified,
         cameras,
         zooms: Vec::new(),
+        absent,
         apart,
     }
 }
@@ -178,8 +180,10 @@ pub fn extend(
     working.grow(&vec![false; photos.len()], &mut tried, progress);
     let taken: Vec<bool> = working.poses.iter().map(Option::is_some).collect();
     let left_out = finish::left_out(photos, features, pairs, &verified, &taken, &tried, options);
+    let model = finish::collected(&working, photos);
     Reconstruction {
-        models: vec![finish::collected(&working, photos)],
+        absent: absent(photos, &model),
+        models: vec![model],
         left_out,
         pairs: verified,
         cameras,

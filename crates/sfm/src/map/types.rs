@@ -1,4 +1,4 @@
-use super::absent::{ABSENT_PAIRS, absent};
+use super::absent::ABSENT_PAIRS;
 use super::focal::Source;
 use crate::PairMatches;
 use crate::geometry::camera::DCamera;
@@ -178,23 +178,21 @@ pub struct Reconstruction {
     pub cameras: Vec<(DCamera, Source)>,
     /// Photographs of one group that turned out to have two focal lengths: each `Zoom` makes a further group.
     pub zooms: Vec<Zoom>,
-    /// Parts of the scene that were taken for one another at first, if there are such.
-    pub apart: Option<Apart>,
+    /// Pairs that share next to nothing, though by their poses in the largest model they see the same, or in the one that was taken apart, those with most
+    /// expected points first.
+    pub absent: Vec<Absent>,
+    /// Models of parts that were taken for one another at first, if there are such.
+    pub apart: Option<usize>,
 }
 
 impl Reconstruction {
     /// Pairs of photographs that should share points and do not, where they are too many to be chance, and that are not among `matched`.
-    pub fn absent_and_unmatched(&self, photos: &[PhotoInfo], matched: &[PairMatches]) -> Vec<[u32; 2]> {
-        let found = match (&self.apart, self.models.first()) {
-            (Some(apart), _) => apart.absent.clone(),
-            (None, Some(model)) => absent(photos, model),
-            (None, None) => Vec::new(),
-        };
-        if found.len() < ABSENT_PAIRS {
+    pub fn absent_and_unmatched(&self, matched: &[PairMatches]) -> Vec<[u32; 2]> {
+        if self.absent.len() < ABSENT_PAIRS {
             return Vec::new();
         }
         let matched: BTreeSet<[u32; 2]> = matched.iter().map(|pair| pair.photos).collect();
-        let pairs = found.iter().map(|pair| pair.photos.map(|photo| photo as u32));
+        let pairs = self.absent.iter().map(|pair| pair.photos);
         pairs.filter(|pair| !matched.contains(pair)).collect()
     }
 
@@ -210,18 +208,9 @@ impl Reconstruction {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Absent {
     /// Their indices, ascending.
-    pub photos: [usize; 2],
+    pub photos: [u32; 2],
     /// Points of the model that should be matched.
     pub expected: usize,
-}
-
-/// Parts of a scene that were taken for one another at first, and are mapped apart.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Apart {
-    /// Models of the parts.
-    pub models: usize,
-    /// What was absent in one model of them.
-    pub absent: Vec<Absent>,
 }
 
 /// Photographs that have another focal length than the rest of their group, which no metadata tell.

@@ -338,12 +338,12 @@ mod tests {
         };
         let weight = |trainer: &Trainer| trainer.recipe.params[&Param::DepthWeight].clone();
         let sparse = trainer(12, None);
-        assert_eq!((sparse.total_steps(), weight(&sparse)), (1440, Knob::Const(0.5)));
+        assert_eq!((sparse.total_steps(), weight(&sparse)), (1080, Knob::Const(0.5)));
         assert!(
             sparse
                 .decisions
                 .iter()
-                .any(|line| line.contains("30 degrees") && line.contains("1440 steps"))
+                .any(|line| line.contains("30 degrees") && line.contains("1080 steps"))
         );
         // A fifth of the recipe's length at least.
         assert_eq!(trainer(4, None).total_steps(), 600);

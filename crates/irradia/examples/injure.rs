@@ -3,6 +3,7 @@
 //! ```text
 //! cargo run --release --example injure -- DATA OUT --gains 0.6,1.6 --balance 0.15      # exposure and white balance per photograph
 //! cargo run --release --example injure -- DATA OUT --local-gains 0.7,1.4               # a gradient and a vignette per photograph
+//! cargo run --release --example injure -- DATA OUT --vignette 0.7                      # the same in all photographs
 //! cargo run --release --example injure -- DATA OUT --pose-noise 0.5,0.005              # degrees, fraction of the scene's extent
 //! cargo run --release --example injure -- DATA OUT --people 0.33                       # share of the training photographs
 //! ```
@@ -39,6 +40,9 @@ struct Args {
     /// less, darkened by a vignette of random strength
     #[arg(long, value_name = "FROM,TO", value_parser = pair)]
     local_gains: Option<[f32; 2]>,
+    /// Factor at the corners of all photographs on their sRGB colours; its logarithm grows with the squared distance from the middle
+    #[arg(long, default_value_t = 1.0)]
+    vignette: f32,
     /// Standard deviations of the poses' rotation in degrees and of their position in extents of the scene
     #[arg(long, value_name = "DEG,FRACTION", value_parser = pair)]
     pose_noise: Option<[f32; 2]>,
@@ -164,7 +168,8 @@ fn write_view(args: &Args, dataset: &Dataset, extent: f32, view: usize) -> Resul
     for (i, pixel) in (0u32..).zip(photo.data.chunks_exact_mut(channels)) {
         let place =
             [(i % columns, columns), (i / columns, rows)].map(|(at, of)| 2.0 * (at as f32 + 0.5) / of as f32 - 1.0);
-        let local = local.as_ref().map_or(1.0, |local| local.at(place));
+        let u = 0.5 * (place[0] * place[0] + place[1] * place[1]);
+        let local = local.as_ref().map_or(1.0, |local| local.at(place)) * args.vignette.powf(u);
         for (value, factor) in pixel.iter_mut().zip(factors) {
             *value = (f32::from(*value) * factor * local).round().min(255.0) as u8;
         }

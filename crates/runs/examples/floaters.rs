@@ -92,6 +92,7 @@ fn held_out_psnr(cloud: &GaussianCloud, scene: &Scene, dataset: &Dataset) -> Res
         render: scene.options,
         metrics: Metrics::Psnr,
         half_fit: HalfFit::default(),
+        vignette: None,
     };
     let model = Model::of_splats(Splats::from_cloud(cloud));
     let mean = evaluate(&model, dataset, &dataset.test, &options, |_| {

@@ -24,6 +24,8 @@ pub const RESIDUAL: &str = socket::FILES[1];
 pub const EXPOSURES: &str = socket::FILES[2];
 /// The appearance codes of a run's photographs.
 pub const APPEARANCE: &str = socket::FILES[4];
+/// The vignettes of a run's lenses.
+pub const VIGNETTE: &str = socket::FILES[6];
 /// The sky behind a run's splats.
 pub const SKY: &str = socket::FILES[3];
 
@@ -38,7 +40,7 @@ const WORLD: &str = "world.json";
 pub(crate) const PACES: &str = "pace.txt";
 
 /// The files of a run.
-const FILES: [&str; 17] = [
+const FILES: [&str; 19] = [
     "run.json",
     VIEWS,
     WORLD,
@@ -52,6 +54,8 @@ const FILES: [&str; 17] = [
     socket::FILES[1],
     socket::FILES[2],
     socket::FILES[4],
+    socket::FILES[5],
+    VIGNETTE,
     SKY,
     "report.json",
     "report.html",

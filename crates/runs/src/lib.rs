@@ -92,7 +92,7 @@ pub use provenance::{data_fingerprint, program_fingerprint};
 pub use request::{DEFAULT_RECIPE, HOW_TO_GET_LPIPS, Reading, TrainInput, TrainRequest, read_recipe};
 pub use results::write_image;
 pub use run::{Finished, Run, open_device};
-pub use scene_file::{Scene, read_lights, scene_of};
+pub use scene_file::{Scene, read_lights, read_vignette, scene_of};
 pub use snapshot::{Snapshot, Snapshots};
 pub use synth_files::{SynthSummary, write_synth_dataset};
 

@@ -13,6 +13,7 @@ use irradia_train::model::Model;
 use irradia_train::report::{
     Beside, Breakdown, Inside, Report, ViewReport, machine, peak_rss_bytes, schedule, to_html,
 };
+use irradia_train::socket::Vignette;
 use std::path::Path;
 use std::time::Instant;
 
@@ -60,6 +61,7 @@ impl Run {
                 render: trainer.render_options(sh::MAX_DEGREE),
                 metrics: Metrics::All(networks),
                 half_fit: trainer.half_fit(),
+                vignette: trainer.sockets.vignette.as_ref(),
             },
             |view| {
                 let stem = stems.next().expect("one per view");
@@ -115,6 +117,7 @@ impl Run {
             trained_on_lpips: name_of(networks.first).filter(|_| has_perceptual_loss(&trainer.recipe)),
             psnr_corrected: mean.psnr_corrected,
             half_fit_psnr: mean.half_fit_psnr,
+            corner_brightness: trainer.sockets.vignette.as_ref().and_then(Vignette::corner),
             views,
             schedule: schedule(
                 &trainer.recipe,

@@ -1,7 +1,7 @@
 //! A scene that can be rendered: read from a file or a run, or taken from a training.
 
 use crate::RunError;
-use crate::folder::{APPEARANCE, EXPOSURES, FIELD, RESIDUAL, SCENE, SKY, cameras_beside, world_beside};
+use crate::folder::{APPEARANCE, EXPOSURES, FIELD, RESIDUAL, SCENE, SKY, VIGNETTE, cameras_beside, world_beside};
 use crate::orbit::{Outlook, orbit, outlook};
 use irradia_edit::Draft;
 use irradia_field::{Field, Sampler};
@@ -11,7 +11,7 @@ use irradia_splat::{RenderOptions, Renderer, Splats};
 use irradia_train::lights::Lights;
 use irradia_train::model::{Frame, Model};
 use irradia_train::recipe::RenderKnobs;
-use irradia_train::socket::background_of_sky;
+use irradia_train::socket::{Vignette, background_of_sky};
 use irradia_train::{Recipe, TrainError, field_file};
 use std::borrow::Cow;
 use std::fs;
@@ -168,6 +168,22 @@ pub fn read_lights(scene: &Path) -> Result<Option<Lights>, RunError> {
         path: scene.to_owned(),
         source,
     })
+}
+
+/// What the lenses of the run whose scene is the file `scene` do to its photographs, if the run has learned it.
+///
+/// # Errors
+/// When its file cannot be read.
+pub fn read_vignette(scene: &Path) -> Result<Option<Vignette>, RunError> {
+    let Some(path) = beside(scene, VIGNETTE) else {
+        return Ok(None);
+    };
+    let bytes = fs::read(&path).map_err(RunError::io("read", &path))?;
+    let vignette = Vignette::from_file(&bytes).map_err(|why| RunError::File {
+        path,
+        source: TrainError::Checkpoint(why),
+    })?;
+    Ok(Some(vignette))
 }
 
 /// The mean colour of the sky beside `scene`, if there is one.

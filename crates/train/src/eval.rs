@@ -3,7 +3,9 @@
 use crate::half_fit::{HalfFit, HeldOut, half_fit_psnr};
 use crate::model::{Model, RenderOptions};
 use crate::photos::Prepared;
+use crate::socket::Vignette;
 use crate::trainer::TrainError;
+use irradia_compute::Planes;
 use irradia_measure::{Evaluation, Networks, evaluate, psnr_masked};
 use irradia_scene::{Camera, Dataset, Image, Photo, View};
 use irradia_splat::Renderer;
@@ -57,6 +59,8 @@ pub struct EvalOptions<'a> {
     pub metrics: Metrics<'a>,
     /// The parameters to fit on the left half of each view for its `half_fit_psnr`.
     pub half_fit: HalfFit,
+    /// What the lenses do to every frame.
+    pub vignette: Option<&'a Vignette>,
 }
 
 /// Renders `model` from the views `indices` of `dataset` and compares; passes each result to `see`, which may end the evaluation.
@@ -80,6 +84,7 @@ pub fn evaluate_views(
         let (view, photo) = (&dataset.views[index], photo?);
         let truth = truth_image(&photo, view, options.render.background);
         let render = model.render(&mut renderer, &view.camera, &options.render).color;
+        let render = vignetted(options.vignette, &view.camera, render);
         let mask = photo.mask.as_deref();
         let blank = mask.is_some_and(|mask| mask.iter().all(|m| *m == 0));
         let mut metrics = match options.metrics {
@@ -99,6 +104,7 @@ pub fn evaluate_views(
             truth: &truth,
             mask,
             options: &options.render,
+            vignette: options.vignette,
             extent,
         };
         let fit = options.half_fit;
@@ -121,6 +127,22 @@ pub fn evaluate_views(
         }
     }
     Ok(())
+}
+
+/// `render` `[H, W, 3]` as the lens of `camera` shows it.
+pub fn vignetted(vignette: Option<&Vignette>, camera: &Camera, render: Image) -> Image {
+    let Some(vignette) = vignette else {
+        return render;
+    };
+    let planes = Planes::from_interleaved(3, &render.data);
+    let pixels = planes.len();
+    let color: Vec<f32> = (0..3).flat_map(|c| &planes.plane(c)[..pixels]).copied().collect();
+    let mut shown = Vec::new();
+    vignette.develop(&camera.intrinsics, &color, &mut shown);
+    let data = (0..pixels)
+        .flat_map(|i| [0, 1, 2].map(|c| shown[c * pixels + i]))
+        .collect();
+    Image { data, ..render }
 }
 
 fn truth_image(photo: &Photo, view: &View, background: [f32; 3]) -> Image {
@@ -217,6 +239,7 @@ mod tests {
                 render: RenderOptions::default(),
                 metrics: Metrics::All(Networks::default()),
                 half_fit,
+                vignette: None,
             };
             let data = dataset();
             views.clear();

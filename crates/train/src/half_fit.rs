@@ -4,8 +4,9 @@
 //! training views, those of held-out views are therefore fitted to pixels that are then not scored (Martin-Brualla et al. 2021,
 //! "NeRF in the Wild", section 5, do so for appearance codes).
 
+use crate::eval::vignetted;
 use crate::model::{Model, RenderOptions};
-use crate::socket::{PerViewAdam, corrected, tangent_gradient};
+use crate::socket::{PerViewAdam, Vignette, corrected, tangent_gradient};
 use irradia_measure::{Affine, psnr_masked};
 use irradia_scene::{Camera, Image, Photo};
 use irradia_splat::{OutputGradient, Renderer, SplatGradients};
@@ -42,6 +43,8 @@ pub struct HeldOut<'a> {
     pub mask: Option<&'a [u8]>,
     /// How the scene is rendered.
     pub options: &'a RenderOptions,
+    /// What the lenses do to every frame.
+    pub vignette: Option<&'a Vignette>,
     /// Extent of the scene, world units.
     pub extent: f32,
 }
@@ -50,7 +53,11 @@ pub struct HeldOut<'a> {
 /// excludes all pixels of a half.
 pub fn half_fit_psnr(model: &Model, renderer: &mut Renderer, view: &HeldOut, fit: HalfFit) -> Option<f64> {
     let HeldOut {
-        truth, mask, options, ..
+        truth,
+        mask,
+        options,
+        vignette,
+        ..
     } = *view;
     let width = truth.width as usize;
     let counts = |i: usize| mask.is_none_or(|mask| mask[i] != 0);
@@ -63,7 +70,7 @@ pub fn half_fit_psnr(model: &Model, renderer: &mut Renderer, view: &HeldOut, fit
     } else {
         *view.camera
     };
-    let render = model.render(renderer, &camera, options).color;
+    let render = vignetted(vignette, &camera, model.render(renderer, &camera, options).color);
     let render = if fit.exposure {
         Affine::fit_unclipped(&render, truth, |i| counts(i) && is_left(i, width)).apply_to(&render)
     } else {
@@ -197,6 +204,7 @@ mod tests {
                 truth: &truth,
                 mask: None,
                 options: &options,
+                vignette: None,
                 extent: 1.0,
             };
             half_fit_psnr(&model, &mut renderer, &view, fit).expect("no mask")

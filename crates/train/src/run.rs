@@ -245,6 +245,7 @@ fn held_out_psnr(trainer: &Trainer, observers: &[&mut dyn Observer]) -> Result<f
         render: trainer.render_options(plan(&trainer.recipe, &trainer.clock).sh_degree),
         metrics: Metrics::Psnr,
         half_fit: HalfFit::default(),
+        vignette: trainer.sockets.vignette.as_ref(),
     };
     let (mut metrics, mut stopped) = (Vec::new(), false);
     evaluate_views(

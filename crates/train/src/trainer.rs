@@ -17,7 +17,7 @@ use crate::photos::{PhotoCache, Prepared};
 use crate::pixel_size::pixel_size;
 use crate::recipe::{AdamKind, Choice, DensityControl, LengthUnit, Param, Recipe};
 use crate::schedule::{Clock, Round, StepMetrics, StepPlan, plan, upcoming_views};
-use crate::socket::{Residual, Sky, Sockets};
+use crate::socket::{Residual, Sky, Sockets, Vignette};
 use crate::times::Times;
 use crate::transients::Hidden;
 use cpu_time::ProcessTime;
@@ -309,6 +309,10 @@ impl Trainer {
             self.recipe.appearance = None;
             self.decisions
                 .push("the light of photographs is trained on the CPU only, and left out".into());
+        }
+        if self.recipe.vignette && Vignette::new(&self.dataset).is_none() {
+            self.decisions
+                .push("the photographs are faces of panoramas, which no lens darkens: no vignette is trained".into());
         }
         // Only the spaces of fields depend on transparency; photographs are not read for the others.
         let fields = self.recipe.residual.is_some() || self.recipe.light().is_some();

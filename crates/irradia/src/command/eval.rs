@@ -10,7 +10,8 @@ use irradia_runs::formats::write_atomic;
 use irradia_runs::train::eval::{EvalOptions, EvaluatedView, Metrics};
 use irradia_runs::train::half_fit::HalfFit;
 use irradia_runs::{
-    Background, HOW_TO_GET_LPIPS, RunFolder, Scene, evaluate, file_stems, scene_of, unmeasured, write_image,
+    Background, HOW_TO_GET_LPIPS, RunFolder, Scene, evaluate, file_stems, read_vignette, scene_of, unmeasured,
+    write_image,
 };
 use serde_json::json;
 use std::path::PathBuf;
@@ -99,6 +100,7 @@ pub fn run(args: &Args) -> Result<()> {
         (None, Some(first)) => unseen_lpips(args.lpips.as_ref(), first)?,
         _ => None,
     };
+    let vignette = read_vignette(&scene_of(&args.scene))?;
     let nets = [&lpips, &unseen].map(|lpips| lpips.as_ref().map(Lpips::net));
     let options = EvalOptions {
         render: scene.options,
@@ -107,6 +109,7 @@ pub fn run(args: &Args) -> Result<()> {
             unseen: unseen.as_ref(),
         }),
         half_fit: args.half_fit(),
+        vignette: vignette.as_ref(),
     };
     let (mut rows, mut measured) = (Vec::new(), Vec::new());
     let stems = file_stems(dataset.views.iter().map(|view| view.name.as_str()));

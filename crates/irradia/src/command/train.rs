@@ -403,7 +403,7 @@ fn tell(finished: &Finished) -> Result<()> {
         "nothing was evaluated: there is no held-out view with pixels to measure".to_owned()
     } else {
         format!(
-            "held-out PSNR {:.2} dB ({:.2} colour-corrected), SSIM {:.4}{}{}{}",
+            "held-out PSNR {:.2} dB ({:.2} colour-corrected), SSIM {:.4}{}{}{}{}",
             report.psnr,
             report.psnr_corrected,
             report.ssim,
@@ -411,6 +411,9 @@ fn tell(finished: &Finished) -> Result<()> {
             in_words(report.unseen_lpips, report.unseen_lpips_net.as_deref()),
             report.half_fit_psnr.map_or(String::new(), |psnr| format!(
                 ", {psnr:.2} dB on right halves after a fit on left halves"
+            )),
+            report.corner_brightness.map_or(String::new(), |corner| format!(
+                ", corners with {corner:.2} of the middle's brightness, which the scene is without"
             )),
         )
     };

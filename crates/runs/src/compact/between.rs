@@ -1,8 +1,10 @@
 //! Views between the photographs, of the scene itself.
 
+use crate::Scene;
 use irradia_scene::{Camera, Dataset, Photo, Pose, View};
 use irradia_splat::Renderer;
-use irradia_train::model::{Model, RenderOptions};
+use irradia_train::eval::vignetted;
+use irradia_train::socket::Vignette;
 use std::sync::Arc;
 
 /// At most this many: they stay in memory.
@@ -12,10 +14,10 @@ const NEIGHBOURS: usize = 2;
 /// Largest angle between two views that are paired, radians.
 const SAME_WAY: f32 = 1.0;
 
-/// `dataset` with pictures of `model` as further training views, halfway between adjacent views. A scene that keeps to them looks between
+/// `dataset` with pictures of `scene`, by lenses with this vignette, as further training views, halfway between adjacent views. A scene that keeps to them looks between
 /// the photographs as it did before. On lund_door, 10 photographs, at a 25th of the bytes: held-out PSNR 33.65 dB without, 33.82 dB
 /// with one neighbour of each.
-pub(super) fn with_views_between(mut dataset: Dataset, model: &Model, options: &RenderOptions) -> Dataset {
+pub(super) fn with_views_between(mut dataset: Dataset, scene: &Scene, vignette: Option<&Vignette>) -> Dataset {
     let cameras: Vec<Camera> = dataset.train.iter().map(|i| dataset.views[*i].camera).collect();
     let pairs = adjacent(&cameras);
     let mut renderer = Renderer::new();
@@ -26,7 +28,8 @@ pub(super) fn with_views_between(mut dataset: Dataset, model: &Model, options: &
             position: own.position.lerp(other.position, 0.5),
         };
         let camera = Camera { pose, ..cameras[*a] };
-        let frame = model.render(&mut renderer, &camera, options).color;
+        let frame = scene.model.render(&mut renderer, &camera, &scene.options).color;
+        let frame = vignetted(vignette, &camera, frame);
         let photo = Photo {
             width: frame.width,
             height: frame.height,

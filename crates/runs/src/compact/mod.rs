@@ -8,7 +8,7 @@
 mod between;
 mod tries;
 
-use crate::{Reading, RunError, Scene, scene_of};
+use crate::{Reading, RunError, Scene, read_vignette, scene_of};
 use between::with_views_between;
 use irradia_formats::{SplatFormat, WriteOptions, splat_file_size, write_splats_with};
 use std::path::PathBuf;
@@ -145,11 +145,11 @@ pub fn compact(input: &CompactInput, see: &mut dyn FnMut(CompactEvent)) -> Resul
     };
     let dataset = scene.place(input.reading.read(&input.data)?);
     let mut notes = dataset.warnings.clone();
-    let measure = Measure::new(&dataset, scene.options);
+    let measure = Measure::new(&dataset, scene.options, read_vignette(&file)?);
     let before = measure.of(&scene.model)?;
     let held_out_before = measure.of_held_out(&scene.model)?;
     let count = splats.len();
-    let dataset = with_views_between(dataset, &scene.model, &scene.options);
+    let dataset = with_views_between(dataset, &scene, measure.vignette());
     let mut tries = Tries::new(input, format, &scene, splats, dataset, &measure)?;
     let found = match input.target {
         Some(target) => {

@@ -12,6 +12,7 @@ use irradia_train::half_fit::HalfFit;
 use irradia_train::memory::usual_limit;
 use irradia_train::model::{Model, RenderOptions};
 use irradia_train::recipe::Param;
+use irradia_train::socket::Vignette;
 use irradia_train::{Recipe, TrainOptions, Trainer};
 use std::sync::Arc;
 
@@ -78,15 +79,22 @@ const CLOSE: f64 = 1.1;
 pub(super) struct Measure {
     dataset: Dataset,
     options: RenderOptions,
+    vignette: Option<Vignette>,
 }
 
 impl Measure {
-    /// By the photographs of `dataset`.
-    pub fn new(dataset: &Dataset, options: RenderOptions) -> Self {
+    /// By the photographs of `dataset`, whose lenses have this vignette.
+    pub fn new(dataset: &Dataset, options: RenderOptions, vignette: Option<Vignette>) -> Self {
         Self {
             dataset: dataset.clone(),
             options,
+            vignette,
         }
+    }
+
+    /// The vignette of the lenses.
+    pub fn vignette(&self) -> Option<&Vignette> {
+        self.vignette.as_ref()
     }
 
     /// Mean PSNR over training views, evenly chosen, dB.
@@ -107,6 +115,7 @@ impl Measure {
             render: self.options,
             metrics: Metrics::Psnr,
             half_fit: HalfFit::default(),
+            vignette: self.vignette.as_ref(),
         };
         Ok(evaluate::<RunError>(model, &self.dataset, views, &options, |_| Ok(()))?.psnr)
     }
@@ -224,6 +233,7 @@ impl<'a> Tries<'a> {
         };
         let first = self.begin.len();
         let mut trainer = Trainer::from_splats(self.dataset.clone(), self.recipe.clone(), options, self.begin.clone())?;
+        trainer.sockets.vignette.clone_from(&self.measure.vignette);
         let (mut rounds, mut stage, mut events) = (0, 0, Vec::new());
         while !trainer.finished() {
             let removed = trainer.clock.time / self.recipe.stage[0].steps as f64;

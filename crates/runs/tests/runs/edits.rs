@@ -231,6 +231,7 @@ fn floaters_planted_in_a_trained_scene_are_removed() {
             render: scene.options,
             metrics: Metrics::Psnr,
             half_fit: HalfFit::default(),
+            vignette: None,
         };
         let mean = evaluate(&scene.model, &data, &data.test, &options, |_| Ok::<(), RunError>(()));
         mean.expect("photographs").psnr

@@ -60,6 +60,7 @@ fn the_mean_of_an_evaluation_is_that_of_its_views() {
         render: scene.options,
         metrics: Metrics::All(Default::default()),
         half_fit: HalfFit::default(),
+        vignette: None,
     };
     let mean = evaluate(&scene.model, &dataset, &dataset.test, &options, |view| {
         psnr.push(view.metrics.psnr);

@@ -137,6 +137,7 @@ fn socket_occupants_resume_exactly() {
     let overrides = [
         "exposure=true",
         "bilateral_grid=true",
+        "vignette=true",
         "refine_poses=true",
         "params.rate_poses=0.001",
         "params.rate_sky=0.05",
@@ -153,7 +154,15 @@ fn socket_occupants_resume_exactly() {
     let names: Vec<&str> = again.sockets.occupants().iter().map(|o| o.name()).collect();
     assert_eq!(
         names,
-        ["poses", "residual", "appearance", "exposure", "bilateral", "sky"]
+        [
+            "poses",
+            "residual",
+            "appearance",
+            "exposure",
+            "bilateral",
+            "sky",
+            "vignette"
+        ]
     );
     let learnt = [&mut trainer, &mut again].map(|trainer| {
         trainer.step(&mut Vec::new()).unwrap();

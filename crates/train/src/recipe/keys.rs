@@ -143,7 +143,7 @@ impl Param {
             Group::Regularizer => "Parameters: regularisers",
             Group::Rate => "Parameters: learning rates of splats",
             Group::Field => "Parameters: radiance fields",
-            Group::Socket => "Parameters: exposure, bilateral grid, sky and poses",
+            Group::Socket => "Parameters: exposure, vignette, bilateral grid, sky and poses",
             Group::Switch => "Parameters: switches, on from 0.5",
         };
         let (low, high) = (row.bounds.start(), row.bounds.end());

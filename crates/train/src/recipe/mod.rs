@@ -1,6 +1,7 @@
 //! A recipe: a training configuration, as a file. Raw TOML, then overrides, then this validated value.
 
 mod ablation;
+mod choice;
 mod density;
 mod field;
 pub mod keys;
@@ -8,6 +9,7 @@ mod param;
 mod table;
 
 pub use ablation::Ingredients;
+pub use choice::Choice;
 pub use density::{ClassicKnobs, DensityControl, FastKnobs, McmcKnobs, MergeKnobs, TamingKnobs};
 pub use field::{FieldKnobs, FieldSpace, ResidualKnobs};
 use irradia_splat::regularize::Regularized;
@@ -119,7 +121,11 @@ documented! {
         /// of the run, photographs differ in exposure beyond what adjacent cameras predict.
         #[serde(default, skip_serializing_if = "Choice::is_no")]
         pub exposure: Choice,
-        /// Train a separate grid of affine colour maps for each photograph, by place and brightness: tone mapping and vignettes.
+        /// Train the vignette of each lens beside the splats, a polynomial of the distance from the principal point, the same in all of its photographs:
+        /// the scene has none, held-out views are compared with it.
+        #[serde(default, skip_serializing_if = "is_default")]
+        pub vignette: bool,
+        /// Train a separate grid of affine colour maps for each photograph, by place and brightness: tone mapping.
         #[serde(default, skip_serializing_if = "is_default")]
         pub bilateral_grid: bool,
         /// Leave out photographs whose error, after a fifth of the run, is far beyond the others': wrong poses, or another scene.
@@ -205,59 +211,6 @@ documented! {
         /// visible keep parameters and moments.
         #[serde(default, skip_serializing_if = "AdamKind::is_sparse")]
         pub kind: AdamKind,
-    }
-}
-
-/// Whether to do something, or let the data decide: `true`, `false` or `"auto"` in a recipe.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(from = "BoolOrAuto", into = "BoolOrAuto")]
-pub enum Choice {
-    /// No.
-    #[default]
-    No,
-    /// Yes.
-    Yes,
-    /// The data decide.
-    Auto,
-}
-
-impl Choice {
-    fn is_no(&self) -> bool {
-        *self == Self::No
-    }
-}
-
-/// How a [`Choice`] is written.
-#[derive(Serialize, Deserialize)]
-#[serde(untagged, expecting = "expected true, false or \"auto\"")]
-enum BoolOrAuto {
-    Bool(bool),
-    Word(Auto),
-}
-
-#[derive(Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-enum Auto {
-    Auto,
-}
-
-impl From<BoolOrAuto> for Choice {
-    fn from(written: BoolOrAuto) -> Self {
-        match written {
-            BoolOrAuto::Bool(false) => Self::No,
-            BoolOrAuto::Bool(true) => Self::Yes,
-            BoolOrAuto::Word(Auto::Auto) => Self::Auto,
-        }
-    }
-}
-
-impl From<Choice> for BoolOrAuto {
-    fn from(choice: Choice) -> Self {
-        match choice {
-            Choice::No => Self::Bool(false),
-            Choice::Yes => Self::Bool(true),
-            Choice::Auto => Self::Word(Auto::Auto),
-        }
     }
 }
 
@@ -479,6 +432,8 @@ impl Recipe {
         // A photograph is used 30 to 100 times in a run, within which gains of 1.6 must be reached.
         default(exposure, Param::RateExposure, 0.03, 0.001);
         default(exposure, Param::ExposureReg, 0.01, 0.001);
+        // The curve is to be there before splats explain it.
+        default(self.vignette, Param::RateVignette, 0.01, 0.001);
         default(grid, Param::RateBilateral, 0.01, 0.0005);
         default(grid, Param::BilateralTv, 30.0, 30.0);
         // Half a degree (9e-3) within as many steps.

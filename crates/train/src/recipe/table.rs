@@ -415,6 +415,16 @@ table! {
         curve: Some("loss.exposure"),
         source: "Irradia: 0.01 falling to 0.001 if a recipe with `exposure` does not set it",
     }
+    /// Learning rate of the lenses' vignettes, if the recipe has `vignette`.
+    RateVignette {
+        name: "rate_vignette",
+        unit: "",
+        default: 0.0,
+        bounds: NOT_NEGATIVE,
+        group: Group::Socket,
+        curve: Some("rate.vignette"),
+        source: "Irradia: 0.01 falling to 0.001 if a recipe with `vignette` does not set it",
+    }
     /// Learning rate of the colours of a sky behind the splats, which each photograph has its own of; without one there is no sky.
     RateSky {
         name: "rate_sky",

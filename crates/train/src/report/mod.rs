@@ -86,6 +86,10 @@ pub struct Report {
     /// halves; `None` if the recipe trains neither.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub half_fit_psnr: Option<f64>,
+    /// Brightness of the photographs' corners relative to the middle, sRGB-encoded, by the vignette that the run trained and
+    /// its held-out views were evaluated with; `None` without one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub corner_brightness: Option<f32>,
     /// The held-out views.
     pub views: Vec<ViewReport>,
     /// The stages of the recipe, in order.

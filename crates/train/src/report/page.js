@@ -31,6 +31,10 @@
     const other = unseen ? `; ${unseen} is not part of its loss` : "";
     notes.push(`this run was trained on LPIPS (${report.trained_on_lpips}), which flatters that figure${other}`);
   }
+  if (report.corner_brightness) {
+    const corners = `corners of the photographs have ${fixed(report.corner_brightness, 2)} of the middle's brightness`;
+    notes.push(`${corners}: the scene is without this vignette, held-out views are shown and measured with it`);
+  }
   if (notes.length) {
     at("warnings").hidden = false;
     for (const line of notes) at("warning-list").append(make("li", line));

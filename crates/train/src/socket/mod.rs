@@ -4,7 +4,7 @@
 //! |---|---|---|
 //! | before projection | a [`Placement`]: the camera, and the splats if they move | gradients of the camera and of the moved splats |
 //! | at colour | a colour to add to each splat in view, by its [`irradia_splat::Surface`] | the gradients of these colours |
-//! | after blending | the frame as the photograph shows it: a sky behind it, then an exposure, then a grid of exposures | the gradient of that frame, which it converts to that of the scene's frame |
+//! | after blending | the frame as the photograph shows it: a sky behind it, then its lens's vignette, then an exposure, then a grid of exposures | the gradient of that frame, which it converts to that of the scene's frame |
 //!
 //! Each occupant has its forward pass, the vector-Jacobian product beside it, its own Adam, and named tensors. Code that saves
 //! runs (checkpoints, resume, files beside the scene) accesses occupants through [`Occupant`] alone, and rendering goes through
@@ -18,6 +18,7 @@ mod per_view;
 mod poses;
 mod residual;
 mod sky;
+mod vignette;
 
 pub use appearance::Appearance;
 pub(crate) use appearance::lit_colors;
@@ -28,6 +29,7 @@ pub use poses::PoseRefinement;
 pub(crate) use poses::{corrected, tangent_gradient};
 pub use residual::{Residual, added_colors};
 pub use sky::{Sky, background_of_sky};
+pub use vignette::Vignette;
 
 use crate::objective::Objective;
 use crate::recipe::{Choice, Param, Recipe};
@@ -40,13 +42,14 @@ use irradia_splat::{Engine, Placement, RenderOptions};
 use rayon::prelude::*;
 
 /// Names of the files that occupants may write beside a scene.
-pub const FILES: [&str; 6] = [
+pub const FILES: [&str; 7] = [
     "poses.safetensors",
     "residual.safetensors",
     "exposure.safetensors",
     "sky.safetensors",
     "appearance.safetensors",
     "bilateral.safetensors",
+    "vignette.safetensors",
 ];
 
 /// The planes of `frame` `[3, H, W]` in pieces of `length` pixels, for all threads.
@@ -104,6 +107,8 @@ pub struct Sockets {
     pub residual: Option<Residual>,
     /// At colour: the light of each photograph.
     pub appearance: Option<Appearance>,
+    /// After blending: the lenses' vignettes.
+    pub vignette: Option<Vignette>,
     /// After blending: each photograph's exposure.
     pub exposure: Option<Exposure>,
     /// After blending: each photograph's local changes of colour.
@@ -112,6 +117,8 @@ pub struct Sockets {
     pub sky: Option<Sky>,
     /// The frame over [`Sky`], `[3, H, W]`.
     over_sky: Vec<f32>,
+    /// The frame after [`Vignette`], `[3, H, W]`.
+    vignetted: Vec<f32>,
     /// The frame after [`Exposure`], `[3, H, W]`.
     developed: Vec<f32>,
     /// The frame after [`BilateralGrid`], `[3, H, W]`.
@@ -140,12 +147,14 @@ impl Sockets {
             appearance,
             poses: recipe.refine_poses.then(|| PoseRefinement::new(dataset)),
             residual,
+            vignette: recipe.vignette.then(|| Vignette::new(dataset)).flatten(),
             exposure: (recipe.exposure == Choice::Yes).then(|| Exposure::new(dataset.views.len(), &dataset.train)),
             bilateral: recipe
                 .bilateral_grid
                 .then(|| BilateralGrid::new(dataset.views.len(), &dataset.train)),
             sky: recipe.uses(Param::RateSky).then(|| Sky::new(dataset)),
             over_sky: Vec::new(),
+            vignetted: Vec::new(),
             developed: Vec::new(),
             graded: Vec::new(),
         })
@@ -155,11 +164,12 @@ impl Sockets {
     pub fn occupants(&self) -> Vec<&dyn Occupant> {
         let poses = self.poses.as_ref().map(|o| o as &dyn Occupant);
         let residual = self.residual.as_ref().map(|o| &o.0 as &dyn Occupant);
+        let vignette = self.vignette.as_ref().map(|o| o as &dyn Occupant);
         let exposure = self.exposure.as_ref().map(|o| o as &dyn Occupant);
         let bilateral = self.bilateral.as_ref().map(|o| o as &dyn Occupant);
         let sky = self.sky.as_ref().map(|o| o as &dyn Occupant);
         let appearance = self.appearance.as_ref().map(|o| &o.0 as &dyn Occupant);
-        [poses, residual, appearance, exposure, bilateral, sky]
+        [poses, residual, appearance, exposure, bilateral, sky, vignette]
             .into_iter()
             .flatten()
             .collect()
@@ -170,10 +180,11 @@ impl Sockets {
         let poses = self.poses.as_mut().map(|o| o as &mut dyn Occupant);
         let residual = self.residual.as_mut().map(|o| &mut o.0 as &mut dyn Occupant);
         let appearance = self.appearance.as_mut().map(|o| &mut o.0 as &mut dyn Occupant);
+        let vignette = self.vignette.as_mut().map(|o| o as &mut dyn Occupant);
         let exposure = self.exposure.as_mut().map(|o| o as &mut dyn Occupant);
         let bilateral = self.bilateral.as_mut().map(|o| o as &mut dyn Occupant);
         let sky = self.sky.as_mut().map(|o| o as &mut dyn Occupant);
-        [poses, residual, appearance, exposure, bilateral, sky]
+        [poses, residual, appearance, exposure, bilateral, sky, vignette]
             .into_iter()
             .flatten()
             .collect()
@@ -191,7 +202,7 @@ impl Sockets {
 
     /// Whether there are any after blending.
     pub fn are_after_blending(&self) -> bool {
-        self.sky.is_some() || self.exposure.is_some() || self.bilateral.is_some()
+        self.sky.is_some() || self.vignette.is_some() || self.exposure.is_some() || self.bilateral.is_some()
     }
 
     /// The files to write beside the scene: name and bytes.
@@ -240,6 +251,10 @@ impl Sockets {
             sky.put_behind(view, &camera, [color, engine.frame().alpha], &mut self.over_sky);
             color = &self.over_sky;
         }
+        if let Some(vignette) = &self.vignette {
+            vignette.develop(&camera.intrinsics, color, &mut self.vignetted);
+            color = &self.vignetted;
+        }
         if let Some(exposure) = &self.exposure {
             exposure.develop(view, color, &mut self.developed);
             color = &self.developed;
@@ -254,6 +269,7 @@ impl Sockets {
     pub fn frame_color<'a>(&'a self, engine: &'a Engine) -> &'a [f32] {
         let layers = [
             (self.sky.is_some(), &self.over_sky),
+            (self.vignette.is_some(), &self.vignetted),
             (self.exposure.is_some(), &self.developed),
             (self.bilateral.is_some(), &self.graded),
         ];
@@ -278,6 +294,7 @@ impl Sockets {
         let frame = engine.frame();
         let layers = [
             (self.sky.is_some(), &self.over_sky),
+            (self.vignette.is_some(), &self.vignetted),
             (self.exposure.is_some(), &self.developed),
         ];
         if let Some(bilateral) = &mut self.bilateral {
@@ -287,8 +304,13 @@ impl Sockets {
         }
         if let Some(exposure) = &mut self.exposure {
             let (rate, weight) = (plan.value(Param::RateExposure), plan.value(Param::ExposureReg));
-            let color = topmost(frame.color, &layers[..1]);
+            let color = topmost(frame.color, &layers[..2]);
             exposure.step(view, color, objective.v_color_mut(), rate, weight);
+        }
+        if let Some(vignette) = &mut self.vignette {
+            let color = topmost(frame.color, &layers[..1]);
+            let rate = plan.value(Param::RateVignette);
+            vignette.step(&camera.intrinsics, color, objective.v_color_mut(), rate);
         }
         if let Some(sky) = &mut self.sky {
             let (v_color, v_alpha) = objective.v_color_and_alpha();

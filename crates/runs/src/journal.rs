@@ -236,12 +236,10 @@ impl Observer for Journal {
             Event::StageEntered { stage, step, seconds } => self.stage(stage.clone(), *step, *seconds),
             Event::Finished { step, seconds, .. } => self.end_stage(*step, *seconds),
             Event::Warned { message } => self.warnings.push(message.clone()),
-            Event::Started { .. }
-            | Event::Decided { .. }
-            | Event::Densified { .. }
-            | Event::Saved { .. }
-            | Event::Paused { .. }
-            | Event::Resumed { .. } => {}
+            Event::Started { .. } | Event::Densified { .. } => {
+                self.saver.prepare(trainer.engine.state(), trainer.recipe.max_splats);
+            }
+            Event::Decided { .. } | Event::Saved { .. } | Event::Paused { .. } | Event::Resumed { .. } => {}
         }
         self.write(event);
         Signal::Continue

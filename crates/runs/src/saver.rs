@@ -1,6 +1,6 @@
 //! Writes checkpoints, large ones in the background: the training is held up while its splats are copied, and not while they are
-//! written. Most of a first copy's time is the system's, for fresh pages, so that its memory is kept for the next one: with five million
-//! splats 4.8 s, then 0.2 s each.
+//! written. Most of a copy's time would be the system's, for fresh pages (with five million splats 4.8 of 5 s), so that its memory is
+//! obtained beforehand, in the background as well, and kept for the next one.
 
 use crate::RunFolder;
 use irradia_splat::SplatState;
@@ -10,6 +10,8 @@ use std::thread::JoinHandle;
 
 /// Copying is worth its memory for checkpoints of at least this many bytes: smaller ones are written in half a second.
 const BACKGROUND_FROM: u64 = 256 << 20;
+/// Splats for which memory is obtained, relative to those there are: density control adds some before the checkpoint.
+const ROOM: f64 = 1.25;
 
 /// Step and path of a checkpoint, or why there is none.
 type Outcome = Result<(u64, String), String>;
@@ -19,11 +21,25 @@ type Outcome = Result<(u64, String), String>;
 pub(crate) struct Saver {
     writing: Option<JoinHandle<(Outcome, SplatState)>>,
     outcome: Option<Outcome>,
-    /// The memory of the last copy.
+    /// The memory of the next copy, if it is not being obtained.
     spare: SplatState,
+    obtaining: Option<JoinHandle<SplatState>>,
 }
 
 impl Saver {
+    /// Obtains memory for a copy of `state`, of which there will be at most `most` splats, if checkpoints are to be written in the
+    /// background and there is none yet. Returns at once.
+    pub fn prepare(&mut self, state: &SplatState, most: usize) {
+        let busy = self.writing.is_some() || self.obtaining.is_some();
+        if busy || !copies(state.bytes() as u64, self.spare.bytes()) || self.spare.has_room_for(state) {
+            return;
+        }
+        self.spare = SplatState::default();
+        let len = ((state.len() as f64 * ROOM) as usize).min(most).max(state.len());
+        let degree = state.splats.sh_degree();
+        self.obtaining = Some(std::thread::spawn(move || SplatState::resident(len, degree)));
+    }
+
     /// Writes `checkpoint`. Returns its path, or nothing if it is still being written, from a copy: where it is large and memory
     /// for the copy, for which [`memory::MemoryPlan`] leaves room, is free twice over.
     ///
@@ -31,9 +47,10 @@ impl Saver {
     /// One line.
     pub fn save(&mut self, folder: &RunFolder, checkpoint: Checkpoint) -> Result<Option<String>, String> {
         self.wait();
-        let bytes = checkpoint.bytes();
-        let held = self.spare.bytes() as u64;
-        if bytes < BACKGROUND_FROM || memory::free().is_none_or(|free| free as u64 + held < 2 * bytes) {
+        if let Some(obtaining) = self.obtaining.take() {
+            self.spare = obtaining.join().unwrap_or_default();
+        }
+        if !copies(checkpoint.bytes(), self.spare.bytes()) {
             self.spare = SplatState::default();
             return self.save_now(folder, &checkpoint).map(Some);
         }
@@ -108,6 +125,12 @@ impl Drop for Saver {
     }
 }
 
+/// Whether a state of `bytes` is copied, with `held` bytes there for the copy already.
+fn copies(bytes: u64, held: usize) -> bool {
+    let enough = |free: usize| (free + held) as u64 >= 2 * bytes;
+    bytes >= BACKGROUND_FROM && memory::free().is_some_and(enough)
+}
+
 fn write(folder: &RunFolder, checkpoint: &Checkpoint) -> Outcome {
     let path = folder.write_checkpoint(checkpoint);
     path.map(|path| (checkpoint.step, path))
@@ -119,6 +142,22 @@ mod tests {
     use super::*;
     use crate::prelude::SynthOptions;
     use crate::{Run, TrainInput, write_synth_dataset};
+
+    #[test]
+    fn memory_is_obtained_for_large_states_alone_and_once() {
+        let mut saver = Saver::default();
+        saver.prepare(&SplatState::resident(1000, 3), 2000);
+        assert!(saver.obtaining.is_none(), "a small state is written at once");
+        // 752 bytes a splat.
+        let large = SplatState::resident(400_000, 3);
+        if copies(large.bytes() as u64, 0) {
+            saver.prepare(&large, 450_000);
+            saver.spare = saver.obtaining.take().expect("begun").join().unwrap();
+            assert_eq!(saver.spare.len(), 450_000);
+            saver.prepare(&large, 450_000);
+            assert!(saver.obtaining.is_none(), "there is enough");
+        }
+    }
 
     #[test]
     fn a_checkpoint_written_behind_is_reported_when_it_is_complete_and_a_failure_too() {

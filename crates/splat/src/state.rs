@@ -159,6 +159,13 @@ impl SplatState {
     }
 
     /// Every column with an item for each splat.
+    fn all_columns(&self) -> Vec<&Planes> {
+        let [first, second] = &self.moments;
+        let splats = [&self.splats, first, second].into_iter().flat_map(Splats::columns);
+        splats.chain([&self.statistics, &self.filter]).collect()
+    }
+
+    /// The same, to be changed.
     fn all_columns_mut(&mut self) -> Vec<&mut Planes> {
         let [first, second] = &mut self.moments;
         let splats = [&mut self.splats, first, second]
@@ -182,10 +189,24 @@ impl SplatState {
         self.filter.copy_from(&from.filter);
     }
 
+    /// `len` splats of degree `sh_degree`, unspecified, whose memory the system has already supplied.
+    pub fn resident(len: usize, sh_degree: u32) -> Self {
+        let mut state = Self::new(Splats::zeros(0, sh_degree));
+        for column in state.all_columns_mut() {
+            *column = Planes::resident(column.count(), len);
+        }
+        state
+    }
+
+    /// Whether [`Self::copy_from`] `other` needs no further memory.
+    pub fn has_room_for(&self, other: &Self) -> bool {
+        let columns = self.all_columns().into_iter().zip(other.all_columns());
+        columns.into_iter().all(|(own, other)| own.has_room_for(other))
+    }
+
     /// Allocated bytes.
     pub fn bytes(&self) -> usize {
-        let splats = [&self.splats, &self.moments[0], &self.moments[1]];
-        splats.iter().map(|splats| splats.bytes()).sum::<usize>() + self.statistics.bytes() + self.filter.bytes()
+        self.all_columns().into_iter().map(Planes::bytes).sum()
     }
 
     /// Statistics plane `plane` of splat `i`, averaged over the frames in which it was visible.
@@ -358,6 +379,18 @@ mod tests {
         assert_eq!(column(&state.splats.means, 0), [2.0, 0.0, 0.0, 1.0, 2.0]);
         assert_eq!(column(&state.moments[1].means, 0), [20.0, 0.0, 0.0, 0.0, 0.0]);
         assert_eq!(column(&state.statistics, SplatState::SEEN), [200.0, 0.0, 0.0, 0.0, 0.0]);
+    }
+
+    #[test]
+    fn a_copy_into_resident_memory_needs_no_more_of_it() {
+        let mut state = SplatState::new(Splats::zeros(5, 2));
+        state.splats.means.set(2, 4, 3.0);
+        let mut copy = SplatState::resident(20, 2);
+        assert!(copy.has_room_for(&state) && !SplatState::resident(20, 1).has_room_for(&state));
+        let bytes = copy.bytes();
+        copy.copy_from(&state);
+        assert!(copy == state && copy.bytes() == bytes);
+        assert!(!copy.has_room_for(&SplatState::new(Splats::zeros(33, 2))));
     }
 
     /// A round against its definition, one splat at a time, with 1 and with 2 threads.

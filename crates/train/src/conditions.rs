@@ -42,9 +42,10 @@ const SKY_SPREAD: f64 = 0.14;
 
 /// Degrees between adjacent photographs from which they are sparse. Held-out PSNR of `fast` at 240 pixels with the usual 3,000 steps and with 1,200 and
 /// `depth_weight` 0.5: fox, 12 photographs 13 degrees apart, 28.2 and 28.7; 6, 29 degrees apart, 24.1 and 24.9; cup, 12, 27 degrees apart, 26.4 and 26.6. With 750
-/// steps: fox, 24 photographs 9 degrees apart, 32.7 and 31.6; lund_door, 6 photographs less than 7 degrees apart, 35.3 and 34.3; fern, 6 of the same, 27.7 and
-/// 26.7.
-const SPARSE: f64 = 10.0;
+/// steps: fox, 24 photographs 7 degrees apart, 32.7 and 31.6; lund_door, 6 photographs 5 degrees apart, 35.3 and 34.3; fern, 6 photographs 2 degrees apart, 27.7
+/// and 26.7. With 90 steps for each photograph, 480 pixels: a book on a table, 6 photographs 9.4 degrees apart, 18.4 and 21.3; toys, 7 photographs 8.1 degrees
+/// apart, 24.0 and 24.2.
+const SPARSE: f64 = 8.0;
 
 /// Whether the mask of `photo` leaves out all but an object.
 fn is_cut_out(photo: &Photo) -> bool {

@@ -156,7 +156,7 @@ documented! {
         /// The same, if the sky differs from photograph to photograph; `known_space` prevails.
         #[serde(default, skip_serializing_if = "Params::is_empty")]
         pub skies: Params,
-        /// The same, if adjacent photographs are more than 10 degrees apart, as seen from what they show; it prevails.
+        /// The same, if adjacent photographs are more than 8 degrees apart, as seen from what they show; it prevails.
         #[serde(default, skip_serializing_if = "Params::is_empty")]
         pub sparse: Params,
         /// The stages, in order.

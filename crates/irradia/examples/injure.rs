@@ -164,12 +164,16 @@ fn write_view(args: &Args, dataset: &Dataset, extent: f32, view: usize) -> Resul
         // A sequence of its own: other faults stay the same.
         LocalGain::random(range, &mut Rng::new(args.seed, view as u64 | 1 << 32))
     });
+    let lens = LocalGain {
+        log: 0.0,
+        slope: [0.0; 2],
+        vignette: args.vignette.ln(),
+    };
     let (channels, columns, rows) = (photo.channels as usize, photo.width, photo.height);
     for (i, pixel) in (0u32..).zip(photo.data.chunks_exact_mut(channels)) {
         let place =
             [(i % columns, columns), (i / columns, rows)].map(|(at, of)| 2.0 * (at as f32 + 0.5) / of as f32 - 1.0);
-        let u = 0.5 * (place[0] * place[0] + place[1] * place[1]);
-        let local = local.as_ref().map_or(1.0, |local| local.at(place)) * args.vignette.powf(u);
+        let local = local.as_ref().map_or(1.0, |local| local.at(place)) * lens.at(place);
         for (value, factor) in pixel.iter_mut().zip(factors) {
             *value = (f32::from(*value) * factor * local).round().min(255.0) as u8;
         }

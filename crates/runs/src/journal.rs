@@ -236,10 +236,16 @@ impl Observer for Journal {
             Event::StageEntered { stage, step, seconds } => self.stage(stage.clone(), *step, *seconds),
             Event::Finished { step, seconds, .. } => self.end_stage(*step, *seconds),
             Event::Warned { message } => self.warnings.push(message.clone()),
-            Event::Started { .. } | Event::Densified { .. } => {
+            // On a GPU the state would be read back for this.
+            Event::Started { .. } | Event::Densified { .. } if !trainer.engine.is_on_gpu() => {
                 self.saver.prepare(trainer.engine.state(), trainer.recipe.max_splats);
             }
-            Event::Decided { .. } | Event::Saved { .. } | Event::Paused { .. } | Event::Resumed { .. } => {}
+            Event::Started { .. }
+            | Event::Decided { .. }
+            | Event::Densified { .. }
+            | Event::Saved { .. }
+            | Event::Paused { .. }
+            | Event::Resumed { .. } => {}
         }
         self.write(event);
         Signal::Continue

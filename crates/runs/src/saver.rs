@@ -31,7 +31,7 @@ impl Saver {
     /// background and there is none yet. Returns at once.
     pub fn prepare(&mut self, state: &SplatState, most: usize) {
         let busy = self.writing.is_some() || self.obtaining.is_some();
-        if busy || !copies(state.bytes() as u64, self.spare.bytes()) || self.spare.has_room_for(state) {
+        if busy || self.spare.has_room_for(state) || !copies(state.bytes() as u64, self.spare.bytes()) {
             return;
         }
         self.spare = SplatState::default();

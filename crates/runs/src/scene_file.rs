@@ -149,6 +149,25 @@ fn beside(scene: &Path, name: &str) -> Option<PathBuf> {
     (scene.file_name().is_some_and(|name| name == SCENE) && path.is_file()).then_some(path)
 }
 
+/// The bytes of the file `name` beside the scene of a run, if there is one.
+fn bytes_beside(scene: &Path, name: &str) -> Result<Option<Vec<u8>>, RunError> {
+    let read = |path: PathBuf| fs::read(&path).map_err(RunError::io("read", &path));
+    beside(scene, name).map(read).transpose()
+}
+
+/// What `parse` finds in the file `name` beside the scene of a run, if there is one.
+fn parsed_beside<T>(
+    scene: &Path,
+    name: &str,
+    parse: impl FnOnce(&[u8]) -> Result<T, String>,
+) -> Result<Option<T>, RunError> {
+    let parsed = bytes_beside(scene, name)?.map(|bytes| parse(&bytes)).transpose();
+    parsed.map_err(|why| RunError::File {
+        path: scene.with_file_name(name),
+        source: TrainError::Checkpoint(why),
+    })
+}
+
 /// The residual field beside `scene`, if there is one.
 pub(crate) fn residual_beside(scene: &Path) -> Result<Option<Field>, RunError> {
     beside(scene, RESIDUAL).as_deref().map(read_field).transpose()
@@ -159,11 +178,7 @@ pub(crate) fn residual_beside(scene: &Path) -> Result<Option<Field>, RunError> {
 /// # Errors
 /// When a file of them cannot be read, or they do not belong together.
 pub fn read_lights(scene: &Path) -> Result<Option<Lights>, RunError> {
-    let read = |name: &str| match beside(scene, name) {
-        Some(path) => fs::read(&path).map_err(RunError::io("read", &path)).map(Some),
-        None => Ok(None),
-    };
-    let [exposures, appearance] = [read(EXPOSURES)?, read(APPEARANCE)?];
+    let [exposures, appearance] = [bytes_beside(scene, EXPOSURES)?, bytes_beside(scene, APPEARANCE)?];
     Lights::from_files(exposures.as_deref(), appearance.as_deref()).map_err(|source| RunError::File {
         path: scene.to_owned(),
         source,
@@ -175,28 +190,12 @@ pub fn read_lights(scene: &Path) -> Result<Option<Lights>, RunError> {
 /// # Errors
 /// When its file cannot be read.
 pub fn read_vignette(scene: &Path) -> Result<Option<Vignette>, RunError> {
-    let Some(path) = beside(scene, VIGNETTE) else {
-        return Ok(None);
-    };
-    let bytes = fs::read(&path).map_err(RunError::io("read", &path))?;
-    let vignette = Vignette::from_file(&bytes).map_err(|why| RunError::File {
-        path,
-        source: TrainError::Checkpoint(why),
-    })?;
-    Ok(Some(vignette))
+    parsed_beside(scene, VIGNETTE, Vignette::from_file)
 }
 
 /// The mean colour of the sky beside `scene`, if there is one.
 fn sky_beside(scene: &Path) -> Result<Option<[f32; 3]>, RunError> {
-    let Some(path) = beside(scene, SKY) else {
-        return Ok(None);
-    };
-    let bytes = fs::read(&path).map_err(RunError::io("read", &path))?;
-    let color = background_of_sky(&bytes).map_err(|why| RunError::File {
-        path,
-        source: TrainError::Checkpoint(why),
-    })?;
-    Ok(Some(color))
+    parsed_beside(scene, SKY, background_of_sky)
 }
 
 /// Background and antialiasing of the run that contains `scene`; otherwise the defaults.

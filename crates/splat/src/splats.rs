@@ -152,13 +152,6 @@ impl Splats {
         Self::from_columns(self.columns().map(|c| c.gather(indices)))
     }
 
-    /// Becomes a copy of `from`, made by all threads; reuses memory where possible.
-    pub fn copy_from(&mut self, from: &Self) {
-        for (to, from) in self.columns_mut().into_iter().zip(from.columns()) {
-            to.copy_from(from);
-        }
-    }
-
     /// Centre of splat `i`, world units.
     pub fn mean(&self, i: usize) -> [f32; 3] {
         std::array::from_fn(|c| self.means.plane(c)[i])

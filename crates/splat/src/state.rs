@@ -181,12 +181,9 @@ impl SplatState {
 
     /// Becomes a copy of `from`, made by all threads; reuses memory where possible.
     pub fn copy_from(&mut self, from: &Self) {
-        self.splats.copy_from(&from.splats);
-        for (to, from) in self.moments.iter_mut().zip(&from.moments) {
+        for (to, from) in self.all_columns_mut().into_iter().zip(from.all_columns()) {
             to.copy_from(from);
         }
-        self.statistics.copy_from(&from.statistics);
-        self.filter.copy_from(&from.filter);
     }
 
     /// `len` splats of degree `sh_degree`, unspecified, whose memory the system has already supplied.
@@ -200,8 +197,8 @@ impl SplatState {
 
     /// Whether [`Self::copy_from`] `other` needs no further memory.
     pub fn has_room_for(&self, other: &Self) -> bool {
-        let columns = self.all_columns().into_iter().zip(other.all_columns());
-        columns.into_iter().all(|(own, other)| own.has_room_for(other))
+        let mut columns = self.all_columns().into_iter().zip(other.all_columns());
+        columns.all(|(own, other)| own.has_room_for(other))
     }
 
     /// Allocated bytes.

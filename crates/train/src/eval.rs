@@ -5,7 +5,6 @@ use crate::model::{Model, RenderOptions};
 use crate::photos::Prepared;
 use crate::socket::Vignette;
 use crate::trainer::TrainError;
-use irradia_compute::Planes;
 use irradia_measure::{Evaluation, Networks, evaluate, psnr_masked};
 use irradia_scene::{Camera, Dataset, Image, Photo, View};
 use irradia_splat::Renderer;
@@ -131,18 +130,10 @@ pub fn evaluate_views(
 
 /// `render` `[H, W, 3]` as the lens of `camera` shows it.
 pub fn vignetted(vignette: Option<&Vignette>, camera: &Camera, render: Image) -> Image {
-    let Some(vignette) = vignette else {
-        return render;
-    };
-    let planes = Planes::from_interleaved(3, &render.data);
-    let pixels = planes.len();
-    let color: Vec<f32> = (0..3).flat_map(|c| &planes.plane(c)[..pixels]).copied().collect();
-    let mut shown = Vec::new();
-    vignette.develop(&camera.intrinsics, &color, &mut shown);
-    let data = (0..pixels)
-        .flat_map(|i| [0, 1, 2].map(|c| shown[c * pixels + i]))
-        .collect();
-    Image { data, ..render }
+    match vignette {
+        Some(vignette) => vignette.apply_to(&camera.intrinsics, render),
+        None => render,
+    }
 }
 
 fn truth_image(photo: &Photo, view: &View, background: [f32; 3]) -> Image {

@@ -17,7 +17,7 @@ use crate::photos::{PhotoCache, Prepared};
 use crate::pixel_size::pixel_size;
 use crate::recipe::{AdamKind, Choice, DensityControl, LengthUnit, Param, Recipe};
 use crate::schedule::{Clock, Round, StepMetrics, StepPlan, plan, upcoming_views};
-use crate::socket::{Residual, Sky, Sockets, Vignette};
+use crate::socket::{Residual, Sky, Sockets};
 use crate::times::Times;
 use crate::transients::Hidden;
 use cpu_time::ProcessTime;
@@ -310,14 +310,15 @@ impl Trainer {
             self.decisions
                 .push("the light of photographs is trained on the CPU only, and left out".into());
         }
-        if self.recipe.vignette && Vignette::new(&self.dataset).is_none() {
-            self.decisions
-                .push("the photographs are faces of panoramas, which no lens darkens: no vignette is trained".into());
-        }
         // Only the spaces of fields depend on transparency; photographs are not read for the others.
         let fields = self.recipe.residual.is_some() || self.recipe.light().is_some();
         let transparent = fields && self.transparent()?;
-        Sockets::new(&self.recipe, &self.dataset, transparent, self.options.seed)
+        let sockets = Sockets::new(&self.recipe, &self.dataset, transparent, self.options.seed)?;
+        if self.recipe.vignette && sockets.vignette.is_none() {
+            self.decisions
+                .push("the photographs are faces of panoramas, which no lens darkens: no vignette is trained".into());
+        }
+        Ok(sockets)
     }
 
     /// Whether photographs have alpha, judged by the first one.

@@ -14,8 +14,8 @@ const NEIGHBOURS: usize = 2;
 /// Largest angle between two views that are paired, radians.
 const SAME_WAY: f32 = 1.0;
 
-/// `dataset` with pictures of `scene`, by lenses with this vignette, as further training views, halfway between adjacent views. A scene that keeps to them looks between
-/// the photographs as it did before. On lund_door, 10 photographs, at a 25th of the bytes: held-out PSNR 33.65 dB without, 33.82 dB
+/// `dataset` with pictures of `scene`, by lenses with this vignette, as further training views, halfway between adjacent views. A scene
+/// that keeps to them looks between the photographs as it did before. On lund_door, 10 photographs, at a 25th of the bytes: held-out PSNR 33.65 dB without, 33.82 dB
 /// with one neighbour of each.
 pub(super) fn with_views_between(mut dataset: Dataset, scene: &Scene, vignette: Option<&Vignette>) -> Dataset {
     let cameras: Vec<Camera> = dataset.train.iter().map(|i| dataset.views[*i].camera).collect();

@@ -4,7 +4,7 @@
 //! 3 x 4 matrix): `y = A x + b` in the photograph's own, sRGB-encoded colours. Photographs saturate at 1, and so does `y`.
 
 use super::per_view::PerViewAdam;
-use super::{Occupant, pieces};
+use super::{Occupant, pieces, sum_of};
 use crate::tensor_file::{NamedTensor, TensorSource, to_bytes};
 use irradia_measure::Affine;
 use rayon::prelude::*;
@@ -127,13 +127,7 @@ impl Exposure {
                 sum
             })
             .collect();
-        let mut total = [0.0f64; N];
-        for sum in sums {
-            for (total, sum) in total.iter_mut().zip(sum) {
-                *total += sum;
-            }
-        }
-        total.map(|v| v as f32)
+        sum_of(&sums)
     }
 
     /// [`Self::vjp`] and a step of Adam on `view` at `rate`, regularised to the identity by `weight` times the mean squared difference.

@@ -61,6 +61,17 @@ fn pieces(frame: &mut [f32], length: usize) -> impl IndexedParallelIterator<Item
     pieces.map(|((red, green), blue)| [red, green, blue])
 }
 
+/// The sum of the gradients of all pieces, in their order.
+fn sum_of<const N: usize>(pieces: &[[f64; N]]) -> [f32; N] {
+    let mut total = [0.0f64; N];
+    for sum in pieces {
+        for (total, sum) in total.iter_mut().zip(sum) {
+            *total += sum;
+        }
+    }
+    total.map(|v| v as f32)
+}
+
 /// What is added to the colours of splats in view, by each that adds any.
 pub(crate) fn sum_of_colors(a: Option<Vec<[f32; 3]>>, b: Option<Vec<[f32; 3]>>) -> Vec<[f32; 3]> {
     match (a, b) {

@@ -6,9 +6,9 @@
 //! have it as well.
 
 use super::per_view::PerViewAdam;
-use super::{Occupant, pieces};
+use super::{Occupant, pieces, sum_of};
 use crate::tensor_file::{NamedTensor, TensorSource, to_bytes};
-use irradia_scene::{Dataset, Intrinsics};
+use irradia_scene::{Dataset, Image, Intrinsics};
 use rayon::prelude::*;
 use safetensors::SafeTensors;
 
@@ -112,6 +112,10 @@ impl Vignette {
         corners.max_by(|a, b| change(*a).total_cmp(&change(*b)))
     }
 
+    fn curves(&self) -> NamedTensor {
+        NamedTensor::real("curves", vec![self.curves.len(), N], self.curves.as_flattened())
+    }
+
     fn lens_of(&self, k: &Intrinsics) -> Option<usize> {
         let lens = Lens::of(k);
         self.lenses.iter().position(|other| other.is_like(lens))
@@ -129,11 +133,24 @@ impl Vignette {
             for plane in planes {
                 for (row, values) in plane.chunks_mut(width).enumerate() {
                     for (value, u) in values.iter_mut().zip(radii(k, piece * ROWS + row)) {
-                        *value = (*value * gain(curve, u)).min(1.0);
+                        *value = seen(*value, gain(curve, u));
                     }
                 }
             }
         });
+    }
+
+    /// `image` `[H, W, 3]` as the lens of `k` shows it, as [`Self::develop`] does with planes.
+    pub fn apply_to(&self, k: &Intrinsics, mut image: Image) -> Image {
+        if let Some(lens) = self.lens_of(k) {
+            let curve = self.curves[lens];
+            for (row, values) in image.data.chunks_mut(3 * k.width as usize).enumerate() {
+                for (pixel, u) in values.as_chunks_mut::<3>().0.iter_mut().zip(radii(k, row)) {
+                    *pixel = pixel.map(|value| seen(value, gain(curve, u)));
+                }
+            }
+        }
+        image
     }
 
     /// The vector-Jacobian product of [`Self::develop`]: `v` `[3, H, W]` becomes the gradient of `color`; returns that of the curve.
@@ -167,13 +184,7 @@ impl Vignette {
                 total
             })
             .collect();
-        let mut total = [0.0f64; N];
-        for sum in sums {
-            for (total, sum) in total.iter_mut().zip(sum) {
-                *total += sum;
-            }
-        }
-        total.map(|v| v as f32)
+        sum_of(&sums)
     }
 
     /// The vector-Jacobian product of [`Self::develop`], and a step of Adam at `rate`.
@@ -194,6 +205,11 @@ fn gain([a, b, c]: [f32; N], u: f32) -> f32 {
     (1.0 + u * (a + u * (b + u * c))).max(MIN_GAIN)
 }
 
+/// What a photograph holds of `value` where the gain is `gain`.
+fn seen(value: f32, gain: f32) -> f32 {
+    (value * gain).min(1.0)
+}
+
 /// Squared distances of the pixels of `row` from the principal point, 1 at half a diagonal.
 fn radii(k: &Intrinsics, row: usize) -> impl Iterator<Item = f32> {
     let unit = 4.0 / (k.width as f32 * k.width as f32 + k.height as f32 * k.height as f32);
@@ -210,8 +226,7 @@ impl Occupant for Vignette {
     }
 
     fn tensors(&self) -> Vec<NamedTensor> {
-        let curves = NamedTensor::real("curves", vec![self.curves.len(), N], self.curves.as_flattened());
-        std::iter::once(curves).chain(self.adam.tensors()).collect()
+        std::iter::once(self.curves()).chain(self.adam.tensors()).collect()
     }
 
     fn restore(&mut self, tensors: TensorSource) -> Result<(), String> {
@@ -226,48 +241,37 @@ impl Occupant for Vignette {
             .flat_map(|lens| [lens.proportion, lens.focal])
             .collect();
         let lenses = NamedTensor::real("lenses", vec![self.lenses.len(), 2], &lenses);
-        let curves = NamedTensor::real("curves", vec![self.curves.len(), N], self.curves.as_flattened());
-        Some(to_bytes(&[lenses, curves], ("irradia_vignette", "1".into())))
+        Some(to_bytes(&[lenses, self.curves()], ("irradia_vignette", "1".into())))
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use glam::Vec3;
-    use irradia_scene::{Camera, Photo, Pose, Rng, View};
-    use std::sync::Arc;
+    use crate::free_space;
+    use irradia_scene::Rng;
 
     const WIDTH: u32 = 7;
     const HEIGHT: u32 = 37;
 
-    /// `counts` photographs by lenses of these focal lengths, by the longer side.
-    fn dataset(counts: &[(u32, u32, f32, usize)]) -> Dataset {
-        let mut data = Dataset::default();
-        for (width, height, focal, count) in counts {
-            let mut intrinsics = Intrinsics::from_fov_x(*width, *height, 1.0);
-            (intrinsics.fx, intrinsics.fy) = (
-                focal * width.max(height).to_owned() as f32,
-                focal * width.max(height).to_owned() as f32,
-            );
-            let camera = Camera::new(Pose::look_at(Vec3::X, Vec3::ZERO, Vec3::Z), intrinsics);
-            let photo = Photo {
-                width: 1,
-                height: 1,
-                channels: 3,
-                data: vec![0; 3],
-                mask: None,
-            };
-            for _ in 0..*count {
-                data.train.push(data.views.len());
-                data.views.push(View::new("a", camera, Arc::new(photo.clone())));
-            }
-        }
+    /// A photograph by each of the lenses: width, height, focal length by the longer side.
+    fn dataset(lenses: &[(u32, u32, f32)]) -> Dataset {
+        let mut data = free_space::tests::dataset(0, None);
+        let view = data.views[0].clone();
+        let by = |(width, height, focal): &(u32, u32, f32)| {
+            let mut view = view.clone();
+            let mut k = Intrinsics::from_fov_x(*width, *height, 1.0);
+            (k.fx, k.fy) = (focal * *width.max(height) as f32, focal * *width.max(height) as f32);
+            view.camera.intrinsics = k;
+            view
+        };
+        data.views = lenses.iter().map(by).collect();
+        data.train = (0..lenses.len()).collect();
         data
     }
 
     fn example() -> (Vignette, Intrinsics, Vec<f32>, Vec<f32>) {
-        let data = dataset(&[(WIDTH, HEIGHT, 1.2, 8)]);
+        let data = dataset(&[(WIDTH, HEIGHT, 1.2)]);
         let mut vignette = Vignette::new(&data).expect("a lens");
         vignette.curves[0] = [-0.2, 0.1, -0.15];
         let mut k = data.views[0].camera.intrinsics;
@@ -287,13 +291,15 @@ mod tests {
 
     #[test]
     fn corners_darken_and_the_principal_point_stays() {
-        let mut vignette = Vignette::new(&dataset(&[(9, 5, 1.0, 8)])).unwrap();
+        let mut vignette = Vignette::new(&dataset(&[(9, 5, 1.0)])).unwrap();
         assert_eq!(vignette.corner(), None);
         let mut k = Intrinsics::from_fov_x(9, 5, 1.0);
         (k.fx, k.fy) = (9.0, 9.0);
         vignette.curves[0] = [-0.1, -0.1, -0.1];
         let mut y = Vec::new();
         vignette.develop(&k, &[0.5; 135], &mut y);
+        let image = vignette.apply_to(&k, Image::new(9, 5, 3, vec![0.5; 135]));
+        assert!((0..45).all(|i| image.data[3 * i..][..3] == [y[i], y[45 + i], y[90 + i]]));
         assert_eq!(y[2 * 9 + 4], 0.5);
         let u = (16.0 + 4.0) / (4.5f32 * 4.5 + 2.5 * 2.5);
         let expected = 0.5 * (1.0 - 0.1 * (u + u * u + u * u * u));
@@ -336,7 +342,7 @@ mod tests {
 
     #[test]
     fn saturated_pixels_only_darken() {
-        let mut vignette = Vignette::new(&dataset(&[(4, 4, 1.0, 8)])).unwrap();
+        let mut vignette = Vignette::new(&dataset(&[(4, 4, 1.0)])).unwrap();
         vignette.curves[0] = [0.5, 0.0, 0.0];
         let mut k = Intrinsics::from_fov_x(4, 4, 1.0);
         (k.fx, k.fy) = (4.0, 4.0);
@@ -366,15 +372,10 @@ mod tests {
 
     #[test]
     fn lenses_are_told_apart_whatever_the_size_and_orientation_of_their_photographs() {
-        let data = dataset(&[
-            (400, 300, 1.0, 4),
-            (600, 800, 1.01, 4),
-            (400, 300, 1.3, 7),
-            (256, 256, 0.5, 20),
-        ]);
+        let data = dataset(&[(400, 300, 1.0), (600, 800, 1.01), (400, 300, 1.3), (256, 256, 0.5)]);
         let vignette = Vignette::new(&data).expect("two lenses");
         assert_eq!(vignette.lenses.len(), 2, "faces of a cube have none: {vignette:?}");
-        assert!(Vignette::new(&dataset(&[(256, 256, 0.5, 7)])).is_none());
+        assert!(Vignette::new(&dataset(&[(256, 256, 0.5)])).is_none());
     }
 
     #[test]

@@ -112,8 +112,7 @@ fn skies_differ(colors: &[[f64; 3]], photographs: usize) -> bool {
 impl Trainer {
     /// Puts the recipe's parameters for conditions into effect that the data meet. In the recipe, so that a resumed run has the same.
     pub(crate) fn settle_conditions(&mut self) -> Result<(), TrainError> {
-        let [sparse, skies, known_space, cut_out] = [
-            std::mem::take(&mut self.recipe.sparse),
+        let [skies, known_space, cut_out] = [
             std::mem::take(&mut self.recipe.skies),
             std::mem::take(&mut self.recipe.known_space),
             std::mem::take(&mut self.recipe.cut_out),
@@ -159,7 +158,7 @@ impl Trainer {
         if are_cut_out {
             self.put_into_effect("masks leave out all but an object", "cut_out", cut_out);
         }
-        self.settle_spacing(sparse);
+        self.settle_spacing();
         self.settle_maps();
         Ok(())
     }
@@ -184,8 +183,8 @@ impl Trainer {
         }
     }
 
-    fn settle_spacing(&mut self, sparse: Params) {
-        if sparse.is_empty() && self.recipe.sparse_visits == 0 {
+    fn settle_spacing(&mut self) {
+        if self.recipe.sparse_visits == 0 {
             return;
         }
         let spacing = spacing(&self.dataset).to_degrees();
@@ -193,13 +192,11 @@ impl Trainer {
             self.recipe.sparse_visits = 0;
             return;
         }
-        let why = format!("adjacent photographs are {spacing:.0} degrees apart");
-        self.put_into_effect(&why, "sparse", sparse);
         let (total, least) = (self.total_steps(), self.least_pace());
         if self.options.steps.is_none() && least > self.pace {
             self.pace = least;
             self.decisions.push(format!(
-                "{why}: at most {} steps in place of {total}, since more fit single photographs (--steps for another number)",
+                "adjacent photographs are {spacing:.0} degrees apart: at most {} steps in place of {total}, since more fit single photographs (--steps for another number)",
                 self.total_steps()
             ));
         }
@@ -337,9 +334,8 @@ mod tests {
             };
             Trainer::new(around(count), recipe, options).unwrap()
         };
-        let weight = |trainer: &Trainer| trainer.recipe.params[&Param::DepthWeight].clone();
         let sparse = trainer(12, None);
-        assert_eq!((sparse.total_steps(), weight(&sparse)), (1080, Knob::Const(0.5)));
+        assert_eq!(sparse.total_steps(), 1080);
         assert!(
             sparse
                 .decisions
@@ -350,8 +346,7 @@ mod tests {
         assert_eq!(trainer(4, None).total_steps(), 600);
         assert_eq!(trainer(12, Some(2000)).total_steps(), 2000);
         let dense = trainer(60, None);
-        assert_eq!((dense.total_steps(), weight(&dense)), (3000, Knob::Const(0.1)));
-        assert_eq!(dense.least_pace(), 0.0);
+        assert_eq!((dense.total_steps(), dense.least_pace()), (3000, 0.0));
     }
 
     /// A photograph of `width` x `height` with a colour for each pixel, and what its mask keeps.

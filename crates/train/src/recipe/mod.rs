@@ -156,9 +156,6 @@ documented! {
         /// The same, if the sky differs from photograph to photograph; `known_space` prevails.
         #[serde(default, skip_serializing_if = "Params::is_empty")]
         pub skies: Params,
-        /// The same, if adjacent photographs are more than 8 degrees apart, as seen from what they show; it prevails.
-        #[serde(default, skip_serializing_if = "Params::is_empty")]
-        pub sparse: Params,
         /// The stages, in order.
         pub stage: Vec<Stage>,
     }
@@ -400,13 +397,7 @@ impl Recipe {
             let mut paths = overrides.iter().filter_map(|given| given.split_once('='));
             paths.any(|(path, _)| path.trim().strip_prefix("params.") == Some(param.name()))
         };
-        let conditional = [
-            &mut recipe.known_space,
-            &mut recipe.cut_out,
-            &mut recipe.skies,
-            &mut recipe.sparse,
-        ];
-        for params in conditional {
+        for params in [&mut recipe.known_space, &mut recipe.cut_out, &mut recipe.skies] {
             params.retain(|param, _| !is_set(param));
         }
         recipe.complete_sockets();
@@ -546,7 +537,6 @@ impl Recipe {
             ("known_space".to_owned(), &self.known_space),
             ("cut_out".to_owned(), &self.cut_out),
             ("skies".to_owned(), &self.skies),
-            ("sparse".to_owned(), &self.sparse),
         ];
         let stages = self
             .stage

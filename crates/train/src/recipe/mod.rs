@@ -94,8 +94,8 @@ documented! {
         /// length; 0: it always has its own length.
         #[serde(default, skip_serializing_if = "is_default")]
         pub visits: u64,
-        /// Steps for each training photograph that a run without a number of steps has at most, where photographs are sparse, but at least a fifth of
-        /// the recipe's own length; a budget that allows more is not used up. 0: no limit.
+        /// Steps for each training photograph that a run without a number of steps has at most, if adjacent photographs are more than 8 degrees apart, as
+        /// seen from what they show, but at least a fifth of the recipe's own length; a budget that allows more is not used up. 0: no limit.
         #[serde(default, skip_serializing_if = "is_default")]
         pub sparse_visits: u64,
         /// Steps between evaluations of held-out views while training; at least 1.

@@ -17,6 +17,8 @@ const IN_FLIGHT: usize = 2;
 const REST: Duration = Duration::from_millis(100);
 /// Wishes other than pictures that wait.
 const JOBS: usize = 4;
+/// Time given to an outbox that is nearly full before it is checked again: nobody says when a page has taken a message.
+const DRAINS: Duration = Duration::from_millis(20);
 /// Between two copies of a training's scene passes this many times what a copy and its picture take.
 const AT_REST: u32 = 40;
 /// Least time between two copies of a training's scene.
@@ -68,6 +70,8 @@ struct State {
     /// The seat served last.
     served: u64,
     closing: bool,
+    /// Changes outside so far.
+    wakes: u64,
     /// Nothing is drawn before this, for the sake of a training.
     rest_until: Option<Instant>,
     /// No picture is renewed for a newer scene before this.
@@ -167,8 +171,8 @@ impl Desk {
 
     /// Something outside has changed: the scene, or the training's state.
     pub fn wake(&self) {
-        // With the lock, so that no sleeper misses it.
-        drop(self.lock());
+        // With the lock, so that no sleeper misses it; counted for one that is about to sleep.
+        self.lock().wakes += 1;
         self.changed.notify_all();
     }
 
@@ -192,9 +196,13 @@ impl Desk {
                 return None;
             }
             // Not under the lock of the desk: `now` takes others.
+            let wakes = state.wakes;
             drop(state);
             let at = now();
             state = self.lock();
+            if state.wakes != wakes {
+                continue;
+            }
             let clock = Instant::now();
             let mut wake_at: Option<Instant> = None;
             let mut sooner = |at: Instant| wake_at = Some(wake_at.map_or(at, |other| other.min(at)));
@@ -292,14 +300,24 @@ impl Seat {
         if matches!(picture, Next::Now(_)) {
             return picture;
         }
-        // A camera at rest leaves time for measurements.
-        let at_rest = clock.duration_since(self.shot_at) >= REST;
-        match self.scores.filter(|_| at_rest && self.outbox.capacity() > 2) {
-            Some((view, count)) => {
-                self.scores = (view + 1 < count).then_some((view + 1, count));
-                Next::Now(Box::new(Task::Score { view }))
-            }
-            None => picture,
+        let Some((view, count)) = self.scores else {
+            return picture;
+        };
+        // A camera at rest leaves time for measurements, and they leave room in the outbox for pictures.
+        let rests_at = self.shot_at + REST;
+        let free_at = if self.outbox.capacity() > 2 {
+            clock
+        } else {
+            clock + DRAINS
+        };
+        let measured_at = rests_at.max(free_at);
+        if measured_at <= clock {
+            self.scores = (view + 1 < count).then_some((view + 1, count));
+            return Next::Now(Box::new(Task::Score { view }));
+        }
+        match picture {
+            Next::At(at) => Next::At(at.min(measured_at)),
+            _ => Next::At(measured_at),
         }
     }
 
@@ -365,8 +383,61 @@ mod tests {
         }
     }
 
+    /// Ends a wait that would last for ever.
+    fn close_after(desk: &Arc<Desk>, time: Duration) {
+        let desk = desk.clone();
+        std::thread::spawn(move || {
+            std::thread::sleep(time);
+            desk.close();
+        });
+    }
+
     fn deliver(desk: &Desk, seat: u64, shot: &Shot, detail: Detail) {
         desk.deliver(seat, shot, detail, vec![], 1e4, 0.001, 1);
+    }
+
+    #[test]
+    fn a_change_while_the_state_is_read_is_not_missed() {
+        let desk = Arc::new(Desk::default());
+        let (outbox, _inbox) = mpsc::channel(8);
+        let seat = desk.sit(outbox).expect("free");
+        desk.want(seat, Some(shot(1)));
+        let reads = std::cell::Cell::new(0);
+        let now = || {
+            // The first version appears just after the state was read without it.
+            reads.set(reads.get() + 1);
+            if reads.get() == 1 {
+                desk.wake();
+                return Now { version: 0, ..STILL };
+            }
+            STILL
+        };
+        close_after(&desk, Duration::from_secs(10));
+        assert!(matches!(desk.next(now), Some((_, Task::Picture { .. }))));
+    }
+
+    #[test]
+    fn measurements_wait_for_a_slow_page_and_go_on() {
+        const VIEWS: usize = 20;
+        let desk = Arc::new(Desk::default());
+        let (outbox, mut inbox) = mpsc::channel(4);
+        let seat = desk.sit(outbox).expect("free");
+        desk.score(seat, VIEWS);
+        let page = std::thread::spawn(move || {
+            for _ in 0..VIEWS {
+                std::thread::sleep(Duration::from_millis(2));
+                let _ = inbox.blocking_recv();
+            }
+        });
+        close_after(&desk, Duration::from_secs(10));
+        for expected in 0..VIEWS {
+            let Some((_, Task::Score { view })) = desk.next(|| STILL) else {
+                panic!("view {expected} is never measured");
+            };
+            assert_eq!(view, expected);
+            desk.tell(seat, "score".to_owned());
+        }
+        page.join().expect("all are told");
     }
 
     #[test]

@@ -35,6 +35,9 @@ export class Stage extends HTMLElement {
   /** Shots on the way, by id. @type {Map<number, { camera: Camera, k: Intrinsics, at: number }>} */
   sent = new Map();
   ids = 0;
+  /** Pictures received, and which of them is shown: they may be decoded in another order. */
+  received = 0;
+  newest = 0;
   /** Whether another picture is wanted. */
   dirty = true;
   /** Whether lines and layout must be renewed. */
@@ -223,11 +226,13 @@ export class Stage extends HTMLElement {
 
   /** @param {{ header: Header, jpeg: Blob }} picture */
   async receive({ header, jpeg }) {
+    const order = (this.received += 1);
     const bitmap = await createImageBitmap(jpeg);
     connection.send({ do: "shown", id: header.id });
     const shot = this.sent.get(header.id);
     const current = this.shown?.header?.id ?? 0;
-    if (!shot || !this.served || header.id < current) return bitmap.close();
+    if (!shot || !this.served || order < this.newest) return bitmap.close();
+    this.newest = order;
     this.served.width = bitmap.width;
     this.served.height = bitmap.height;
     this.context?.transferFromImageBitmap(bitmap);

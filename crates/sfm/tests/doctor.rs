@@ -30,6 +30,7 @@ fn examine(world: &World, appearances: &[Appearance], colors: &[Vec<[u8; 3]>]) -
         cameras: &cameras,
         model: found.models.first(),
         zooms: &found.zooms,
+        own_focals: found.own_focals,
         absent: &found.absent,
         apart: found.apart,
         left_out: &found.left_out,
@@ -37,6 +38,7 @@ fn examine(world: &World, appearances: &[Appearance], colors: &[Vec<[u8; 3]>]) -
     let alone = Evidence {
         model: None,
         zooms: &[],
+        own_focals: false,
         absent: &[],
         apart: None,
         left_out: &[],
@@ -246,6 +248,37 @@ fn a_zoom_that_no_metadata_tell_is_named_and_mapped_with_its_own_focal_length() 
     let focal = |group: usize| model.cameras[group].as_ref().expect("used").focal();
     assert!((focal(0) / 870.0 - 1.0).abs() < 0.01, "{}", focal(0));
     assert!((focal(1) / 1305.0 - 1.0).abs() < 0.01, "{}", focal(1));
+}
+
+#[test]
+fn focal_lengths_that_differ_from_photograph_to_photograph_make_as_many_cameras() {
+    let mut rng = irradia_scene::Rng::new(3, 3);
+    let zooms: Vec<f32> = (0..24).map(|_| rng.range(1.0, 1.5)).collect();
+    let first = ring(24, 2500, 0..0).zoomed(0, zooms[0]);
+    let world = (1..24).fold(first, |world, i| world.zoomed(i, zooms[i] / zooms[i - 1]));
+    let found = world.map();
+    let model = &found.models[0];
+    assert!(found.own_focals && model.registered() == 24, "{}", model.registered());
+    for (camera, zoom) in model.cameras.iter().flatten().zip(&zooms) {
+        assert!(
+            (camera.focal() / (870.0 * f64::from(*zoom)) - 1.0).abs() < 0.03,
+            "{camera:?}"
+        );
+    }
+    assert!(world.auc(model, 5.0) > 95.0, "{}", world.auc(model, 5.0));
+    let longest = (0..24)
+        .max_by(|a, b| zooms[*a].total_cmp(&zooms[*b]))
+        .expect("photographs");
+    let mut photos = world.photos.clone();
+    found.regroup(&mut photos);
+    assert!(photos.iter().enumerate().all(|(i, photo)| photo.group == i));
+    let [mapped, _] = plainly(&world);
+    assert!(
+        mapped
+            .iter()
+            .any(|d| matches!(d, Diagnosis::OwnFocals { ends: [_, long], .. } if *long == longest)),
+        "{mapped:?}"
+    );
 }
 
 #[test]

@@ -154,6 +154,7 @@ pub(super) fn examine(
         cameras: &found.cameras,
         model,
         zooms: &found.zooms,
+        own_focals: found.own_focals,
         absent: &found.absent,
         apart: found.apart,
         left_out: &found.left_out,

@@ -44,6 +44,24 @@ pub(super) fn zoom(evidence: &Evidence) -> Vec<Diagnosis> {
     evidence.zooms.iter().map(told).collect()
 }
 
+/// Photographs that became cameras of their own.
+pub(super) fn own_focals(evidence: &Evidence) -> Vec<Diagnosis> {
+    let model = evidence.model.filter(|_| evidence.own_focals);
+    let cameras = model.map_or(&[][..], |model| &model.cameras);
+    let focals = cameras.iter().enumerate();
+    let mut focals: Vec<(f64, usize)> = focals
+        .filter_map(|(photo, camera)| Some((camera.as_ref()?.focal(), photo)))
+        .collect();
+    focals.sort_by(|a, b| a.0.total_cmp(&b.0));
+    match focals[..] {
+        [(least, short), .., (most, long)] => vec![Diagnosis::OwnFocals {
+            ends: [short, long],
+            ratio: most / least,
+        }],
+        _ => Vec::new(),
+    }
+}
+
 /// Cameras of which any focal length fits.
 pub(super) fn focal_unknown(evidence: &Evidence) -> Vec<Diagnosis> {
     let mut found = Vec::new();

@@ -48,6 +48,8 @@ pub struct Evidence<'a> {
     pub model: Option<&'a Model>,
     /// What the mapper found of focal lengths that no metadata tell.
     pub zooms: &'a [Zoom],
+    /// Whether the mapper made each photograph a camera of its own.
+    pub own_focals: bool,
     /// Photographs that should share points of a model and do not.
     pub absent: &'a [Absent],
     /// Models of what the mapper took apart therefore, if it did.
@@ -174,6 +176,7 @@ pub fn diagnose(evidence: &Evidence) -> Vec<Diagnosis> {
     let lens = [
         lens::settings(evidence),
         lens::zoom(evidence),
+        lens::own_focals(evidence),
         lens::focal_unknown(evidence),
     ]
     .concat();

@@ -11,7 +11,7 @@ pub enum Kind {
     Exposure,
     /// [`Diagnosis::FewFeatures`]
     FewFeatures,
-    /// [`Diagnosis::Zoom`] and [`Diagnosis::ZoomSettings`]
+    /// [`Diagnosis::Zoom`], [`Diagnosis::OwnFocals`] and [`Diagnosis::ZoomSettings`]
     Zoom,
     /// [`Diagnosis::FocalUnknown`]
     FocalUnknown,
@@ -110,6 +110,13 @@ pub enum Diagnosis {
         /// The photographs of one focal length.
         photos: Vec<usize>,
         /// That focal length by the one of the others.
+        ratio: f64,
+    },
+    /// The focal lengths differ from photograph to photograph, and no metadata tell.
+    OwnFocals {
+        /// The photographs of the shortest and of the longest.
+        ends: [usize; 2],
+        /// The longest by the shortest.
         ratio: f64,
     },
     /// The metadata name several focal lengths.
@@ -230,7 +237,7 @@ impl Diagnosis {
             Diagnosis::Blurred { .. } => Kind::Blurred,
             Diagnosis::ExposureJump { .. } | Diagnosis::Clipped { .. } => Kind::Exposure,
             Diagnosis::FewFeatures { .. } => Kind::FewFeatures,
-            Diagnosis::Zoom { .. } | Diagnosis::ZoomSettings { .. } => Kind::Zoom,
+            Diagnosis::Zoom { .. } | Diagnosis::OwnFocals { .. } | Diagnosis::ZoomSettings { .. } => Kind::Zoom,
             Diagnosis::FocalUnknown { .. } => Kind::FocalUnknown,
             Diagnosis::SeparateParts { .. } => Kind::SeparateParts,
             Diagnosis::Bridge { .. } | Diagnosis::CutPoint { .. } => Kind::WeakLink,
@@ -266,7 +273,9 @@ impl Diagnosis {
             Diagnosis::ZoomSettings { settings } => settings.iter().flat_map(|s| s.1.clone()).collect(),
             Diagnosis::SeparateParts { parts } => parts.iter().skip(1).flatten().copied().collect(),
             Diagnosis::Bridge { photos, .. } | Diagnosis::Twice { photos } => photos.to_vec(),
-            Diagnosis::Gap { sides: ends, .. } | Diagnosis::OpenLoop { ends, .. } => ends.to_vec(),
+            Diagnosis::Gap { sides: ends, .. }
+            | Diagnosis::OpenLoop { ends, .. }
+            | Diagnosis::OwnFocals { ends, .. } => ends.to_vec(),
             Diagnosis::Contradiction { pairs, .. } => pairs.iter().flatten().copied().collect(),
         }
     }
@@ -370,6 +379,16 @@ impl Display for Sentence<'_> {
                 "{} {} taken with {ratio:.2} times the focal length of the others; do not zoom",
                 self.list(photos),
                 if photos.len() == 1 { "was" } else { "were" }
+            ),
+            Diagnosis::OwnFocals {
+                ends: [short, long],
+                ratio,
+            } => write!(
+                f,
+                "each photograph has a focal length of its own that no metadata tell, {} {ratio:.2} times that of {}: each became a \
+                 camera of its own; do not zoom, and take the pictures as the camera wrote them",
+                name(long),
+                name(short)
             ),
             Diagnosis::ZoomSettings { settings } => {
                 let settings: Vec<String> = settings

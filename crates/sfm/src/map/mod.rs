@@ -41,9 +41,12 @@ use crate::geometry::camera::DCamera;
 use crate::{Features, PairMatches};
 use apart::Parted;
 use tracks::Tracks;
+use zoom::Focals;
 
 /// Settings of a zoom that are told apart, beside the first.
 const MOST_ZOOMS: usize = 3;
+/// The mean error of a model in which each photograph has its own focal length, by that of the one before, at most.
+const OWN_ERROR: f64 = 0.8;
 
 /// Cameras, poses and points from matched features.
 ///
@@ -74,7 +77,15 @@ pub fn reconstruct(
     }
     let mut grouped = photos.to_vec();
     while found.zooms.len() < MOST_ZOOMS {
-        let within = found.models.first().and_then(|m| zoom::find(&grouped, features, m));
+        let within = match found.models.first().map(|m| zoom::find(&grouped, features, m)) {
+            Some(Focals::Own) if found.zooms.is_empty() => {
+                let own = with_own_focals(photos, features, pairs, &found, options, progress);
+                found = own.unwrap_or(found);
+                break;
+            }
+            Some(Focals::Parted(zoom)) => Some(zoom),
+            _ => None,
+        };
         let Some(zoom) = within.or_else(|| zoom::between(&grouped, &found.models)) else {
             break;
         };
@@ -102,6 +113,33 @@ pub fn reconstruct(
         }
     }
     found
+}
+
+/// Another mapping with each photograph as a camera of its own, that starts with the focal length of its camera in `found`; `None` if
+/// the errors do not fall by as much as where that is right.
+fn with_own_focals(
+    photos: &[PhotoInfo],
+    features: &[Features],
+    pairs: &[PairMatches],
+    found: &Reconstruction,
+    options: &MapOptions,
+    progress: &mut dyn FnMut(Progress),
+) -> Option<Reconstruction> {
+    let shared = found.models.first()?;
+    let first = |photo: &PhotoInfo| {
+        let focal = shared.cameras[photo.group].as_ref()?.focal();
+        Some((DCamera::centered(photo.width, photo.height, focal), Source::Guess))
+    };
+    let cameras: Vec<_> = photos.iter().map(first).collect();
+    let each = photos.iter().cloned().enumerate();
+    let each: Vec<PhotoInfo> = each.map(|(group, photo)| PhotoInfo { group, ..photo }).collect();
+    let own = mapped(&each, features, pairs, &cameras, options, progress);
+    let model = own.models.first()?;
+    let better = model.registered() >= shared.registered() && model.mean_error() < OWN_ERROR * shared.mean_error();
+    better.then_some(Reconstruction {
+        own_focals: true,
+        ..own
+    })
 }
 
 /// Photographs of the largest model, and what its points explain of them.
@@ -152,6 +190,7 @@ fn mapped(
         pairs: verified,
         cameras,
         zooms: Vec::new(),
+        own_focals: false,
         absent,
         apart,
     }
@@ -188,6 +227,7 @@ pub fn extend(
         pairs: verified,
         cameras,
         zooms: Vec::new(),
+        own_focals: false,
         apart: None,
     }
 }

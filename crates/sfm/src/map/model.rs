@@ -149,6 +149,18 @@ impl<'a> Working<'a> {
         self.points.iter().flatten().count()
     }
 
+    /// Observations that belong to points.
+    pub fn used_count(&self) -> usize {
+        self.used.iter().filter(|used| **used).count()
+    }
+
+    /// The fraction of the tracked observations in registered photographs that belong to points.
+    pub fn explained(&self) -> f64 {
+        let registered = (0..self.poses.len()).filter(|photo| self.poses[*photo].is_some());
+        let shown: usize = registered.map(|photo| self.tracks.of_photo[photo].len()).sum();
+        self.used_count() as f64 / shown.max(1) as f64
+    }
+
     /// Observations of a photograph, and of those on its rig, that belong to points.
     pub fn used_in(&self, photo: usize) -> usize {
         let observations = self.rigs[photo].iter().flat_map(|p| &self.tracks.of_photo[*p]);

@@ -15,6 +15,9 @@ const LOSS: Loss = Loss::Cauchy(1.0);
 /// Observations of a photograph, from long tracks, that an adjustment needs while the model grows.
 const ENOUGH: usize = 300;
 
+/// Registered photographs from which on the focal length of each camera is adjusted, even of one with a single photograph.
+const ANCHORED: usize = 5;
+
 /// Squared error, px^2, that one deviation of an intrinsic parameter is worth: that of ten observations off by a
 /// pixel.
 const BELIEF: f64 = 10.0;
@@ -49,7 +52,7 @@ impl Working<'_> {
             problem.cameras.push(AdjustedCamera {
                 camera: self.cameras[group],
                 freedom: self.freedom(group, extent),
-                belief: belief(&self.cameras[group], self.first_focals[group]),
+                belief: self.belief(group),
             });
         }
         self.add_points(&mut problem, &chosen, |_| false, &view_of);
@@ -114,6 +117,15 @@ impl Working<'_> {
             .iter()
             .map(|c| AdjustedCamera::new(*c, Freedom::HELD))
             .collect();
+        let group = self.photos[photo].group;
+        let adjusts_focal = self.is_alone(photo) && self.registered() >= ANCHORED && !self.held_cameras[group];
+        if adjusts_focal {
+            problem.cameras[group] = AdjustedCamera {
+                freedom: self.freedom(group, Extent::Growing),
+                belief: self.belief(group),
+                ..problem.cameras[group]
+            };
+        }
         self.add_points(&mut problem, &tracks, |track| !variable[track], &view_of);
         problem.solve(&AdjustOptions {
             loss: GROWING_LOSS,
@@ -126,7 +138,31 @@ impl Working<'_> {
         for (track, point) in tracks.iter().zip(&problem.points) {
             self.points[*track] = Some(*point);
         }
+        if adjusts_focal {
+            self.take_camera(group, problem.cameras[group].camera);
+            self.undistort();
+        }
         self.filter(&tracks);
+    }
+
+    /// Whether no other photograph of the camera of `photo` is registered.
+    pub(super) fn is_alone(&self, photo: usize) -> bool {
+        let group = self.photos[photo].group;
+        (0..self.poses.len()).all(|p| p == photo || self.poses[p].is_none() || self.photos[p].group != group)
+    }
+
+    /// Whether nothing tells the focal lengths of several cameras.
+    pub(super) fn has_open_focals(&self) -> bool {
+        let open = |group: &usize| self.sources[*group] == Source::Guess && !self.held_cameras[*group];
+        (0..self.sources.len()).filter(open).count() > 1
+    }
+
+    /// Multiplies the focal length of a group.
+    pub(super) fn scale_focal(&mut self, group: usize, factor: f64) {
+        for focal in &mut self.cameras[group].parameters[..2] {
+            *focal *= factor;
+        }
+        self.undistort();
     }
 
     /// The first registered photograph of each rig; a photograph on none leads itself.
@@ -234,7 +270,12 @@ impl Working<'_> {
             .filter(|p| self.poses[*p].is_some() && self.photos[*p].group == group)
             .count();
         let full = extent != Extent::Growing && count >= self.options.full_lens_photos;
-        let least = if self.sources[group] == Source::Prior { 4 } else { 3 };
+        // Others anchor the points of a camera with few photographs.
+        let least = match self.sources[group] {
+            _ if self.registered() >= ANCHORED => 1,
+            Source::Prior => 4,
+            Source::Pairs | Source::Guess => 3,
+        };
         Freedom {
             focal: match (self.focal_held[group] || count < least, full) {
                 (true, _) => Focal::Held,
@@ -252,6 +293,17 @@ impl Working<'_> {
         }
     }
 
+    /// What is believed of a group's camera.
+    fn belief(&self, group: usize) -> Belief {
+        // Of several cameras of which nothing tells the focal length, each may have any.
+        let focal = if self.has_open_focals() && self.sources[group] == Source::Guess {
+            1.0
+        } else {
+            0.5
+        };
+        belief(&self.cameras[group], self.first_focals[group], focal)
+    }
+
     /// Takes an adjusted camera, unless its values are not those of a camera.
     fn take_camera(&mut self, group: usize, camera: DCamera) {
         let long_side = f64::from(camera.width.max(camera.height));
@@ -266,11 +318,11 @@ impl Working<'_> {
 }
 
 /// What is known of cameras in general, so that what a set of photographs does not determine stays where it usually is:
-/// square pixels, a principal point near the centre, a weak lens, a focal length near the first one.
-fn belief(camera: &DCamera, first_focal: f64) -> Belief {
+/// square pixels, a principal point near the centre, a weak lens, a focal length within `focal` of the first one.
+fn belief(camera: &DCamera, first_focal: f64, focal: f64) -> Belief {
     let long_side = f64::from(camera.width.max(camera.height));
     let deviations = [
-        0.5 * first_focal,
+        focal * first_focal,
         0.002,
         0.01 * long_side,
         0.01 * long_side,

@@ -178,6 +178,8 @@ pub struct Reconstruction {
     pub cameras: Vec<(DCamera, Source)>,
     /// Photographs of one group that turned out to have two focal lengths: each `Zoom` makes a further group.
     pub zooms: Vec<Zoom>,
+    /// Whether each photograph became a group of its own, because each has a focal length of its own that no metadata tell.
+    pub own_focals: bool,
     /// Pairs that share next to nothing, though by their poses in the largest model they see the same, or in the one that was taken apart, those with most
     /// expected points first.
     pub absent: Vec<Absent>,
@@ -198,6 +200,10 @@ impl Reconstruction {
 
     /// Puts photographs that were zoomed into the groups by which `cameras` and those of the models are numbered.
     pub fn regroup(&self, photos: &mut [PhotoInfo]) {
+        if self.own_focals {
+            let groups = photos.iter_mut().enumerate();
+            groups.for_each(|(group, photo)| photo.group = group);
+        }
         for zoom in &self.zooms {
             zoom.photos.iter().for_each(|photo| photos[*photo].group = zoom.group);
         }

@@ -177,6 +177,28 @@ impl World {
         self
     }
 
+    /// With each photograph cut around its middle to a size of its own, of `keep` times the first: each has a camera of its own.
+    pub fn cut(mut self, keep: impl Fn(usize) -> f64) -> Self {
+        for (i, (photo, features)) in self.photos.iter_mut().zip(&mut self.features).enumerate() {
+            let side = |side: u32| (f64::from(side) * keep(i) / 2.0).round() as u32 * 2;
+            (photo.width, photo.height, photo.group) = (side(CAMERA.width), side(CAMERA.height), i);
+            for k in &mut features.keypoints {
+                k.x -= 0.5 * (CAMERA.width - photo.width) as f32;
+                k.y -= 0.5 * (CAMERA.height - photo.height) as f32;
+            }
+        }
+        for pair in &mut self.pairs {
+            let seen = |side: usize, keypoint: u32| {
+                let photo = pair.photos[side] as usize;
+                let k = &self.features[photo].keypoints[keypoint as usize];
+                let PhotoInfo { width, height, .. } = self.photos[photo];
+                (0.0..width as f32).contains(&k.x) && (0.0..height as f32).contains(&k.y)
+            };
+            pair.matches.retain(|m| seen(0, m[0]) && seen(1, m[1]));
+        }
+        self
+    }
+
     /// Both worlds, without matches between them; the second is another camera.
     pub fn and(mut self, other: Self) -> Self {
         let shift = self.photos.len() as u32;

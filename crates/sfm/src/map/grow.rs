@@ -24,9 +24,11 @@ const SEED_POINTS: usize = 12;
 /// Inliers among the points a photograph shows: those with fewer wait until the others are registered and all is adjusted.
 const STRICT: f64 = 0.5;
 const LENIENT: f64 = 0.25;
-/// Focal lengths tried for the first photograph of a camera, by the one it has: steps of 15 %, from 0.6 to 3.2 long sides where that
-/// is a guess.
-const FOCALS: [f64; 13] = [0.5, 0.57, 0.66, 0.76, 0.87, 1.0, 1.15, 1.32, 1.52, 1.75, 2.0, 2.3, 2.65];
+/// Focal lengths tried for the first photograph of a camera, by the one it has: steps of 15 %, from 0.5 to 4.8 long sides where that
+/// is a guess. The best must lie between the ends: a wrong pose far away, with a long focal length, has no minimum.
+const FOCALS: [f64; 17] = [
+    0.43, 0.5, 0.57, 0.66, 0.76, 0.87, 1.0, 1.15, 1.32, 1.52, 1.75, 2.0, 2.3, 2.65, 3.05, 3.5, 4.0,
+];
 /// Rounds of adjustment, filtering and triangulation at the end.
 const LAST_ROUNDS: usize = 3;
 
@@ -273,9 +275,9 @@ impl Working<'_> {
         // Metadata of a picture that was cut later are wrong.
         if found.is_none() && first {
             let any = FOCALS.into_iter().filter_map(solved);
-            found = any
-                .min_by(|(.., a), (.., b)| a.cost.total_cmp(&b.cost))
-                .filter(|(.., found)| agrees(found));
+            let best = any.min_by(|(.., a), (.., b)| a.cost.total_cmp(&b.cost));
+            let between = |longer: f64| longer > FOCALS[0] && longer < FOCALS[FOCALS.len() - 1];
+            found = best.filter(|(longer, _, found)| between(*longer) && agrees(found));
         }
         let Some((longer, problem, found)) = found else {
             return false;

@@ -15,7 +15,7 @@ use glam::{DVec2, DVec3};
 /// Seeds tried for one model.
 const SEEDS: usize = 12;
 /// Fraction of what its photographs show that a model explains, where focal lengths are open. Those that are right explain 0.88 to
-/// 0.99 of twelve captures cut to sizes of their own, and 0.74 of a clock with three models; wrong ones 0.06 to 0.67.
+/// 1.00 of six captures cut in ten ways, and 0.74 of a clock with three models; wrong ones 0.06 to 0.67.
 const EXPLAINED: f64 = 0.8;
 /// Times a photograph is tried before it is given up.
 const TRIES: usize = 3;
@@ -69,7 +69,8 @@ pub(super) fn model<'a>(
         {
             best = Some((grown, failures));
         }
-        let suffices = |best: &Working| 2 * best.registered() > reachable && (!open || best.explained() > EXPLAINED);
+        let suffices =
+            |best: &Working| 2 * best.registered() > reachable && (!open || best.explained_fraction() > EXPLAINED);
         if best.as_ref().is_some_and(|(best, _)| suffices(best)) {
             break;
         }
@@ -266,7 +267,7 @@ impl Working<'_> {
         let least = self.options.min_registration_inliers as f64;
         let agrees = |found: &Estimate<DPose>| found.inliers as f64 >= least.max(ratio * seen.len() as f64);
         let group = self.photos[photo].group;
-        let first = self.is_alone(photo) && !self.held_cameras[group];
+        let first = self.registered_of(group) == 0 && !self.held_cameras[group];
         let mut found = if first && self.sources[group] == Source::Guess {
             None
         } else {

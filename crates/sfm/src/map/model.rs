@@ -144,6 +144,12 @@ impl<'a> Working<'a> {
         self.poses.iter().flatten().count()
     }
 
+    /// Number of registered photographs of a camera.
+    pub fn registered_of(&self, group: usize) -> usize {
+        let posed = self.photos.iter().zip(&self.poses).filter(|(_, pose)| pose.is_some());
+        posed.filter(|(photo, _)| photo.group == group).count()
+    }
+
     /// Number of points.
     pub fn point_count(&self) -> usize {
         self.points.iter().flatten().count()
@@ -155,7 +161,7 @@ impl<'a> Working<'a> {
     }
 
     /// The fraction of the tracked observations in registered photographs that belong to points.
-    pub fn explained(&self) -> f64 {
+    pub fn explained_fraction(&self) -> f64 {
         let registered = (0..self.poses.len()).filter(|photo| self.poses[*photo].is_some());
         let shown: usize = registered.map(|photo| self.tracks.of_photo[photo].len()).sum();
         self.used_count() as f64 / shown.max(1) as f64

@@ -118,10 +118,15 @@ impl Working<'_> {
             .map(|c| AdjustedCamera::new(*c, Freedom::HELD))
             .collect();
         let group = self.photos[photo].group;
-        let adjusts_focal = self.is_alone(photo) && self.registered() >= ANCHORED && !self.held_cameras[group];
-        if adjusts_focal {
+        // A camera of its own has no other photograph that its adjustment could harm.
+        let freedom = if self.registered_of(group) == 1 {
+            self.freedom(group, Extent::Growing)
+        } else {
+            Freedom::HELD
+        };
+        if freedom != Freedom::HELD {
             problem.cameras[group] = AdjustedCamera {
-                freedom: self.freedom(group, Extent::Growing),
+                freedom,
                 belief: self.belief(group),
                 ..problem.cameras[group]
             };
@@ -138,17 +143,11 @@ impl Working<'_> {
         for (track, point) in tracks.iter().zip(&problem.points) {
             self.points[*track] = Some(*point);
         }
-        if adjusts_focal {
+        if freedom != Freedom::HELD {
             self.take_camera(group, problem.cameras[group].camera);
             self.undistort();
         }
         self.filter(&tracks);
-    }
-
-    /// Whether no other photograph of the camera of `photo` is registered.
-    pub(super) fn is_alone(&self, photo: usize) -> bool {
-        let group = self.photos[photo].group;
-        (0..self.poses.len()).all(|p| p == photo || self.poses[p].is_none() || self.photos[p].group != group)
     }
 
     /// Whether nothing tells the focal lengths of several cameras.
@@ -266,9 +265,7 @@ impl Working<'_> {
         if self.held_cameras[group] {
             return Freedom::HELD;
         }
-        let count = (0..self.poses.len())
-            .filter(|p| self.poses[*p].is_some() && self.photos[*p].group == group)
-            .count();
+        let count = self.registered_of(group);
         let full = extent != Extent::Growing && count >= self.options.full_lens_photos;
         // Others anchor the points of a camera with few photographs.
         let least = match self.sources[group] {

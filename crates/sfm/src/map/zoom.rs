@@ -8,8 +8,8 @@
 //!
 //! Where focal lengths differ from photograph to photograph instead, as in pictures of many cameras scaled to one size, each photograph
 //! becomes a camera of its own. With each of four captures cut to 65 to 100 % of its width and scaled back, the cost falls by 35 to 70 % and
-//! the focal lengths are 8 to 14 % from their median; as they are, by at most 8 % and 2.3 %, in
-//! twenty captures.
+//! the focal lengths are 8 to 14 % from their median; in twenty captures as they are,
+//! by at most 8 % and 2.3 %.
 
 use super::readjust::{self, posed};
 use super::types::{Model, PhotoInfo, Zoom};

@@ -167,14 +167,7 @@ impl World {
                 k.y = center[1] + ratio * (k.y - center[1]);
             }
         }
-        for pair in &mut self.pairs {
-            let seen = |side: usize, keypoint: u32| {
-                let k = &self.features[pair.photos[side] as usize].keypoints[keypoint as usize];
-                (0.0..CAMERA.width as f32).contains(&k.x) && (0.0..CAMERA.height as f32).contains(&k.y)
-            };
-            pair.matches.retain(|m| seen(0, m[0]) && seen(1, m[1]));
-        }
-        self
+        self.without_what_left()
     }
 
     /// With each photograph cut around its middle to a size of its own, of `keep` times the first: each has a camera of its own.
@@ -187,6 +180,11 @@ impl World {
                 k.y -= 0.5 * (CAMERA.height - photo.height) as f32;
             }
         }
+        self.without_what_left()
+    }
+
+    /// Without the matches of keypoints outside their photographs.
+    fn without_what_left(mut self) -> Self {
         for pair in &mut self.pairs {
             let seen = |side: usize, keypoint: u32| {
                 let photo = pair.photos[side] as usize;

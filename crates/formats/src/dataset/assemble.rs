@@ -263,7 +263,7 @@ impl Finishing<'_> {
     fn views(&self, view: DeclaredView, probed: &Probed) -> Vec<View> {
         match &probed.cut {
             None => self.view(&view, probed, None).into_iter().collect(),
-            Some(Cut::Whole(plan)) => self.view(&view, probed, Some(*plan)).into_iter().collect(),
+            Some(Cut::Whole(plan)) => self.view(&view, probed, Some(**plan)).into_iter().collect(),
             Some(Cut::Faces(faces)) => faces
                 .iter()
                 .filter_map(|(name, plan)| {

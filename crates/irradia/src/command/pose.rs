@@ -8,15 +8,15 @@ use clap::builder::RangedU64ValueParser;
 use indicatif::{ProgressBar, ProgressStyle};
 use irradia_runs::formats::DatasetFormat;
 use irradia_runs::scene::Dataset;
-use irradia_runs::{Finding, KnownDistance, Mapper, PoseInput, PoseProgress, PoseReport, TrainInput, is_capture, pose};
+use irradia_runs::{
+    ENOUGH_POSED, Finding, KnownDistance, Mapper, PoseInput, PoseProgress, PoseReport, TrainInput, is_capture, pose,
+};
 use std::collections::HashSet;
 use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
 use std::time::{Duration, Instant};
 
-/// Photographs with a pose, of all, below which a training does not begin.
-const ENOUGH: f64 = 0.8;
 /// Findings of one kind that are told in full.
 const TOLD: usize = 5;
 /// Interval of plain lines.
@@ -110,7 +110,7 @@ pub fn pose_first(input: &mut TrainInput, poses: Poses, anyway: bool) -> Result<
     ));
     let report = pose_into_run(input, poses)?;
     let posed = &input.data;
-    if report.fraction() < ENOUGH && !anyway {
+    if report.fraction() < ENOUGH_POSED && !anyway {
         let reasons: Vec<&str> = report
             .findings
             .iter()
@@ -147,7 +147,7 @@ pub fn pose_again(input: &mut TrainInput, dataset: &Dataset, poses: Poses, anywa
         names.filter(|name| left_out.contains(name.as_str())).count()
     };
     let (train, test) = (lost(&dataset.train), lost(&dataset.test));
-    if !anyway && (test > 0 || train as f64 > (1.0 - ENOUGH) * dataset.train.len() as f64) {
+    if !anyway && (test > 0 || train as f64 > (1.0 - ENOUGH_POSED) * dataset.train.len() as f64) {
         return Err(Usage(format!(
             "{train} of {} training views and {test} of {} held-out ones find no pose again; train with --poses given, or --anyway on the others",
             dataset.train.len(),

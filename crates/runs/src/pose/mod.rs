@@ -6,9 +6,10 @@
 //! sparse/0/*.bin   cameras, poses and points with tracks, in COLMAP's format; further models in sparse/1, ..
 //! pose.json        what happened: numbers, times, and each photograph left out with its reason
 //! doctor.html      what is wrong with the capture, and where to take further photographs; doctor.json and doctor/*.png belong to it
-//! features.bin     features and matches, which are reused as long as photographs do not change
+//! features.bin     features and matches, which are reused as long as photographs do not change; features-more.bin, where they had to be more
 //! ```
 
+mod attempt;
 mod capture;
 mod check;
 mod colmap;
@@ -22,11 +23,11 @@ mod store;
 
 use crate::RunError;
 use crate::folder::to_json;
+use attempt::Attempt;
 use capture::Capture;
 use irradia_formats::{PhotoFolder, write_atomic};
 use irradia_sfm::doctor::Kind;
-use irradia_sfm::map::{MapOptions, PhotoInfo, Progress, Reconstruction, extend, reconstruct};
-use irradia_sfm::matching::PairOptions;
+use irradia_sfm::map::{MapOptions, PhotoInfo, Reconstruction};
 use serde::Serialize;
 use stages::Work;
 use std::fs;
@@ -38,6 +39,8 @@ pub use check::{PoseCheck, check_poses};
 pub use doctor::{DoctorInput, DoctorReport, Finding, doctor};
 use film::is_film;
 
+/// The fraction of the photographs that should have a pose: below it, more features are tried, and no training begins unasked.
+pub const ENOUGH_POSED: f64 = 0.8;
 /// Fewer photographs make no dataset.
 const MIN_PHOTOS: usize = 3;
 /// Frames after each frame of a film that it is matched with in any case.
@@ -206,7 +209,8 @@ pub struct StageReport {
     pub seconds: f64,
 }
 
-/// Finds the poses of photographs and writes them as a dataset. Features and matches of an earlier call are reused. The result
+/// Finds the poses of photographs and writes them as a dataset. Features and matches of an earlier call are reused. Where fewer than [`ENOUGH_POSED`] of
+/// the photographs have a pose at first, and `max_features` is not given, it tries again with twice as many, and the larger model counts. The result
 /// depends neither on the number of threads nor on the order of the files.
 ///
 /// # Errors
@@ -273,42 +277,30 @@ pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Resu
         return Ok(report);
     }
 
-    let mut work = Work::new(input.max_features, Some(out), folder, progress);
-    work.find_features()?;
-    clock.end("features");
-    let pair_options = PairOptions {
-        successors: if capture.has_films { FILM_SUCCESSORS } else { 0 },
-        ..PairOptions::default()
-    };
-    let mut pairs = work.match_pairs(&pair_options)?;
-    clock.end("matches");
-
-    progress(PoseProgress::Stage {
-        name: "poses",
-        of: work.photos().len(),
-    });
-    let mut infos = capture.infos(work.photos());
-    let mut tell = |event| {
-        if let Progress::Registered { photos, .. } = event {
-            progress(PoseProgress::Done(photos));
-        }
-    };
     let is_new = known.is_none();
-    let mut reconstruction = match known {
-        None => reconstruct(&infos, work.features(), &pairs, &input.mapping, &mut tell),
-        Some(known) => {
-            let known = known.of(&mut infos)?;
-            extend(&infos, work.features(), &pairs, &known, &input.mapping, &mut tell)
+    let work = Work::new(input.max_features, Some(out), folder, progress);
+    let mut attempt = Attempt::make(work, input, &capture, known, &mut clock, progress)?;
+    if is_new
+        && input.max_features.is_none()
+        && let Some(work) = attempt.with_more_features(out)
+    {
+        progress(PoseProgress::Warned(format!(
+            "{} of {} photographs have a pose: trying again with up to {} features of each",
+            attempt.registered(),
+            folder.photos.len(),
+            work.max_features()
+        )));
+        let again = Attempt::make(work, input, &capture, None, &mut clock, progress)?;
+        if again.registered() > attempt.registered() {
+            attempt = again;
         }
-    };
-    let unmatched = reconstruction.absent_and_unmatched(&pairs);
-    if is_new && !unmatched.is_empty() {
-        // Of many photographs not all pairs are matched: where too much is absent, the rest must be as well.
-        let mut all: Vec<[u32; 2]> = pairs.iter().map(|pair| pair.photos).chain(unmatched).collect();
-        all.sort_unstable();
-        pairs = work.matches_of(all)?;
-        reconstruction = reconstruct(&infos, work.features(), &pairs, &input.mapping, &mut tell);
     }
+    let Attempt {
+        work,
+        mut infos,
+        pairs,
+        mut reconstruction,
+    } = attempt;
     reconstruction.regroup(&mut infos);
     let scale = match reconstruction.models.first_mut() {
         // What is known keeps its unit.
@@ -419,11 +411,13 @@ impl Clock {
         }
     }
 
+    /// Counts the time since the last stage's end for `name`.
     fn end(&mut self, name: &'static str) {
-        self.stages.push(StageReport {
-            name,
-            seconds: self.last.elapsed().as_secs_f64(),
-        });
+        let seconds = self.last.elapsed().as_secs_f64();
+        match self.stages.iter_mut().find(|stage| stage.name == name) {
+            Some(stage) => stage.seconds += seconds,
+            None => self.stages.push(StageReport { name, seconds }),
+        }
         self.last = Instant::now();
     }
 }

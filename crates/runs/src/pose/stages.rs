@@ -13,8 +13,9 @@ use std::collections::HashSet;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicUsize, Ordering};
 
-/// The file of features and matches.
+/// The file of features and matches, and of more of them.
 const STORE: &str = "features.bin";
+const STORE_OF_MORE: &str = "features-more.bin";
 
 /// Photographs up to which each has so many features, since a scene of few photographs has few points otherwise, and matching them costs little: splats
 /// that begin from them end 0.7 dB better on lund_door, 12 photographs.
@@ -56,11 +57,32 @@ impl<'a> Work<'a> {
         folder: &'a PhotoFolder,
         progress: &'a (dyn Fn(PoseProgress) + Sync),
     ) -> Self {
+        let most = max_features(wanted, folder.photos.len());
+        Self::with(most, out.map(|out| out.join(STORE)), folder, progress)
+    }
+
+    /// The same photographs with twice the features, if half of those `left_out` or more have as many as were allowed.
+    pub fn with_more_features(&self, left_out: impl Iterator<Item = usize>, out: &Path) -> Option<Self> {
+        let most = self.sift.max_features;
+        let (mut full, mut all) = (0, 0);
+        for photo in left_out {
+            full += usize::from(self.features[photo].keypoints.len() >= most);
+            all += 1;
+        }
+        let has_more = all > 0 && 2 * full >= all;
+        has_more.then(|| Self::with(2 * most, Some(out.join(STORE_OF_MORE)), self.folder, self.progress))
+    }
+
+    fn with(
+        max_features: usize,
+        path: Option<PathBuf>,
+        folder: &'a PhotoFolder,
+        progress: &'a (dyn Fn(PoseProgress) + Sync),
+    ) -> Self {
         let sift = Sift {
-            max_features: max_features(wanted, folder.photos.len()),
+            max_features,
             ..Sift::default()
         };
-        let path = out.map(|out| out.join(STORE));
         let settings = [
             sift.max_side,
             sift.max_features as u32,
@@ -88,6 +110,11 @@ impl<'a> Work<'a> {
         };
         work.warn(warning);
         work
+    }
+
+    /// The most features of a photograph.
+    pub fn max_features(&self) -> usize {
+        self.sift.max_features
     }
 
     fn warn(&mut self, warning: Option<String>) {

@@ -314,6 +314,39 @@ fn folders_without_enough_photographs_have_one_clear_outcome() {
     refused(&film, &["film.mp4", "ffmpeg"]);
 }
 
+/// Noise has more features than are allowed and none that match; a smaller picture of it has few.
+#[test]
+fn photographs_without_poses_are_searched_for_more_features_where_there_are_more() {
+    let folder = tempfile::tempdir().unwrap();
+    let tries = |name: &str, side: u32, max_features: Option<usize>| {
+        let photos = folder.path().join(format!("{name}-photos"));
+        let out = folder.path().join(name);
+        fs::create_dir(&photos).unwrap();
+        for i in 0..3 {
+            let mut rng = Rng::new(i, 1);
+            let noise: Vec<u8> = (0..side * side).map(|_| rng.range(0.0, 256.0) as u8).collect();
+            write_png(&photos.join(format!("{i}.png")), side, side, 1, &noise).unwrap();
+        }
+        let input = PoseInput {
+            max_features,
+            ..PoseInput::new(&photos, &out)
+        };
+        let told = std::sync::Mutex::new(Vec::new());
+        let progress = |event| {
+            if let PoseProgress::Warned(warning) = event {
+                told.lock().unwrap().push(warning);
+            }
+        };
+        pose(&input, &progress).unwrap_err();
+        (told.into_inner().unwrap(), out.join("features-more.bin").exists())
+    };
+    let (told, is_kept) = tries("noise", 1600, None);
+    assert!(is_kept && told.len() == 1, "{told:?}");
+    assert!(told[0].contains("0 of 3") && told[0].contains("16384"), "{told:?}");
+    assert_eq!(tries("small", 120, None), (Vec::new(), false));
+    assert_eq!(tries("asked", 400, Some(300)), (Vec::new(), false));
+}
+
 #[test]
 fn photographs_of_two_scenes_a_copy_and_a_text_file_have_one_clear_outcome() {
     let (Some(door), Some(fern)) = (shared("data/lund_door/images"), shared("data/fern/images_8")) else {

@@ -1,0 +1,93 @@
+//! From photographs to models, once with so many features.
+
+use super::capture::Capture;
+use super::known::KnownPoses;
+use super::stages::Work;
+use super::{Clock, ENOUGH_POSED, FILM_SUCCESSORS, PoseInput, PoseProgress};
+use crate::RunError;
+use irradia_sfm::PairMatches;
+use irradia_sfm::map::{MapOptions, PhotoInfo, Progress, Reconstruction, extend, reconstruct};
+use irradia_sfm::matching::PairOptions;
+use std::path::Path;
+
+/// What was found.
+pub(super) struct Attempt<'a> {
+    pub work: Work<'a>,
+    /// Of the photographs that have features.
+    pub infos: Vec<PhotoInfo>,
+    pub pairs: Vec<PairMatches>,
+    pub reconstruction: Reconstruction,
+}
+
+impl<'a> Attempt<'a> {
+    /// Features, matches and models of the photographs of `work`, or poses for those that are not `known`.
+    pub fn make(
+        mut work: Work<'a>,
+        input: &PoseInput,
+        capture: &Capture,
+        known: Option<KnownPoses>,
+        clock: &mut Clock,
+        progress: &(dyn Fn(PoseProgress) + Sync),
+    ) -> Result<Self, RunError> {
+        work.find_features()?;
+        clock.end("features");
+        let pair_options = PairOptions {
+            successors: if capture.has_films { FILM_SUCCESSORS } else { 0 },
+            ..PairOptions::default()
+        };
+        let mut pairs = work.match_pairs(&pair_options)?;
+        clock.end("matches");
+
+        progress(PoseProgress::Stage {
+            name: "poses",
+            of: work.photos().len(),
+        });
+        let mut infos = capture.infos(work.photos());
+        let mut tell = |event| {
+            if let Progress::Registered { photos, .. } = event {
+                progress(PoseProgress::Done(photos));
+            }
+        };
+        let options: &MapOptions = &input.mapping;
+        let is_new = known.is_none();
+        let mut reconstruction = match known {
+            None => reconstruct(&infos, work.features(), &pairs, options, &mut tell),
+            Some(known) => {
+                let known = known.of(&mut infos)?;
+                extend(&infos, work.features(), &pairs, &known, options, &mut tell)
+            }
+        };
+        let unmatched = reconstruction.absent_and_unmatched(&pairs);
+        if is_new && !unmatched.is_empty() {
+            // Of many photographs not all pairs are matched: where too much is absent, the rest must be as well.
+            let mut all: Vec<[u32; 2]> = pairs.iter().map(|pair| pair.photos).chain(unmatched).collect();
+            all.sort_unstable();
+            pairs = work.matches_of(all)?;
+            reconstruction = reconstruct(&infos, work.features(), &pairs, options, &mut tell);
+        }
+        clock.end("poses");
+        Ok(Self {
+            work,
+            infos,
+            pairs,
+            reconstruction,
+        })
+    }
+
+    /// Photographs with a pose in the largest model.
+    pub fn registered(&self) -> usize {
+        self.reconstruction.models.first().map_or(0, |model| model.registered())
+    }
+
+    /// The same photographs, to be searched for more features, if too few of them have a pose and more can be found in most of the others. Parts that look
+    /// alike and are mapped apart would only be taken for one another again.
+    pub fn with_more_features(&self, out: &Path) -> Option<Work<'a>> {
+        let photos = self.work.photos().len();
+        if self.registered() as f64 >= ENOUGH_POSED * photos as f64 || self.reconstruction.apart.is_some() {
+            return None;
+        }
+        let posed = self.reconstruction.models.first().map(|model| &model.poses);
+        let left_out = (0..photos).filter(|i| posed.is_none_or(|poses| poses[*i].is_none()));
+        self.work.with_more_features(left_out, out)
+    }
+}

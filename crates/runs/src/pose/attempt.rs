@@ -3,12 +3,15 @@
 use super::capture::Capture;
 use super::known::KnownPoses;
 use super::stages::Work;
-use super::{Clock, ENOUGH_POSED, FILM_SUCCESSORS, PoseInput, PoseProgress};
+use super::{Clock, ENOUGH_POSED, PoseInput, PoseProgress};
 use crate::RunError;
 use irradia_sfm::PairMatches;
-use irradia_sfm::map::{MapOptions, PhotoInfo, Progress, Reconstruction, extend, reconstruct};
+use irradia_sfm::map::{PhotoInfo, Progress, Reconstruction, extend, reconstruct};
 use irradia_sfm::matching::PairOptions;
 use std::path::Path;
+
+/// Frames after each frame of a film that it is matched with in any case.
+const FILM_SUCCESSORS: usize = 10;
 
 /// What was found.
 pub(super) struct Attempt<'a> {
@@ -48,7 +51,7 @@ impl<'a> Attempt<'a> {
                 progress(PoseProgress::Done(photos));
             }
         };
-        let options: &MapOptions = &input.mapping;
+        let options = &input.mapping;
         let is_new = known.is_none();
         let mut reconstruction = match known {
             None => reconstruct(&infos, work.features(), &pairs, options, &mut tell),

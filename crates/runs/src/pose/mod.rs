@@ -43,8 +43,6 @@ use film::is_film;
 pub const ENOUGH_POSED: f64 = 0.8;
 /// Fewer photographs make no dataset.
 const MIN_PHOTOS: usize = 3;
-/// Frames after each frame of a film that it is matched with in any case.
-const FILM_SUCCESSORS: usize = 10;
 /// The report's name.
 const REPORT: &str = "pose.json";
 

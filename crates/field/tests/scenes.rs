@@ -221,3 +221,31 @@ fn skipping_keeps_every_occupied_sample_in_place() {
     }
     assert!(found > 50, "only {found} samples tested");
 }
+
+#[test]
+fn what_is_empty_is_reported_as_large_as_it_is_aligned() {
+    use irradia_field::sample::occupancy::Cell;
+    // 40 cells per side: the last blocks of 16 stick out.
+    let side = 40;
+    let mut density = vec![0.0; side * side * side];
+    density[side * side * 3 + side * 2 + 1] = 1.0;
+    let mut grid = OccupancyGrid::from_density(side, density).expect("a multiple of four");
+    grid.threshold(0.01, |_| 1.0);
+    let at = |cell: [usize; 3]| grid.at(cell.map(|c| (c as f32 + 0.5) / side as f32));
+    assert_eq!(at([1, 2, 3]), Cell::Occupied);
+    for (cell, cells) in [
+        ([0, 2, 3], 1),
+        ([3, 3, 3], 1),
+        ([4, 2, 3], 4),
+        ([15, 15, 15], 4),
+        ([16, 2, 3], 16),
+        ([39, 39, 39], 16),
+    ] {
+        assert_eq!(at(cell), Cell::Empty { cells }, "{cell:?}");
+    }
+    assert_eq!(
+        grid.at([-1.0, 0.06, 0.08]),
+        Cell::Empty { cells: 1 },
+        "the nearest cell"
+    );
+}

@@ -50,12 +50,14 @@ impl March<'_> {
     pub fn advance(&self, ray: &Ray, mut t: f32, most: usize, middles: &mut Vec<f32>, lengths: &mut Vec<f32>) -> f32 {
         let straight = !matches!(self.space.outside, Outside::Contracted);
         let full = middles.len().saturating_add(most);
+        let unit = if straight { 0.5 } else { 0.25 };
+        let inverse = ray.direction.map(|d| 1.0 / (d * unit));
         while t < ray.far && middles.len() < full {
             let step = self.steps.at(t);
             let middle = t + 0.5 * step;
             let p = ray.at(middle);
             let u = self.space.unit(p);
-            let width = match self.grid.at(u) {
+            let cells = match self.grid.at(u) {
                 Cell::Occupied => {
                     if middle > ray.near && middle < ray.far {
                         middles.push(middle);
@@ -64,31 +66,30 @@ impl March<'_> {
                     t += step;
                     continue;
                 }
-                Cell::Empty => 1.0 / self.grid.side as f32,
-                Cell::EmptyBrick => 4.0 / self.grid.side as f32,
+                Cell::Empty { cells } => cells as f32,
             };
-            // Leaves the cell by whole steps, so that sample positions do not depend on what is skipped. In contracted space
-            // rays are straight only in the inner cube.
+            // Leaves the empty cells by whole steps, so that sample positions do not depend on what is skipped. In contracted
+            // space rays are straight only in the inner cube.
             let inner = straight || p.iter().all(|v| v.abs() < 1.0);
             if !inner || self.steps.cone > 0.0 && t * self.steps.cone > self.steps.shortest {
                 t += step;
                 continue;
             }
-            let unit = if straight { 0.5 } else { 0.25 };
+            let width = cells / self.grid.side as f32;
+            let per_width = self.grid.side as f32 / cells;
             let mut exit = f32::INFINITY;
             for c in 0..3 {
-                let slope = ray.direction[c] * unit;
-                let cell = (u[c] / width).floor();
-                let face = if slope > 0.0 {
-                    (cell + 1.0) * width
-                } else {
-                    cell * width
-                };
-                if slope != 0.0 {
-                    exit = exit.min((face - u[c]) / slope);
+                // Casts instead of `floor` and `ceil`, which are calls on x86-64 without SSE 4.1. What lies below 0 or above 1
+                // by rounding leaves by one step.
+                let cell = (u[c] * per_width) as u32 as f32;
+                let face = if inverse[c] > 0.0 { cell + 1.0 } else { cell } * width;
+                if inverse[c].is_finite() {
+                    exit = exit.min((face - u[c]) * inverse[c]);
                 }
             }
-            t += step * (exit / step).ceil().max(1.0);
+            let steps = exit / step;
+            let whole = steps as u32 as f32;
+            t += step * if whole < steps { whole + 1.0 } else { whole.max(1.0) };
         }
         t
     }

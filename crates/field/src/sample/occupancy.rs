@@ -1,7 +1,7 @@
 //! The occupancy grid, which lets ray marching skip empty space (Mueller et al. 2022, appendix E).
 //!
 //! A cell's density is a decaying maximum of the network's output. Occupancy is stored as bits, a brick of 4 x 4 x 4 cells per
-//! word: one test skips an empty brick.
+//! word, and a block of 4 x 4 x 4 bricks per word of a second level: one test skips an empty brick or block.
 
 use irradia_scene::Rng;
 
@@ -14,6 +14,8 @@ pub struct OccupancyGrid {
     pub density: Vec<f32>,
     /// Occupied cells, one word per brick, x fastest.
     bricks: Vec<u64>,
+    /// Bricks with occupied cells, one word per block, x fastest.
+    blocks: Vec<u64>,
 }
 
 /// The state of a point's cell.
@@ -21,10 +23,11 @@ pub struct OccupancyGrid {
 pub enum Cell {
     /// The cell may contain something.
     Occupied,
-    /// The cell is empty.
-    Empty,
-    /// All 64 cells of its brick are empty.
-    EmptyBrick,
+    /// All cells around it that share its multiple of `cells` in each coordinate are empty: it, its brick or its block.
+    Empty {
+        /// Cells per side, 1, 4 or 16.
+        cells: u32,
+    },
 }
 
 impl OccupancyGrid {
@@ -35,6 +38,7 @@ impl OccupancyGrid {
             side,
             density: vec![0.0; side.pow(3)],
             bricks: vec![u64::MAX; (side / 4).pow(3)],
+            blocks: vec![u64::MAX; side.div_ceil(16).pow(3)],
         }
     }
 
@@ -44,25 +48,34 @@ impl OccupancyGrid {
             side,
             density,
             bricks: vec![u64::MAX; (side / 4).pow(3)],
+            blocks: vec![u64::MAX; side.div_ceil(16).pow(3)],
         })
     }
 
-    fn brick(&self, [x, y, z]: [usize; 3]) -> (usize, u32) {
-        let bricks = self.side / 4;
-        let brick = x / 4 + bricks * (y / 4 + bricks * (z / 4));
-        (brick, (x % 4 + 4 * (y % 4) + 16 * (z % 4)) as u32)
+    fn brick(&self, cell: [usize; 3]) -> (usize, u32) {
+        word_of(cell, self.side / 4)
+    }
+
+    fn block(&self, brick: [usize; 3]) -> (usize, u32) {
+        word_of(brick, self.side.div_ceil(16))
     }
 
     /// The cell of a point of the unit cube; points outside belong to the nearest cell.
     #[inline]
     pub fn at(&self, u: [f32; 3]) -> Cell {
         let top = self.side as f32 - 0.5;
-        let (brick, bit) = self.brick(u.map(|v| (v * self.side as f32).clamp(0.0, top) as usize));
-        let word = self.bricks[brick];
+        let cell = u.map(|v| (v * self.side as f32).clamp(0.0, top) as usize);
+        let (block, bit) = self.block(cell.map(|c| c / 4));
+        let word = self.blocks[block];
         if word == 0 {
-            Cell::EmptyBrick
-        } else if word >> bit & 1 == 0 {
-            Cell::Empty
+            return Cell::Empty { cells: 16 };
+        }
+        if word >> bit & 1 == 0 {
+            return Cell::Empty { cells: 4 };
+        }
+        let (brick, bit) = self.brick(cell);
+        if self.bricks[brick] >> bit & 1 == 0 {
+            Cell::Empty { cells: 1 }
         } else {
             Cell::Occupied
         }
@@ -134,5 +147,21 @@ impl OccupancyGrid {
                 self.bricks[brick] |= 1 << bit;
             }
         }
+        let side = self.side / 4;
+        self.blocks.fill(0);
+        for brick in 0..self.bricks.len() {
+            if self.bricks[brick] != 0 {
+                let (block, bit) = self.block([brick % side, brick / side % side, brick / side / side]);
+                self.blocks[block] |= 1 << bit;
+            }
+        }
     }
+}
+
+/// The word, among words of 4 x 4 x 4 with `side` of them per side, and the bit in it that belong to `at`.
+#[inline]
+fn word_of(at: [usize; 3], side: usize) -> (usize, u32) {
+    let [x, y, z] = at;
+    let word = x / 4 + side * (y / 4 + side * (z / 4));
+    (word, (x % 4 + 4 * (y % 4) + 16 * (z % 4)) as u32)
 }

@@ -99,7 +99,7 @@ pub(crate) struct Scratch {
 /// One in this many empty cells is updated.
 pub(crate) const EMPTY_ONE_IN: u32 = 16;
 /// Bounds of the number of rays in a batch.
-const RAYS: [usize; 2] = [64, 131_072];
+const RAYS: [usize; 2] = [64, 16_384];
 /// One in this many rays passes through a pixel of known depth if the depth loss is on.
 const KNOWN_ONE_IN: usize = 4;
 

@@ -58,7 +58,8 @@ fn network(point: vec3f) -> f32 {
     return y;
 }
 
-// Cells along a side of the empty cube around a point, 0 where its cell is occupied. Twin: `OccupancyGrid::at`.
+// Cells along a side of the empty cube around a point, 0 where its cell is occupied. Twin: `OccupancyGrid::at`,
+// which knows empty blocks of bricks as well.
 fn empty(u: vec3f) -> f32 {
     let side = task.space.x;
     let cell = vec3u(clamp(u * f32(side), vec3f(0.0), vec3f(f32(side) - 0.5)));

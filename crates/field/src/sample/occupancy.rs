@@ -34,22 +34,21 @@ impl OccupancyGrid {
     /// A grid with every cell occupied.
     pub fn new(side: usize) -> Self {
         let side = side.next_multiple_of(4).max(4);
-        Self {
-            side,
-            density: vec![0.0; side.pow(3)],
-            bricks: vec![u64::MAX; (side / 4).pow(3)],
-            blocks: vec![u64::MAX; side.div_ceil(16).pow(3)],
-        }
+        Self::all_occupied(side, vec![0.0; side.pow(3)])
     }
 
     /// A grid of given densities `[side^3]`; [`Self::threshold`] computes the bits.
     pub fn from_density(side: usize, density: Vec<f32>) -> Option<Self> {
-        (side > 0 && side.is_multiple_of(4) && density.len() == side.pow(3)).then(|| Self {
+        (side > 0 && side.is_multiple_of(4) && density.len() == side.pow(3)).then(|| Self::all_occupied(side, density))
+    }
+
+    fn all_occupied(side: usize, density: Vec<f32>) -> Self {
+        Self {
             side,
             density,
             bricks: vec![u64::MAX; (side / 4).pow(3)],
             blocks: vec![u64::MAX; side.div_ceil(16).pow(3)],
-        })
+        }
     }
 
     fn brick(&self, cell: [usize; 3]) -> (usize, u32) {
@@ -141,17 +140,13 @@ impl OccupancyGrid {
         let mean = optical_depths.iter().map(|t| f64::from(*t)).sum::<f64>() / optical_depths.len() as f64;
         let limit = thickness.min(mean as f32);
         self.bricks.fill(0);
+        self.blocks.fill(0);
         for (c, optical_depth) in optical_depths.iter().enumerate() {
             if *optical_depth >= limit {
-                let (brick, bit) = self.brick(self.cell(c));
+                let cell = self.cell(c);
+                let (brick, bit) = self.brick(cell);
                 self.bricks[brick] |= 1 << bit;
-            }
-        }
-        let side = self.side / 4;
-        self.blocks.fill(0);
-        for brick in 0..self.bricks.len() {
-            if self.bricks[brick] != 0 {
-                let (block, bit) = self.block([brick % side, brick / side % side, brick / side / side]);
+                let (block, bit) = self.block(cell.map(|c| c / 4));
                 self.blocks[block] |= 1 << bit;
             }
         }

@@ -194,9 +194,8 @@ fn a_budget_covers_the_whole_recipe() {
     assert!(ended.stderr.contains("recipe complete"), "{ended:?}");
     let run = folder.path().join("run");
     let seconds = json(&run.join("report.json"))["seconds"].as_f64().expect("a number");
-    // Other tests use the same cores at times, which is noticed only when a step is measured: a run whose first steps were
-    // slow has taken 0.83 s.
-    assert!((0.5..4.0).contains(&seconds), "{seconds}");
+    // Other tests use the same cores at times, which is noticed only when a step is measured.
+    assert!((1.0..4.0).contains(&seconds), "{seconds}");
     assert_eq!(events(&run).iter().filter(|e| e["event"] == "stage_entered").count(), 2);
 }
 

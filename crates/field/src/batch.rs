@@ -1,7 +1,7 @@
 //! The rays of one step, sampled from photographs.
 
 use crate::space::{Ray, Space};
-use glam::{Vec2, Vec3};
+use glam::Vec2;
 use irradia_scene::{Camera, Rng};
 
 /// Rays with their target colours.
@@ -33,7 +33,7 @@ pub enum Background {
 /// A photograph to sample rays from, at the size of its camera.
 #[derive(Clone, Copy, Debug)]
 pub struct TrainView<'a> {
-    /// Its camera; the lens is ignored, since pixels are undistorted.
+    /// Its camera.
     pub camera: &'a Camera,
     /// `[H, W, 3]`, composited over the colour `over` if there is alpha.
     pub rgb: &'a [u8],
@@ -120,7 +120,7 @@ impl RayBatch {
             let (x, y) = (pixel % width, pixel / width);
             let direction = view.camera.ray_direction(Vec2::new(x as f32 + 0.5, y as f32 + 0.5));
             let ray = space.ray(view.camera.pose.position.to_array(), direction.to_array());
-            let cosine = direction.dot(view.camera.pose.rotation * Vec3::Z);
+            let cosine = view.camera.depth_along(direction);
             let known = depth > 0.0 && depth.is_finite();
             self.depths.push(if known { ray.distance(depth / cosine) } else { 0.0 });
             self.rays.push(ray);

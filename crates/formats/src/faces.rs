@@ -6,7 +6,7 @@
 use crate::FormatError;
 use crate::Pixels;
 use crate::image_file::{Colour, decode};
-use crate::undistort::{Undistortion, monotonic, plane_point};
+use crate::undistort::{Undistortion, plane_point};
 use glam::{DQuat, DVec2, DVec3};
 use image::metadata::Orientation;
 use irradia_scene::{Intrinsics, Lens, resize_area};
@@ -60,7 +60,7 @@ impl Cut {
         if !source.lens.is_wide() {
             return whole.map(|plan| Cut::Whole(Box::new(plan)));
         }
-        let reach = reach(&source.lens);
+        let reach = source.lens.reach_in_angle();
         if let Some(plan) = whole
             && shown(source, reach, &plan) >= SHOWN
         {
@@ -85,18 +85,6 @@ pub(crate) fn panorama_faces(width: u32, height: u32) -> Vec<(&'static str, Undi
         lens: Lens::Equirectangular,
     };
     faces(&source, PI)
-}
-
-/// The angle from the axis up to which the lens is monotonic, radians.
-fn reach(lens: &Lens) -> f64 {
-    match *lens {
-        Lens::Fisheye { k, .. } => {
-            let radial = Lens::fisheye(k);
-            let radius = |theta: f64| radial.project(DVec3::new(theta.sin(), 0.0, theta.cos()));
-            monotonic(PI - 1e-6, |theta| radius(theta).map_or(f64::NAN, |p| p.x)).unwrap_or(PI)
-        }
-        _ => PI,
-    }
 }
 
 /// The angle between a direction and the axis, radians.

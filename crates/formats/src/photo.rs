@@ -1,5 +1,6 @@
 use crate::DEFAULT_MAX_SIDE;
 use crate::image_file::{Colour, decode, decode_jpeg_at, read_header};
+use crate::shown::Shown;
 use crate::undistort::Undistortion;
 use crate::{FormatError, Pixels};
 use image::metadata::Orientation;
@@ -21,6 +22,8 @@ pub(crate) struct PhotoFile {
     /// Size after orientation, from the header when the dataset was read.
     pub upright: (u32, u32),
     pub undistortion: Option<Undistortion>,
+    /// What a photograph that is not undistorted shows, if not all.
+    pub shown: Option<Shown>,
     /// Size of the resulting photograph.
     pub size: (u32, u32),
 }
@@ -86,11 +89,14 @@ impl PhotoFile {
             ));
         }
         let pixels = self.bring_to_size(pixels, self.part(divisor), size);
-        let mask = self
+        let mut mask = self
             .mask
             .as_deref()
             .map(|path| self.read_mask(path, size))
             .transpose()?;
+        if let Some(shown) = &self.shown {
+            shown.restrict(size.0, size.1, &mut mask);
+        }
         Ok(Photo {
             width: pixels.width,
             height: pixels.height,
@@ -170,6 +176,7 @@ mod tests {
                 jpeg,
                 upright: (2000, 1400),
                 undistortion,
+                shown: None,
                 size: (960, 672),
             };
             let (file, whole) = (photo(true), photo(false));
@@ -229,6 +236,7 @@ mod tests {
                     jpeg,
                     upright,
                     undistortion,
+                    shown: None,
                     size: (upright.0 / 9, upright.1 / 9),
                 };
                 let (file, whole) = (photo(true), photo(false));

@@ -49,10 +49,8 @@ impl Undistortion {
             right: (cx + half.x) as i64,
             bottom: (cy + half.y) as i64,
         };
-        let reach = reach(
-            &source.lens,
-            (half.x / f64::from(source.fx)).hypot(half.y / f64::from(source.fy)),
-        );
+        let largest_radius = (half.x / f64::from(source.fx)).hypot(half.y / f64::from(source.fy));
+        let reach = source.lens.reach_on_plane(largest_radius);
         let whole = Self {
             source: *source,
             pinhole: Intrinsics {
@@ -389,32 +387,6 @@ fn pixel(k: &Intrinsics, p: DVec2) -> DVec2 {
         f64::from(k.fx) * p.x + f64::from(k.cx),
         f64::from(k.fy) * p.y + f64::from(k.cy),
     )
-}
-
-/// The radius on the undistorted plane, at most `largest`, up to which the lens is monotonic. Beyond it a polynomial folds back
-/// and would show the picture twice.
-fn reach(lens: &Lens, largest: f64) -> f64 {
-    let radial = match *lens {
-        Lens::Pinhole => return f64::INFINITY,
-        Lens::Opencv { k, .. } => Lens::Opencv { k, p: [0.0; 2] },
-        Lens::Fisheye { k, .. } => Lens::fisheye(k),
-        other => other,
-    };
-    monotonic(largest, |radius| radial.distort(DVec2::new(radius, 0.0)).x).unwrap_or(f64::INFINITY)
-}
-
-/// The largest of values up to `largest` up to which `of` grows; `None` if it always does.
-pub(crate) fn monotonic(largest: f64, of: impl Fn(f64) -> f64) -> Option<f64> {
-    const STEPS: u32 = 2000;
-    let mut before = 0.0;
-    for i in 1..=STEPS {
-        let value = of(largest * f64::from(i) / f64::from(STEPS));
-        if value.is_nan() || value <= before {
-            return Some(largest * f64::from(i - 1) / f64::from(STEPS));
-        }
-        before = value;
-    }
-    None
 }
 
 #[cfg(test)]

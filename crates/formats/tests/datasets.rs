@@ -2,7 +2,7 @@
 
 use glam::Vec3;
 use image::{GrayImage, Rgb, RgbImage};
-use irradia_formats::{DatasetFormat, DatasetOptions, Kind, describe, detect, read_dataset};
+use irradia_formats::{DatasetFormat, DatasetOptions, Kind, Lenses, describe, detect, read_dataset};
 use irradia_scene::{Dataset, View};
 use std::fs;
 use std::path::Path;
@@ -37,6 +37,57 @@ fn pictures(count: usize, width: u32, height: u32) -> TempDir {
             .unwrap();
     }
     folder
+}
+
+#[test]
+fn distorted_photographs_stay_as_they_are_on_request() {
+    let as_they_are = |folder: &TempDir| {
+        let options = DatasetOptions {
+            lenses: Lenses::Distorted,
+            ..DatasetOptions::default()
+        };
+        read_dataset(folder.path(), &options).expect("a dataset")
+    };
+    let folder = pictures(4, 40, 30);
+    let keys = r#""w": 40, "h": 30, "fl_x": 30, "fl_y": 30, "cx": 20, "cy": 15, "k1": -0.05"#;
+    fs::write(folder.path().join("transforms.json"), transforms(4, keys)).unwrap();
+    let whole = as_they_are(&folder);
+    let (view, k) = (&whole.views[0], whole.views[0].camera.intrinsics);
+    assert_eq!((k.width, k.height), (40, 30));
+    assert!(matches!(k.lens, irradia_scene::Lens::Opencv { .. }));
+    let photo = view.photo.load().unwrap();
+    assert_eq!((photo.data, photo.mask), (picture(40, 30).into_raw(), None));
+    let straight = read(folder.path()).unwrap();
+    assert_eq!(straight.views[0].camera.intrinsics.lens, irradia_scene::Lens::Pinhole);
+
+    // A fisheye's photograph is not cut into faces; what is beyond its circle is masked.
+    let keys = r#""camera_model": "OPENCV_FISHEYE", "w": 40, "h": 30, "fl_x": 8, "fl_y": 8, "cx": 20, "cy": 15"#;
+    fs::write(folder.path().join("transforms.json"), transforms(4, keys)).unwrap();
+    for i in 0..4 {
+        let round = |x: u32, y: u32| (f64::from(x) - 19.5).hypot(f64::from(y) - 14.5) < 14.0;
+        let lit = RgbImage::from_fn(40, 30, |x, y| Rgb(if round(x, y) { [200; 3] } else { [0; 3] }));
+        lit.save(folder.path().join(format!("images/{i:02}.png"))).unwrap();
+    }
+    let cut = read(folder.path()).unwrap();
+    assert!(cut.views.iter().all(|view| view.name.ends_with("/front")));
+    let round = as_they_are(&folder);
+    assert_eq!(round.views.len(), 4);
+    let mask = round.views[0].photo.load().unwrap().mask.expect("a circle");
+    let kept = mask.iter().filter(|value| **value > 0).count() as f64 / mask.len() as f64;
+    assert!(
+        (0.40..0.52).contains(&kept),
+        "{kept}: a circle of 13.7 pixels covers half"
+    );
+    assert_eq!((mask[0], mask[40 * 15 + 20]), (0, 255));
+
+    // Nor are panoramas, of which poles and edges are masked.
+    let keys = r#""camera_model": "EQUIRECTANGULAR", "w": 80, "h": 40"#;
+    let folder = pictures(4, 80, 40);
+    fs::write(folder.path().join("transforms.json"), transforms(4, keys)).unwrap();
+    let whole = as_they_are(&folder);
+    assert_eq!((whole.views.len(), read(folder.path()).unwrap().views.len()), (4, 24));
+    let mask = whole.views[0].photo.load().unwrap().mask.expect("a band");
+    assert_eq!([0, 80 * 20, 80 * 20 + 40].map(|at: usize| mask[at]), [0, 0, 255]);
 }
 
 /// A transforms file of `count` frames `images/00.png` .. with `keys` at the top.

@@ -1,6 +1,6 @@
 //! The data of a run, to detect changes.
 
-use irradia_scene::Dataset;
+use irradia_scene::{Dataset, Lens};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::io;
@@ -103,6 +103,9 @@ pub fn data_fingerprint(dataset: &Dataset, root: &Path) -> String {
         let numbers = [k.fx, k.fy, k.cx, k.cy].into_iter();
         let numbers = numbers.chain(pose.position.to_array()).chain(pose.rotation.to_array());
         numbers.for_each(|number| hash.add(&number.to_bits().to_le_bytes()));
+        if k.lens != Lens::Pinhole {
+            hash.add(format!("{:?}", k.lens).as_bytes());
+        }
         let bytes = std::fs::metadata(root.join(&view.name)).map_or(0, |file| file.len());
         hash.add(&bytes.to_le_bytes());
     }

@@ -2,7 +2,7 @@
 
 use crate::{Background, RunError, RunFolder, scene_of};
 use irradia_compute::DeviceChoice;
-use irradia_formats::{DEFAULT_MAX_SIDE, DatasetFormat, DatasetOptions, Holdout, read_dataset, read_splats};
+use irradia_formats::{DEFAULT_MAX_SIDE, DatasetFormat, DatasetOptions, Holdout, Lenses, read_dataset, read_splats};
 use irradia_scene::{Dataset, sh};
 use irradia_splat::Splats;
 use irradia_train::Recipe;
@@ -43,6 +43,9 @@ pub struct Reading {
     /// The folder of the photographs, if it is not where the layout has it.
     #[serde(default)]
     pub images: Option<PathBuf>,
+    /// What becomes of distorted photographs.
+    #[serde(default)]
+    pub lenses: Lenses,
 }
 
 impl Default for Reading {
@@ -54,6 +57,7 @@ impl Default for Reading {
             max_side: Some(DEFAULT_MAX_SIDE),
             holdout: None,
             images: None,
+            lenses: Lenses::default(),
         }
     }
 }
@@ -90,6 +94,7 @@ impl Reading {
             max_side,
             holdout: self.holdout()?,
             images: self.images.clone(),
+            lenses: self.lenses,
         })
     }
 

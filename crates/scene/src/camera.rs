@@ -1,5 +1,8 @@
 use crate::{Lens, Pose};
-use glam::{Vec2, Vec3};
+use glam::{DVec2, DVec3, Vec2, Vec3};
+
+/// A direction and that of its own pixel differ by less than this, radians, unless a lens folds.
+const SAME_DIRECTION: f64 = 1e-3;
 
 /// Intrinsic parameters of a camera, in pixels.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -16,7 +19,7 @@ pub struct Intrinsics {
     pub cx: f32,
     /// Principal point y, pixels; the image's top edge is 0.
     pub cy: f32,
-    /// Distortion; renderers accept only [`Lens::Pinhole`], readers undistort photographs.
+    /// Distortion; [`Lens::Pinhole`] unless photographs are kept as their lens shows them, since readers undistort them.
     pub lens: Lens,
 }
 
@@ -58,6 +61,45 @@ impl Intrinsics {
         }
     }
 
+    /// Pixel coordinates of a point in the camera and its [depth](Self::depth); `None` where the lens shows nothing, such as behind a pinhole.
+    pub fn project(&self, point: Vec3) -> Option<(Vec2, f32)> {
+        let depth = self.depth(point);
+        if self.lens == Lens::Pinhole {
+            let at = Vec2::new(
+                self.fx * point.x / point.z + self.cx,
+                self.fy * point.y / point.z + self.cy,
+            );
+            return (point.z > 0.0).then_some((at, depth));
+        }
+        let direction = point.as_dvec3();
+        let plane = self.lens.project(direction)?;
+        // Beyond the fold of a polynomial another direction has the same pixel.
+        let back = self.lens.direction(plane)?;
+        let is_same = back.angle_between(direction) < SAME_DIRECTION;
+        let [fx, fy, cx, cy] = [self.fx, self.fy, self.cx, self.cy].map(f64::from);
+        is_same.then(|| (DVec2::new(fx * plane.x + cx, fy * plane.y + cy).as_vec2(), depth))
+    }
+
+    /// The depth of a point in the camera: along +Z, or for lenses that also show what is behind the camera the distance from it.
+    pub fn depth(&self, point: Vec3) -> f32 {
+        if self.lens.is_wide() { point.length() } else { point.z }
+    }
+
+    /// The point in the camera that pixel coordinates `(x, y)` show at a [depth](Self::depth) of 1; straight ahead where the lens shows nothing.
+    pub fn ray(&self, pixel: Vec2) -> Vec3 {
+        let plane = Vec2::new((pixel.x - self.cx) / self.fx, (pixel.y - self.cy) / self.fy);
+        if self.lens == Lens::Pinhole {
+            return plane.extend(1.0);
+        }
+        let direction = self.lens.direction(plane.as_dvec2()).unwrap_or(DVec3::Z);
+        let depth = if self.lens.is_wide() {
+            direction.length()
+        } else {
+            direction.z
+        };
+        (direction / depth).as_vec3()
+    }
+
     /// Whether sizes are non-zero and every number is finite with positive focal lengths.
     pub fn is_valid(&self) -> bool {
         self.width > 0
@@ -75,7 +117,7 @@ pub struct Camera {
     pub pose: Pose,
     /// Intrinsic parameters.
     pub intrinsics: Intrinsics,
-    /// Near plane: nothing closer than this along +Z is drawn, world units.
+    /// Near plane: nothing at a smaller [depth](Intrinsics::depth) is drawn, world units.
     pub near: f32,
 }
 
@@ -92,11 +134,11 @@ impl Camera {
         }
     }
 
-    /// Pixel coordinates of a world point and its depth along +Z, ignoring the lens; `None` in front of the near plane.
+    /// Pixel coordinates of a world point and its [depth](Intrinsics::depth); `None` in front of the near plane and where the lens shows nothing.
     pub fn project(&self, world: Vec3) -> Option<(Vec2, f32)> {
-        let p = self.pose.camera_from_world(world);
-        let k = &self.intrinsics;
-        (p.z > self.near).then(|| (Vec2::new(k.fx * p.x / p.z + k.cx, k.fy * p.y / p.z + k.cy), p.z))
+        let point = self.pose.camera_from_world(world);
+        let projected = self.intrinsics.project(point);
+        projected.filter(|(_, depth)| *depth > self.near)
     }
 
     /// As [`Self::project`], but `None` outside the image as well; what may hide the point is ignored.
@@ -106,11 +148,14 @@ impl Camera {
             .filter(|(at, _)| (0.0..k.width as f32).contains(&at.x) && (0.0..k.height as f32).contains(&at.y))
     }
 
-    /// Unit direction in the world of the ray through pixel coordinates `(x, y)`, ignoring the lens.
+    /// Unit direction in the world of the ray through pixel coordinates `(x, y)`; straight ahead where the lens shows nothing.
     pub fn ray_direction(&self, pixel: Vec2) -> Vec3 {
-        let k = &self.intrinsics;
-        let camera = Vec3::new((pixel.x - k.cx) / k.fx, (pixel.y - k.cy) / k.fy, 1.0);
-        (self.pose.rotation * camera).normalize()
+        (self.pose.rotation * self.intrinsics.ray(pixel)).normalize()
+    }
+
+    /// [Depth](Intrinsics::depth) per world unit along a unit direction in the world.
+    pub fn depth_along(&self, direction: Vec3) -> f32 {
+        self.intrinsics.depth(self.pose.rotation.inverse() * direction)
     }
 }
 
@@ -125,6 +170,34 @@ mod tests {
         assert_eq!((half.width, half.height), (271, 167));
         assert!((half.fx / half.width as f32 - k.fx / k.width as f32).abs() < 1e-5);
         assert!((half.cy / half.height as f32 - 0.5).abs() < 1e-6);
+    }
+
+    #[test]
+    fn a_lens_shows_points_of_its_rays_and_none_beyond_its_fold() {
+        let lenses = [
+            Lens::Opencv {
+                k: [-0.3, 0.0, 0.0, 0.0, 0.0, 0.0],
+                p: [0.001, -0.002],
+            },
+            Lens::fisheye([0.02, -0.01, 0.0, 0.0]),
+            Lens::Equirectangular,
+        ];
+        for lens in lenses {
+            let k = Intrinsics {
+                lens,
+                ..Intrinsics::from_fov_x(640, 480, 1.0)
+            };
+            for pixel in [Vec2::new(10.0, 20.0), Vec2::new(320.0, 240.0), Vec2::new(500.0, 300.0)] {
+                let (at, depth) = k.project(3.0 * k.ray(pixel)).expect("it shows what it sees");
+                assert!(
+                    (at - pixel).length() < 0.01 && (depth - 3.0).abs() < 1e-5,
+                    "{lens:?} {pixel} {at}"
+                );
+            }
+            // r - 0.3 r^3 grows up to a radius of 1.05, and is 0 again at 1.83.
+            assert_eq!(k.project(Vec3::new(1.8, 0.0, 1.0)).is_some(), lens.is_wide());
+            assert_eq!(k.project(Vec3::new(0.3, 0.2, -1.0)).is_some(), lens.is_wide());
+        }
     }
 
     #[test]

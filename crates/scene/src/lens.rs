@@ -51,6 +51,40 @@ impl Lens {
         matches!(self, Lens::Fisheye { .. } | Lens::Equirectangular)
     }
 
+    /// The same lens without its tangential part and prism.
+    fn radial(&self) -> Self {
+        match *self {
+            Lens::Opencv { k, .. } => Lens::Opencv { k, p: [0.0; 2] },
+            Lens::Fisheye { k, .. } => Lens::fisheye(k),
+            other => other,
+        }
+    }
+
+    /// The radius on the undistorted plane, at most `largest`, up to which the lens is monotonic, infinite if it is on all of it. Beyond it a polynomial
+    /// folds back and would show the picture twice.
+    pub fn reach_on_plane(&self, largest: f64) -> f64 {
+        if *self == Lens::Pinhole {
+            return f64::INFINITY;
+        }
+        let radial = self.radial();
+        monotonic(largest, |radius| radial.distort(DVec2::new(radius, 0.0)).x).unwrap_or(f64::INFINITY)
+    }
+
+    /// The angle from the axis, radians, up to which a wide lens is monotonic.
+    pub fn reach_in_angle(&self) -> f64 {
+        match *self {
+            Lens::Fisheye { .. } => monotonic(PI - 1e-6, |theta| self.radius_of_angle(theta)).unwrap_or(PI),
+            _ => PI,
+        }
+    }
+
+    /// The distance from the centre, on the lens's plane, of what is `theta` radians from the axis; NaN where the lens has nothing. Its tangential
+    /// part is ignored.
+    pub fn radius_of_angle(&self, theta: f64) -> f64 {
+        let point = self.radial().project(DVec3::new(theta.sin(), 0.0, theta.cos()));
+        point.map_or(f64::NAN, |point| point.x)
+    }
+
     /// Whether every coefficient is finite.
     pub fn is_finite(&self) -> bool {
         let all = |values: &[f64]| values.iter().all(|v| v.is_finite());
@@ -167,6 +201,20 @@ impl Lens {
         }
         None
     }
+}
+
+/// The largest of values up to `largest` up to which `of` grows; `None` if it always does.
+fn monotonic(largest: f64, of: impl Fn(f64) -> f64) -> Option<f64> {
+    const STEPS: u32 = 2000;
+    let mut before = 0.0;
+    for i in 1..=STEPS {
+        let value = of(largest * f64::from(i) / f64::from(STEPS));
+        if value.is_nan() || value <= before {
+            return Some(largest * f64::from(i - 1) / f64::from(STEPS));
+        }
+        before = value;
+    }
+    None
 }
 
 #[cfg(test)]

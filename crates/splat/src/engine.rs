@@ -8,7 +8,7 @@
 use crate::densify::mcmc;
 #[cfg(feature = "gpu")]
 use crate::gpu::{DeviceGradient, GpuTraining};
-use crate::regularize::{self, Regularized, Regularizers};
+use crate::regularize::{self, AngleCap, Regularized, Regularizers};
 use crate::render::{
     CameraGradient, ChunkBounds, FramePlanes, OutputGradient, RenderOptions, Renderer, SplatGradients, ViewParams,
 };
@@ -77,6 +77,8 @@ pub struct Update {
     pub noise: Option<Noise>,
     /// Largest condition number of a covariance.
     pub condition_cap: Option<f32>,
+    /// Largest size as seen from the camera.
+    pub angle_cap: Option<AngleCap>,
 }
 
 /// Noise of one step (3DGS-MCMC).
@@ -436,7 +438,7 @@ impl Engine {
         (self.rendered().surfaces(&seen), v_colors)
     }
 
-    /// Applies statistics, regularisers, Adam, noise and the condition cap, in this order, with the last gradients.
+    /// Applies statistics, regularisers, Adam, noise and the caps, in this order, with the last gradients.
     pub fn update(&mut self, update: &Update) {
         #[cfg(feature = "gpu")]
         if let Some(gpu) = &mut self.gpu {
@@ -480,6 +482,10 @@ impl Engine {
         }
         if let Some(limit) = update.condition_cap {
             regularize::cap_condition(&mut state.splats, limit);
+        }
+        // Splats only shrink, so that their bounds hold.
+        if let Some(cap) = &update.angle_cap {
+            regularize::cap_angle(&mut state.splats, cap);
         }
         let only_active = !update.optimizer.dense
             && regularized == Regularized::Visible

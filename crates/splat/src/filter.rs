@@ -37,13 +37,17 @@ pub fn update(state: &mut SplatState, views: &[ViewParams]) {
 fn rate(view: &ViewParams, mean: [f64; 3]) -> Option<f64> {
     let x: [f64; 3] =
         std::array::from_fn(|i| (0..3).map(|j| view.rotation[i][j] * mean[j]).sum::<f64>() + view.translation[i]);
+    let (pixel, depth) = match &view.lens {
+        Some(lens) => lens.project(x, view.focal, view.principal)?,
+        None => (
+            std::array::from_fn(|i| view.focal[i] * x[i] / x[2] + view.principal[i]),
+            x[2],
+        ),
+    };
     let size = [f64::from(view.width), f64::from(view.height)];
-    let inside = x[2] > view.near
-        && (0..2).all(|i| {
-            let pixel = view.focal[i] * x[i] / x[2] + view.principal[i];
-            (-MARGIN * size[i]..=(1.0 + MARGIN) * size[i]).contains(&pixel)
-        });
-    inside.then(|| view.focal[0].max(view.focal[1]) / x[2])
+    let inside =
+        depth > view.near && (0..2).all(|i| (-MARGIN * size[i]..=(1.0 + MARGIN) * size[i]).contains(&pixel[i]));
+    inside.then(|| view.focal[0].max(view.focal[1]) / depth)
 }
 
 /// The splats with the filter baked in, for files without a filter.
@@ -81,6 +85,7 @@ mod tests {
             width: 32,
             height: 32,
             near: 0.01,
+            lens: None,
         }
     }
 

@@ -109,8 +109,7 @@ pub fn random_points<E, C: Fn(Vec2) -> PixelClass + Sync>(
             [0.5 * distance, 1.6 * distance]
         });
         let inverse = rng.range(1.0 / far, 1.0 / near);
-        let ray = camera.pose.rotation * Vec3::new((pixel.x - k.cx) / k.fx, (pixel.y - k.cy) / k.fy, 1.0);
-        let point = camera.pose.position + ray / inverse;
+        let point = camera.pose.position + camera.pose.rotation * k.ray(pixel) / inverse;
         Candidate {
             point,
             chance: rng.uniform(),

@@ -43,6 +43,7 @@ fn view(golden: &Golden) -> ViewParams {
         width: golden.scalar("width") as u32,
         height: golden.scalar("height") as u32,
         near: 0.01,
+        lens: None,
     }
 }
 

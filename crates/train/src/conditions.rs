@@ -6,6 +6,8 @@
 //!   nothing beside the object, and what floats there stands before it in other photographs.
 //! - **Skies.** Photographs of many days have skies that no scene can show at once; splats explain them by fog around all that is in
 //!   front.
+//! - **Wide lenses.** Pixels of a photograph by a fisheye that keeps its distortion show angles other than those of the views that are rendered later: splats
+//!   must look alike at each.
 //! - **Maps of depth and normals.** They are read, and weighed only where some can be used.
 //! - **Sparse photographs.** What only a few photographs see is not determined by them: steps beyond those that the scene takes to appear only fit
 //!   splats to single photographs.
@@ -132,7 +134,8 @@ impl Trainer {
                     continue;
                 };
                 photographs += 1;
-                cut_outs += usize::from(is_cut_out(&photo));
+                // The mask of a wide lens is that of its image circle.
+                cut_outs += usize::from(!k.lens.is_wide() && is_cut_out(&photo));
                 if up(view).dot(mean_up) >= UPRIGHT {
                     upright += 1;
                     sky_colors.extend(sky_color(&photo).filter(|_| photo.channels == 3));
@@ -158,6 +161,7 @@ impl Trainer {
         if are_cut_out {
             self.put_into_effect("masks leave out all but an object", "cut_out", cut_out);
         }
+        self.settle_lenses();
         self.settle_spacing();
         self.settle_maps();
         Ok(())
@@ -181,6 +185,20 @@ impl Trainer {
         if self.normal_maps.is_none() {
             self.recipe.params.remove(&Param::NormalMapWeight);
         }
+    }
+
+    fn settle_lenses(&mut self) {
+        if self.has_wide_lenses() && !self.recipe.render.antialias {
+            self.recipe.render.antialias = true;
+            self.decisions
+                .push("photographs of wide lenses keep their distortion: splats are antialiased".into());
+        }
+    }
+
+    /// Whether some training photographs are by wide lenses, and not cut into faces.
+    fn has_wide_lenses(&self) -> bool {
+        let mut train = self.dataset.train.iter();
+        train.any(|view| self.dataset.views[*view].camera.intrinsics.lens.is_wide())
     }
 
     fn settle_spacing(&mut self) {
@@ -220,7 +238,9 @@ mod tests {
     use crate::recipe::Knob;
     use crate::trainer::{TrainOptions, Trainer};
     use glam::Vec3;
-    use irradia_scene::{Camera, Dataset, DepthGrid, GridSource, Intrinsics, LoadError, Photo, PointCloud, Pose, View};
+    use irradia_scene::{
+        Camera, Dataset, DepthGrid, GridSource, Intrinsics, Lens, LoadError, Photo, PointCloud, Pose, View,
+    };
     use std::sync::Arc;
 
     /// One grey photograph of `channels` channels, with or without points.
@@ -347,6 +367,21 @@ mod tests {
         assert_eq!(trainer(12, Some(2000)).total_steps(), 2000);
         let dense = trainer(60, None);
         assert_eq!((dense.total_steps(), dense.least_pace()), (3000, 0.0));
+    }
+
+    #[test]
+    fn splats_in_photographs_of_a_fisheye_are_antialiased() {
+        let antialiased = |lens: Lens| {
+            let mut data = (*dataset(3, true)).clone();
+            data.views[0].camera.intrinsics.lens = lens;
+            let recipe = Recipe::parse("fast", Recipe::built_in("fast").unwrap(), &[]).unwrap();
+            let trainer = Trainer::new(Arc::new(data), recipe, TrainOptions::default()).unwrap();
+            let told = trainer.decisions.iter().any(|line| line.contains("antialiased"));
+            assert_eq!(told, trainer.recipe.render.antialias);
+            told
+        };
+        assert!(antialiased(Lens::fisheye([0.0; 4])));
+        assert!(!antialiased(Lens::Pinhole) && !antialiased(Lens::Fov { omega: 0.5 }));
     }
 
     /// A photograph of `width` x `height` with a colour for each pixel, and what its mask keeps.

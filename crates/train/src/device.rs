@@ -6,7 +6,7 @@ use crate::recipe::Recipe;
 use crate::schedule::StepPlan;
 use crate::trainer::{TrainError, Trainer};
 use irradia_compute::{Device, DeviceError};
-use irradia_scene::Camera;
+use irradia_scene::{Camera, Lens};
 use irradia_splat::{Engine, RenderOptions, Update};
 #[cfg(feature = "gpu")]
 use {
@@ -17,13 +17,14 @@ use {
     irradia_splat::{DeviceGradient, Statistics},
 };
 
-/// Puts the engine of the splats on the device, as far as the recipe's can be trained there, which begin as `first_splats`. Returns what is
-/// told of the device, with the recipe's field, which follows.
+/// Puts the engine of the splats on the device, as far as the recipe's can be trained there for `cameras`, which begin as `first_splats`. Returns
+/// what is told of the device, with the recipe's field, which follows.
 pub(crate) fn use_device(
     engine: &mut Engine,
     device: &Device,
     recipe: &Recipe,
     first_splats: usize,
+    cameras: &[Camera],
 ) -> Result<Vec<String>, DeviceError> {
     if device.is_cpu() {
         return Ok(Vec::new());
@@ -33,6 +34,8 @@ pub(crate) fn use_device(
     if fields < recipe.stage.len() {
         told.push(if recipe.residual.is_some() {
             format!("splats with a residual field are trained on the CPU, not on {device}")
+        } else if cameras.iter().any(|camera| camera.intrinsics.lens != Lens::Pinhole) {
+            format!("splats in distorted photographs are trained on the CPU, not on {device}")
         } else {
             engine.use_device(device)?;
             let most = engine.most_splats();
@@ -260,7 +263,9 @@ mod tests {
         let recipe = Recipe::parse("mcmc", Recipe::built_in("mcmc").unwrap(), &[]).unwrap();
         let told_of = |splats: usize| {
             let mut engine = Engine::new(SplatState::new(Splats::zeros(0, sh::MAX_DEGREE)));
-            let told = use_device(&mut engine, &device, &recipe, splats).unwrap().remove(0);
+            let told = use_device(&mut engine, &device, &recipe, splats, &[])
+                .unwrap()
+                .remove(0);
             (engine.is_on_gpu(), engine.most_splats(), told)
         };
         let (is_on_gpu, most, told) = told_of(1000);

@@ -6,7 +6,7 @@
 use crate::recipe::Param;
 use crate::schedule::StepPlan;
 use crate::trainer::Trainer;
-use glam::Vec3;
+use glam::{Vec2, Vec3};
 use irradia_measure::NormalSample;
 use irradia_scene::{Camera, Dataset, NormalGrid};
 use rayon::prelude::*;
@@ -141,7 +141,7 @@ fn facing(dataset: &Dataset, maps: &[(usize, NormalGrid)], axes: Axes) -> f64 {
             let Some(normal) = axes.in_camera(*normal, camera) else {
                 continue;
             };
-            let ray = Vec3::new((x as f32 + 0.5 - k.cx) / k.fx, (y as f32 + 0.5 - k.cy) / k.fy, 1.0);
+            let ray = k.ray(Vec2::new(x as f32 + 0.5, y as f32 + 0.5));
             known += 1;
             facing += usize::from(normal.dot(ray) < 0.0);
         }

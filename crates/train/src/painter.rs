@@ -9,6 +9,7 @@ use irradia_splat::Renderer;
 #[cfg(feature = "gpu")]
 use {
     irradia_field::gpu::{GpuFieldRenderer, supports},
+    irradia_scene::Lens,
     irradia_splat::GpuRenderer,
 };
 
@@ -48,7 +49,8 @@ impl<'m> Painter<'m> {
     pub fn render(&mut self, camera: &Camera, options: &RenderOptions) -> Result<Frame, DeviceError> {
         #[cfg(feature = "gpu")]
         match (&mut self.gpu, self.model) {
-            (Some(OnGpu::Splats(gpu)), _) => {
+            // The kernels of splats are those of a pinhole.
+            (Some(OnGpu::Splats(gpu)), _) if camera.intrinsics.lens == Lens::Pinhole => {
                 gpu.render(&irradia_splat::ViewParams::new(camera), options);
                 let frame = Frame::of_planes(gpu.frame(), camera);
                 gpu.gpu().check()?;

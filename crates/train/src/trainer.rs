@@ -28,6 +28,7 @@ use irradia_measure::Lpips;
 use irradia_scene::{Camera, Dataset, LoadError, Rng, sh};
 use irradia_splat::densify::{DensityChange, classic, fast, mcmc, merge, taming};
 use irradia_splat::init;
+use irradia_splat::regularize::AngleCap;
 use irradia_splat::{
     Engine, FramePlanes, Gather, Noise, Optimizer, RenderOptions, SplatState, Splats, Statistics, Update, ViewParams,
     filter,
@@ -248,7 +249,7 @@ impl Trainer {
             Arc::make_mut(&mut dataset).keep_held_out();
         }
         let mut engine = Engine::new(SplatState::new(Splats::zeros(0, sh::MAX_DEGREE)));
-        let decisions = use_device(&mut engine, &options.device, &recipe, first_splats)?;
+        let decisions = use_device(&mut engine, &options.device, &recipe, first_splats, &cameras)?;
         let extent = init::camera_extent(&cameras);
         Ok(Self {
             clock: Clock::new(&recipe),
@@ -433,7 +434,7 @@ impl Trainer {
                 .as_ref()
                 .map(|(samples, reach)| (&samples[..], *reach, &camera.intrinsics)),
         };
-        let (update, has_lpips) = (self.update(&plan), self.options.lpips.is_some());
+        let (update, has_lpips) = (self.update(&plan, &camera), self.options.lpips.is_some());
         let ahead = self.sockets.are_empty().then(|| {
             let frame = (&camera, &options);
             self.device_loss
@@ -527,8 +528,8 @@ impl Trainer {
         loss
     }
 
-    /// The splat update of this step.
-    fn update(&self, plan: &StepPlan) -> Update {
+    /// The splat update of this step, whose view is that of `camera`.
+    fn update(&self, plan: &StepPlan, camera: &Camera) -> Update {
         let longer = self.pace.min(1.0).powf(f64::from(self.recipe.length_exponent)) as f32;
         let mut rates = plan.rates().scaled(longer);
         rates.means *= self.extent_of_rate;
@@ -560,6 +561,7 @@ impl Trainer {
                 step: self.clock.step,
             }),
             condition_cap: (limit > 0.0).then_some(limit),
+            angle_cap: AngleCap::of(camera),
         }
     }
 

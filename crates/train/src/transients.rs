@@ -159,8 +159,9 @@ impl Difference {
         let center = |at: usize, blocks: usize, side: u32| (at as f32 + 0.5) / blocks as f32 * side as f32;
         let x = center(i % self.grid.columns, self.grid.columns, k.width);
         let y = center(i / self.grid.columns, self.grid.rows, k.height);
-        let in_camera = Vec3::new((x - k.cx) / k.fx, (y - k.cy) / k.fy, 1.0) * self.depth[i];
-        self.camera.pose.world_from_camera(in_camera)
+        self.camera
+            .pose
+            .world_from_camera(k.ray(Vec2::new(x, y)) * self.depth[i])
     }
 
     /// The block in which this view sees the surface at `place`; `None` out of view and where it sees something else.

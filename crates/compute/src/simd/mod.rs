@@ -245,6 +245,9 @@ macro_rules! unroll {
     ($i:ident in 5 => $value:expr) => {
         $crate::unroll!(@ $i, $value, 0, 1, 2, 3, 4)
     };
+    ($i:ident in 6 => $value:expr) => {
+        $crate::unroll!(@ $i, $value, 0, 1, 2, 3, 4, 5)
+    };
     ($i:ident in 7 => $value:expr) => {
         $crate::unroll!(@ $i, $value, 0, 1, 2, 3, 4, 5, 6)
     };

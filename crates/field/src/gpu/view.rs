@@ -37,7 +37,7 @@ impl GpuFieldRenderer {
         })
     }
 
-    /// Renders the view of `camera`, of the field that was uploaded; its lens is ignored. Normals are not computed.
+    /// Renders the view of `camera`, of the field that was uploaded. Normals are not computed.
     ///
     /// # Errors
     /// When the device fails.

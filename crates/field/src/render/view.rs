@@ -31,7 +31,7 @@ pub struct FieldView {
     pub color: Vec<f32>,
     /// Opacity of the field in each pixel.
     pub alpha: Vec<f32>,
-    /// Depth along the camera's +Z, world units, the weighted mean along the ray; 0 where alpha is 0.
+    /// [Depth](irradia_scene::Intrinsics::depth), world units, the weighted mean along the ray; 0 where alpha is 0.
     pub depth: Vec<f32>,
     /// Depth at which the ray's transmittance falls below a half; 0 where it never does.
     pub median_depth: Vec<f32>,
@@ -44,10 +44,10 @@ pub struct FieldView {
 pub fn camera_ray(field: &Field, camera: &Camera, x: f32, y: f32) -> (Ray, f32) {
     let direction = camera.ray_direction(Vec2::new(x, y));
     let ray = field.space.ray(camera.pose.position.to_array(), direction.to_array());
-    (ray, direction.dot(camera.pose.rotation * Vec3::Z))
+    (ray, camera.depth_along(direction))
 }
 
-/// Renders the view of `camera`; its lens is ignored.
+/// Renders the view of `camera`.
 pub fn render_view(field: &Field, camera: &Camera, options: &RenderOptions) -> FieldView {
     let (width, height) = (camera.intrinsics.width, camera.intrinsics.height);
     let pixels = width as usize * height as usize;

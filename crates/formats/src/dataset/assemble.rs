@@ -5,12 +5,13 @@ use super::declared::{Declared, DeclaredView};
 use super::split;
 use super::visible::find_points_seen;
 use super::world::world_from_dataset;
-use super::{DEFAULT_MAX_SIDE, DatasetOptions};
+use super::{DEFAULT_MAX_SIDE, DatasetOptions, Lenses};
 use crate::FormatError;
 use crate::faces::{Cut, image_circle};
 use crate::image_file::{Header, read_header};
 use crate::map_file::MapFile;
 use crate::photo::PhotoFile;
+use crate::shown::Shown;
 use crate::undistort::Undistortion;
 use glam::DQuat;
 use image::metadata::Orientation;
@@ -54,8 +55,10 @@ struct Probed {
     jpeg: bool,
     /// At the actual size of the upright image, lens included.
     source: Intrinsics,
-    /// Set for distorted cameras by [`plan_cuts`].
+    /// Set for distorted cameras by [`plan_cuts`], unless photographs are kept as they are.
     cut: Option<Cut>,
+    /// What a photograph that is kept as it is shows, if not all.
+    shown: Option<Shown>,
 }
 
 impl Probed {
@@ -91,7 +94,7 @@ pub(super) fn assemble(declared: Declared, options: &DatasetOptions) -> Result<D
     let named = views.len();
 
     let mut probed: Vec<Result<Probed, Skipped>> = views.par_iter().map(|view| probe(view, ignores_exif)).collect();
-    plan_cuts(&views, &mut probed);
+    plan_cuts(&views, &mut probed, options.lenses);
     let reasons = skipped_warnings(&views, &probed);
     let usable: Vec<(DeclaredView, Probed)> = views
         .into_iter()
@@ -176,11 +179,12 @@ fn probe(view: &DeclaredView, ignores_exif: bool) -> Result<Probed, Skipped> {
         jpeg: header.jpeg,
         source,
         cut: None,
+        shown: None,
     })
 }
 
-/// Plans the pinhole images of every distinct distorted camera once, for all views that share it.
-fn plan_cuts(views: &[DeclaredView], probed: &mut [Result<Probed, Skipped>]) {
+/// Plans the pinhole images of every distinct distorted camera once, for all views that share it, or what its photographs show as they are.
+fn plan_cuts(views: &[DeclaredView], probed: &mut [Result<Probed, Skipped>], lenses: Lenses) {
     let mut distinct: Vec<Intrinsics> = Vec::new();
     for view in probed.iter().flatten() {
         if view.source.lens != Lens::Pinhole && !distinct.contains(&view.source) {
@@ -202,19 +206,37 @@ fn plan_cuts(views: &[DeclaredView], probed: &mut [Result<Probed, Skipped>]) {
             .ok()
             .flatten()
     };
-    let plans: Vec<Option<Cut>> = distinct
+    let plans: Vec<Plan> = distinct
         .par_iter()
-        .map(|source| Cut::plan(source, || circle(source)))
+        .map(|source| {
+            let stays = || Plan::Stays(Shown::of(source, || circle(source)));
+            if lenses == Lenses::Distorted {
+                return stays();
+            }
+            match Cut::plan(source, || circle(source)) {
+                Some(Cut::Faces(_)) if lenses == Lenses::Whole => stays(),
+                cut => cut.map_or(Plan::Impossible, Plan::Cut),
+            }
+        })
         .collect();
     for view in probed {
         let Ok(known) = view else { continue };
         if let Some(camera) = distinct.iter().position(|source| *source == known.source) {
             match &plans[camera] {
-                Some(plan) => known.cut = Some(plan.clone()),
-                None => *view = Err(Skipped::NoCamera),
+                Plan::Cut(cut) => known.cut = Some(cut.clone()),
+                Plan::Stays(shown) => known.shown = *shown,
+                Plan::Impossible => *view = Err(Skipped::NoCamera),
             }
         }
     }
+}
+
+/// What becomes of the photographs of a distorted camera.
+enum Plan {
+    Cut(Cut),
+    Stays(Option<Shown>),
+    /// The lens leaves no image.
+    Impossible,
 }
 
 /// Valid bounds: finite, in front of the camera, and in order.
@@ -244,7 +266,7 @@ fn faces_warning(usable: &[(DeclaredView, Probed)]) -> Option<String> {
     (cut > 0).then(|| {
         format!(
             "{cut} of {} photographs show more than one pinhole image can: each is cut into the faces of a cube, which are views of their \
-             own, such as NAME/front",
+             own, such as NAME/front (--lenses whole keeps them, on the CPU)",
             usable.len()
         )
     })
@@ -300,10 +322,12 @@ impl Finishing<'_> {
             jpeg: probed.jpeg,
             upright: (probed.source.width, probed.source.height),
             undistortion: plan,
+            shown: probed.shown,
             size: (intrinsics.width, intrinsics.height),
         };
         let map = |path: &Option<PathBuf>| {
-            path.clone().map(|path| {
+            // Those of a fisheye may be depths along the axis or distances.
+            path.clone().filter(|_| !intrinsics.lens.is_wide()).map(|path| {
                 Arc::new(MapFile {
                     path,
                     orientation: probed.orientation,

@@ -36,6 +36,7 @@ pub(crate) use declared::DeclaredPoints;
 pub(crate) use files::{is_image_name, list_files};
 use irradia_scene::Dataset;
 pub(crate) use npy::parse_table;
+use serde::{Deserialize, Serialize};
 pub use split::Holdout;
 use std::fmt;
 use std::path::{Path, PathBuf};
@@ -182,6 +183,43 @@ pub struct DatasetOptions {
     pub holdout: Holdout,
     /// The folder of the photographs, if it is not where the layout has it.
     pub images: Option<PathBuf>,
+    /// What becomes of distorted photographs.
+    pub lenses: Lenses,
+}
+
+/// What becomes of photographs by lenses that are no pinholes. Where they keep their distortion, [`irradia_scene::Intrinsics::lens`] has the lens.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Lenses {
+    /// Each is undistorted, or cut into the faces of a cube where one pinhole image would show too little of it.
+    #[default]
+    Undistorted,
+    /// Those that would be cut into faces keep their distortion, the others are undistorted.
+    Whole,
+    /// Each keeps its distortion.
+    Distorted,
+}
+
+impl Lenses {
+    const ALL: [Self; 3] = [Self::Undistorted, Self::Whole, Self::Distorted];
+
+    /// Its name.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Undistorted => "undistorted",
+            Self::Whole => "whole",
+            Self::Distorted => "distorted",
+        }
+    }
+}
+
+impl FromStr for Lenses {
+    type Err = String;
+
+    fn from_str(name: &str) -> Result<Self, String> {
+        let named = Self::ALL.into_iter().find(|lenses| lenses.name() == name);
+        named.ok_or_else(|| "expected undistorted, whole or distorted".to_owned())
+    }
 }
 
 /// The default limit on the longer side, in pixels, to which larger photographs are downscaled, as by the authors' code of 3DGS
@@ -196,6 +234,7 @@ impl Default for DatasetOptions {
             max_side: None,
             holdout: Holdout::AsDeclared,
             images: None,
+            lenses: Lenses::default(),
         }
     }
 }

@@ -140,6 +140,7 @@ fn parts(engine: &mut Engine, camera: &Camera, repeats: u32, limits: &Limits) {
     line("update, dense Adam", spent, adam(n), operations * n, limits);
     let with_all = Update {
         condition_cap: Some(1e6),
+        angle_cap: None,
         trained_fraction: 0.9,
         ..update(
             false,
@@ -189,6 +190,7 @@ pub fn update(dense: bool, regularizers: Regularizers) -> Update {
         },
         noise: None,
         condition_cap: None,
+        angle_cap: None,
     }
 }
 

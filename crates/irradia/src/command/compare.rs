@@ -264,9 +264,10 @@ fn sources(args: &Args) -> Result<Vec<Source>> {
             Some(protocol) => Reading {
                 format: args.reading.format.clone(),
                 images: args.reading.images.clone(),
+                lenses: args.reading.training(None).lenses,
                 ..protocol.reading(&scene)
             },
-            None => args.reading.reading(),
+            None => args.reading.training(None),
         };
         reading.check().map_err(by_option)?;
         let dataset = reading.read(data).ok();
@@ -365,7 +366,13 @@ fn request(args: &Args, program: &str, source: &Source, variant: &Variant, seed:
         Some(side) => option("--max-side", Some(side.to_string())),
         None => option("--downscale", Some(reading.downscale.to_string())),
     }
+    option("--lenses", Some(reading.lenses.name().to_owned()));
     option("--holdout", reading.holdout.clone());
+    let images = reading.images.as_ref().map(std::path::absolute);
+    option(
+        "--images",
+        images.and_then(Result::ok).map(|path| path.display().to_string()),
+    );
     option("--background", args.background().map(|b| b.to_string()));
     // Published figures are those of the given poses.
     option("--poses", args.protocol.map(|_| "given".to_owned()));

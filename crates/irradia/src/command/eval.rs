@@ -78,6 +78,9 @@ pub fn run(args: &Args) -> Result<()> {
         // The run was trained on all views except those that it held out.
         reading.holdout = run.as_ref().and_then(|record| record.input.reading.holdout.clone());
     }
+    if reading.lenses.is_none() {
+        reading.lenses = run.as_ref().map(|record| record.input.reading.lenses);
+    }
     let dataset = scene.place(reading.read(&args.data)?);
     let background = match (args.background, &run) {
         (None, None) => Background::usual(&dataset, false)?,

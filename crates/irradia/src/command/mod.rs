@@ -24,7 +24,8 @@ use crate::Usage;
 use crate::terminal::note;
 use anyhow::{Context, Result};
 use clap::builder::RangedU64ValueParser;
-use irradia_runs::formats::SplatFormat;
+use irradia_compute::DeviceChoice;
+use irradia_runs::formats::{Lenses, SplatFormat};
 use irradia_runs::scene::Dataset;
 use irradia_runs::{Reading, RunError};
 use std::path::{Path, PathBuf};
@@ -69,6 +70,10 @@ pub struct DataArgs {
     /// Folder of the photographs, if it is not where the layout of the dataset has it
     #[arg(long, value_name = "DIR")]
     pub images: Option<PathBuf>,
+    /// Distorted photographs are undistorted, and cut into faces where one image would show too little (undistorted); kept as their lens shows
+    /// them in place of faces (whole: the default of training on the CPU); or kept in any case (distorted)
+    #[arg(long, value_name = "undistorted|whole|distorted", hide_possible_values = true)]
+    pub lenses: Option<Lenses>,
     /// colmap, nerfstudio, blender, llff, nerfies, opensfm, metashape, realitycapture, polycam, record3d, nvm or bundler; detected
     /// from the folder when absent
     #[arg(long)]
@@ -86,6 +91,17 @@ impl DataArgs {
             max_side: self.max_side.or(usual.max_side.filter(|_| !sized)),
             holdout: self.holdout.clone(),
             images: self.images.clone(),
+            lenses: self.lenses.unwrap_or(usual.lenses),
+        }
+    }
+
+    /// As [`DataArgs::reading`], to train on `device`: the kernels of splats on GPUs are those of a pinhole.
+    pub fn training(&self, device: Option<&str>) -> Reading {
+        let on_cpu = device.is_none_or(|device| device.parse() == Ok(DeviceChoice::Cpu));
+        let usual = if on_cpu { Lenses::Whole } else { Lenses::Undistorted };
+        Reading {
+            lenses: self.lenses.unwrap_or(usual),
+            ..self.reading()
         }
     }
 

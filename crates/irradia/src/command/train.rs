@@ -220,7 +220,7 @@ fn input(args: &Args) -> Result<TrainInput> {
         memory: args.memory,
         seed: args.seed,
         lpips,
-        reading: args.reading.reading(),
+        reading: args.reading.training(args.device.as_deref()),
         background: args.background,
         from: args.from.clone(),
         device: args
@@ -302,10 +302,11 @@ fn read(input: TrainInput) -> Result<(TrainRequest, Dataset)> {
     Ok((request, dataset))
 }
 
-/// Compares the poses of the dataset of `input` with its photographs, at a size that does not depend on that of the training.
+/// Compares the poses of the dataset of `input` with its photographs, undistorted and at a size that does not depend on that of the training.
 fn check(input: &TrainInput) -> Result<PoseCheck> {
     let mut input = input.clone();
     (input.reading.downscale, input.reading.max_side) = (1.0, Reading::default().max_side);
+    input.reading.lenses = irradia_runs::formats::Lenses::Undistorted;
     Ok(check_poses(&read(input)?.1))
 }
 

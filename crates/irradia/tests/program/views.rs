@@ -188,3 +188,36 @@ fn views_with_colliding_names_get_separate_files() {
         assert_eq!(files_under(&folder.path().join(name)).len(), 2, "{name}");
     }
 }
+
+/// A fisheye of 190 degrees is trained on as it is: no faces, no pixels beyond its circle, and views by a pinhole look right.
+#[test]
+fn photographs_of_wide_lenses_are_trained_on_and_evaluated_as_they_are() {
+    let folder = tempfile::tempdir().expect("a folder");
+    irradia(
+        folder.path(),
+        "synth fisheye --scene room --views 16 --size 96x96 --lens fisheye",
+    )
+    .success();
+    let run = folder.path().join("run");
+    let ended = irradia(folder.path(), "train fisheye --out run --steps 300 --threads 2").success();
+    assert!(ended.stderr.contains("splats are antialiased"), "{}", ended.stderr);
+    assert!(!ended.stderr.contains("cut into the faces"), "{}", ended.stderr);
+    assert_eq!(json(&run.join("cameras.json")).as_array().map(Vec::len), Some(16));
+    let held_out = json(&run.join("report.json"))["psnr"].as_f64().expect("PSNR");
+    assert!(held_out > 20.0, "{held_out} dB by a pinhole");
+
+    let trained_on = |option: &str| {
+        irradia(
+            folder.path(),
+            &format!("eval run --data fisheye --split train --json scores.json {option}"),
+        )
+        .success();
+        let scores = json(&folder.path().join("scores.json"));
+        let views = scores["views"].as_array().expect("views").len();
+        (views, scores["psnr"].as_f64().expect("PSNR"))
+    };
+    let (photographs, psnr) = trained_on("");
+    assert!(photographs == 16 && psnr > 22.0, "{photographs} {psnr}");
+    let (faces, psnr) = trained_on("--lenses undistorted");
+    assert!(faces > 16 && psnr > 18.0, "{faces} {psnr}");
+}

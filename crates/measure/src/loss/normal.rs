@@ -10,7 +10,7 @@
 //!
 //! A normal has no scale, and no absolute depth. Samples at edges of depth do not count.
 
-use glam::DVec3;
+use glam::{DVec3, Vec2};
 use irradia_compute::simd::Scalar;
 use irradia_scene::Intrinsics;
 
@@ -125,14 +125,7 @@ impl NormalLoss {
             }
         }
         let is_edge = |a: f64, b: f64| (a - b).abs() > EDGE * a.min(b);
-        let ray = |[x, y]: [u32; 2]| {
-            let k = camera;
-            let center = [
-                f64::from(x) + 0.5 - f64::from(k.cx),
-                f64::from(y) + 0.5 - f64::from(k.cy),
-            ];
-            DVec3::new(center[0] / f64::from(k.fx), center[1] / f64::from(k.fy), 1.0)
-        };
+        let ray = |[x, y]: [u32; 2]| camera.ray(Vec2::new(x as f32 + 0.5, y as f32 + 0.5)).as_dvec3();
         let given = DVec3::from_array(sample.normal.map(f64::from));
         let counts = !is_edge(depths[0], depths[1]) && !is_edge(depths[2], depths[3]) && given.is_finite();
         counts.then(|| Stencil {

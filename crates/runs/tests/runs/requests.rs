@@ -162,6 +162,7 @@ fn a_request_round_trips() {
             max_side: None,
             holdout: Some("5".into()),
             images: Some(std::path::absolute("photographs").expect("a path")),
+            lenses: irradia_formats::Lenses::Whole,
         },
         ..input(folder.path(), "run", 4)
     };

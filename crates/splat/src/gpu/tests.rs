@@ -225,6 +225,7 @@ pub(super) fn usual_update() -> Update {
         },
         noise: None,
         condition_cap: None,
+        angle_cap: None,
     }
 }
 
@@ -252,6 +253,7 @@ fn steps_agree_with_the_cpu_under_every_option_of_an_update() {
             regularizers: weights,
             statistics: Some(Statistics::AbsoluteGradient),
             condition_cap: Some(50.0),
+            angle_cap: None,
             ..base
         },
         Update {
@@ -342,6 +344,7 @@ fn noise_moves_faint_splats_by_the_given_amount_and_opaque_ones_not_at_all() {
             step: 17,
         }),
         condition_cap: None,
+        angle_cap: None,
     });
     let after = engine.state();
     let (mut squares, mut faint) = (0.0, 0);

@@ -47,6 +47,12 @@ impl ChunkBounds {
     /// For each chunk, whether `view` may see some of its splats.
     pub(super) fn seen(&self, view: &ViewParams, seen: &mut Vec<bool>) {
         let planes = view_planes(view);
+        // The sides of a lens's image are no planes: there only what is behind the camera is left out, if the lens does not show it.
+        let planes = match &view.lens {
+            None => &planes[..],
+            Some(lens) if lens.is_wide() => &[],
+            Some(_) => &planes[..1],
+        };
         self.bounds
             .par_iter()
             .with_min_len(256)
@@ -195,6 +201,7 @@ mod tests {
                 width: 64,
                 height: 48,
                 near: 0.01,
+                lens: None,
             };
             let filter = vec![0.04; if round % 2 == 0 { 0 } else { splats.stride() }];
             let mut renderer = Renderer::new();

@@ -2,13 +2,15 @@
 //! lanes, and here a lane is one `f64`. Only the loops around them are written a second time, as simply as possible.
 
 use super::blend::{ALPHA_MAX, LOG2_ALPHA_MIN, TRANSMITTANCE_MIN, fragment, fragment_vjp};
+use super::lens::LensParams;
 use super::project::{Geometry, footprint_gradient, project, project_vjp, quadratic};
 use super::sh::{MAX_COEFFICIENTS, basis, basis_vjp, direction, direction_vjp};
 use super::view::ViewParams;
 use super::{CameraGradient, Gather, OutputGradient, RenderOptions, Renderer, SplatGradients};
 use crate::{COLUMN_NAMES, Splats};
+use glam::DVec3;
 use irradia_compute::simd::{Double, Level};
-use irradia_scene::{GaussianCloud, Rng, sh::coefficients};
+use irradia_scene::{GaussianCloud, Intrinsics, Lens, Rng, sh::coefficients};
 use irradia_testkit::differences::Differences;
 use irradia_testkit::relative_difference;
 
@@ -46,8 +48,40 @@ fn geometry(flat: &[f64]) -> Geometry<f64> {
     }
 }
 
+/// Distortion, rational, and so strong that the limit is within the image; a fisheye with a prism; the model of the field of view; a panorama.
+const LENSES: [Lens; 5] = [
+    Lens::Opencv {
+        k: [0.12, -0.08, 0.01, 0.02, 0.01, 0.0],
+        p: [-0.01, 0.02],
+    },
+    Lens::Opencv {
+        k: [-0.9, 0.0, 0.0, 0.0, 0.0, 0.0],
+        p: [0.01, 0.0],
+    },
+    Lens::Fisheye {
+        k: [0.02, -0.01, 0.003, -0.0005],
+        p: [0.001, -0.002],
+        s: [0.004, -0.003],
+    },
+    Lens::Fov { omega: 0.9 },
+    Lens::Equirectangular,
+];
+
+fn intrinsics(view: &ViewParams, lens: Lens) -> Intrinsics {
+    let [[fx, fy], [cx, cy]] = [view.focal, view.principal].map(|pair| pair.map(|v| v as f32));
+    Intrinsics {
+        width: view.width,
+        height: view.height,
+        fx,
+        fy,
+        cx,
+        cy,
+        lens,
+    }
+}
+
 impl Scene {
-    /// One of six configurations, `seed` 1 to 6, with an image of this size.
+    /// One of six configurations with an image of this size, by a pinhole for `seed` 1 to 6, by a lens for 7 to 11.
     fn new(seed: u64, width: u32, height: u32) -> Self {
         let (antialias, filter, degree) = [
             (false, None, 3),
@@ -56,20 +90,30 @@ impl Scene {
             (true, Some(0.02), 3),
             (false, None, 0),
             (false, Some(0.1), 1),
-        ][seed as usize - 1];
+        ][(seed as usize - 1) % 6];
         let mut rng = Rng::new(seed, 77);
+        let lens = if seed <= 6 {
+            Lens::Pinhole
+        } else {
+            LENSES[seed as usize - 7]
+        };
+        // Wide lenses show what is behind the camera as well.
         let scale = f64::from(width) / 21.0;
+        let zoom = if lens.is_wide() { 0.4 } else { 1.0 };
+        let mut view = ViewParams {
+            // A rotated camera, off-centre, with pixels that are not square.
+            rotation: rotation(0.2, -0.1, 0.3),
+            translation: [0.1, -0.2, 0.05],
+            focal: [19.0, 23.0].map(|f| f * scale * zoom),
+            principal: [11.3, 8.1].map(|p| p * scale),
+            width,
+            height,
+            near: 0.2,
+            lens: None,
+        };
+        view.lens = LensParams::new(&intrinsics(&view, lens));
         Self {
-            view: ViewParams {
-                // A rotated camera, off-centre, with pixels that are not square.
-                rotation: rotation(0.2, -0.1, 0.3),
-                translation: [0.1, -0.2, 0.05],
-                focal: [19.0, 23.0].map(|f| f * scale),
-                principal: [11.3, 8.1].map(|p| p * scale),
-                width,
-                height,
-                near: 0.2,
-            },
+            view,
             antialias,
             filter,
             degree,
@@ -312,7 +356,7 @@ fn splats(rng: &mut Rng, degree: u32) -> Vec<Flat> {
 #[test]
 fn every_gradient_matches_finite_differences() {
     let mut compared = 0;
-    for seed in 1..=6 {
+    for seed in 1..=11 {
         let scene = Scene::new(seed, 21, 18);
         let splats = splats(&mut Rng::new(seed, 78), scene.degree);
         assert!(scene.project(&splats).len() >= 7, "most are visible");
@@ -375,10 +419,46 @@ fn every_gradient_matches_finite_differences() {
     assert!(compared > 1000);
 }
 
+/// The renderer's own code for lenses against the lenses of cameras, before and behind them, and the limit of a lens that folds.
+#[test]
+fn a_lens_shows_points_where_its_camera_has_them() {
+    for lens in LENSES {
+        let view = Scene::new(1, 640, 480).view;
+        let k = intrinsics(&view, lens);
+        let params = LensParams::new(&k).expect("not a pinhole");
+        let focal = [k.fx, k.fy].map(f64::from);
+        let (mut shown, mut rng) = (0, Rng::new(5, 5));
+        for _ in 0..1000 {
+            let point = [0; 3].map(|_| f64::from(rng.range(-2.0, 2.0)));
+            let ours = params.project(point, focal, [k.cx, k.cy].map(f64::from));
+            let expected = k.project(DVec3::from(point).as_vec3());
+            let inside = expected
+                .filter(|(at, _)| (0.0..k.width as f32).contains(&at.x) && (0.0..k.height as f32).contains(&at.y));
+            if let Some((at, depth)) = inside {
+                let (pixel, z) = ours.expect("the image shows it");
+                shown += 1;
+                let apart = (pixel[0] - f64::from(at.x)).hypot(pixel[1] - f64::from(at.y));
+                assert!(
+                    apart < 1e-3 && (z - f64::from(depth)).abs() < 1e-5,
+                    "{lens:?} {point:?}: {apart}"
+                );
+            } else if let Some((pixel, _)) = ours {
+                // What a lens is continued by is outside the image.
+                let [x, y] = [pixel[0] / f64::from(k.width), pixel[1] / f64::from(k.height)];
+                assert!(
+                    !((0.01..0.99).contains(&x) && (0.01..0.99).contains(&y)),
+                    "{lens:?} {point:?}: {pixel:?}"
+                );
+            }
+        }
+        assert!(shown > 10, "{lens:?} {shown}");
+    }
+}
+
 /// The whole renderer, with its own loops over chunks, tiles, blocks and lanes, against the simple loops above.
 #[test]
 fn every_level_matches_double_precision() {
-    for seed in 1..=6 {
+    for seed in 1..=11 {
         // Four tiles, complete or three cut by the image's border; 66 splats do not fill a whole number of vectors.
         let whole = seed % 2 == 0;
         let (width, height) = if whole { (64, 64) } else { (63, 54) };

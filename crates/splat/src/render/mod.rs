@@ -10,6 +10,7 @@ mod cull;
 mod develop;
 mod harmonics;
 mod inspect;
+mod lens;
 mod project;
 mod sh;
 mod touch;
@@ -22,6 +23,7 @@ pub use blend::{ALPHA_MAX, TRANSMITTANCE_MIN};
 pub use cull::ChunkBounds;
 pub use harmonics::CHUNK;
 pub use inspect::{Hit, Shape};
+pub use lens::LensParams;
 pub use project::{ALPHA_MIN, DILATION};
 pub use view::ViewParams;
 

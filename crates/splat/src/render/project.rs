@@ -3,8 +3,9 @@
 //!
 //! Symbols: `m` mean in the world, `x = R m + t` in the camera, `q` unit quaternion, `s` standard deviations,
 //! `J` Jacobian of the projection, `U = J R Rot(q)` (2x3), `V = U diag(s)`, `cov = V V^T + dilation`,
-//! `conic = cov^-1 = [A B; B C]`. All functions are generic over lanes: `f32` vectors train, `f64` is tested.
+//! `conic = cov^-1 = [A B; B C]`. J is that of a pinhole, or of a lens ([`super::lens`]). All functions are generic over lanes: `f32` vectors train, `f64` is tested.
 
+use super::lens::LensAt;
 use super::view::ViewLanes;
 use irradia_compute::simd::{Lanes, Mask, Scalar};
 use irradia_compute::unroll;
@@ -39,7 +40,7 @@ pub(super) struct CameraTerms<F> {
 pub(super) struct Footprint<F> {
     /// Pixel coordinates of the centre.
     pub xy: [F; 2],
-    /// Along +Z.
+    /// Along +Z, or for wide lenses the distance.
     pub depth: F,
     /// `[A, B, C]` of `sigma = (A dx^2 + C dy^2) / 2 + B dx dy`.
     pub conic: [F; 3],
@@ -59,7 +60,7 @@ pub(super) struct FootprintGradient<F> {
 }
 
 /// Intermediate values shared by forward and backward.
-struct Intermediate<F> {
+struct Intermediate<F: Lanes> {
     x: [F; 3],
     inv_z: F,
     /// Clamped tangents and whether the clamp is active.
@@ -71,6 +72,8 @@ struct Intermediate<F> {
     scale: [F; 3],
     /// Variance along each axis before the 3D filter divided by that after it.
     fraction: [F; 3],
+    /// What a lens shows at the mean; `None` for a pinhole.
+    lens: Option<LensAt<F>>,
     /// Rows of J R.
     jr: [[F; 3]; 2],
     v: [[F; 3]; 2],
@@ -132,9 +135,17 @@ fn intermediate<F: Lanes>(view: &ViewLanes<F>, g: &Geometry<F>, filter: Option<F
         }
         None => (own_scale, [one; 3], one),
     };
-    // J = [[fx/z, 0, -fx tx/z], [0, fy/z, -fy ty/z]] with the clamped tangents tx, ty.
-    let j_scale = unroll!(r in 2 => view.f[r] * inv_z);
-    let jr = unroll!(r in 2 => unroll!(c in 3 => j_scale[r] * (view.r[r][c] - tangent[r] * view.r[2][c])));
+    let lens = view.lens.as_ref().map(|lens| lens.at(x, view.f, view.c));
+    let jr = match &lens {
+        Some(lens) => {
+            unroll!(r in 2 => unroll!(c in 3 => dot(lens.jacobian[r], [view.r[0][c], view.r[1][c], view.r[2][c]])))
+        }
+        // J = [[fx/z, 0, -fx tx/z], [0, fy/z, -fy ty/z]] with the clamped tangents tx, ty.
+        None => {
+            let j_scale = unroll!(r in 2 => view.f[r] * inv_z);
+            unroll!(r in 2 => unroll!(c in 3 => j_scale[r] * (view.r[r][c] - tangent[r] * view.r[2][c])))
+        }
+    };
     let u: [[F; 3]; 2] = unroll!(r in 2 => unroll!(c in 3 => dot(jr[r], [rot[0][c], rot[1][c], rot[2][c]])));
     let v: [[F; 3]; 2] = unroll!(r in 2 => unroll!(c in 3 => u[r][c] * scale[c]));
     let cov = [dot(v[0], v[0]), dot(v[0], v[1]), dot(v[1], v[1])];
@@ -157,6 +168,7 @@ fn intermediate<F: Lanes>(view: &ViewLanes<F>, g: &Geometry<F>, filter: Option<F
         rot,
         scale,
         fraction,
+        lens,
         jr,
         v,
         cov,
@@ -186,13 +198,19 @@ pub(super) fn project<F: Lanes>(
     } else {
         own_opacity
     };
-    let xy: [F; 2] = unroll!(i in 2 => view.f[i] * at.x[i] * at.inv_z + view.c[i]);
+    let (xy, depth) = match &at.lens {
+        Some(lens) => (lens.xy, lens.depth),
+        None => (unroll!(i in 2 => view.f[i] * at.x[i] * at.inv_z + view.c[i]), at.x[2]),
+    };
     // alpha >= 1/255 inside d^T conic d <= 2 ln(255 opacity), whose box has half sizes sqrt(2 ln(255 opacity) cov_ii).
     let reach = (opacity * opacity.splat(1.0 / ALPHA_MIN)).map(|v| Scalar::from_f64(2.0 * v.to_f64().max(1.0).ln()));
     let extent = [(reach * a).sqrt(), (reach * c).sqrt()];
     let zero = reach.splat(0.0);
     let half = reach.splat(0.5);
-    let mut visible = view.near.lt(at.x[2]).and(reach.splat(ALPHA_MIN).le(opacity));
+    let mut visible = view.near.lt(depth).and(reach.splat(ALPHA_MIN).le(opacity));
+    if let Some(lens) = &at.lens {
+        visible = visible.and(lens.shown);
+    }
     for i in 0..2 {
         // Some pixel centre (0.5 .. size - 0.5) must lie within the box; NaN fails both.
         let low = (xy[i] - extent[i]).le(view.size[i] - half);
@@ -205,7 +223,7 @@ pub(super) fn project<F: Lanes>(
     (
         Footprint {
             xy,
-            depth: at.x[2],
+            depth,
             conic: [c * inv_det, -b * inv_det, a * inv_det],
             opacity,
             extent,
@@ -256,7 +274,6 @@ pub(super) fn project_vjp<F: Lanes>(
     let at = intermediate(view, g, filter);
     let one = at.inv_z.splat(1.0);
     let two = one.splat(2.0);
-    let zero = one.splat(0.0);
     let inv_det = one / at.det_dilated;
     let [a, b, c] = at.cov_dilated;
 
@@ -307,27 +324,16 @@ pub(super) fn project_vjp<F: Lanes>(
     let v_rot: [[F; 3]; 3] = unroll!(j in 3 => unroll!(k in 3 => at.jr[0][j] * v_u[0][k] + at.jr[1][j] * v_u[1][k]));
     let v_jr: [[F; 3]; 2] = unroll!(r in 2 => unroll!(j in 3 => dot(v_u[r], at.rot[j])));
 
-    // J R: row r is f_r / z (R_r - tangent_r R_2).
-    let mut v_x = [zero; 3];
-    let mut v_r = [[zero; 3]; 3];
-    for r in 0..2 {
-        let j_scale = view.f[r] * at.inv_z;
-        for c in 0..3 {
-            v_r[r][c] = j_scale * v_jr[r][c];
-            v_r[2][c] -= at.tangent[r] * v_r[r][c];
+    let (v_x, mut v_r) = match &at.lens {
+        Some(lens) => {
+            let v_jacobian = unroll!(r in 2 => unroll!(i in 3 => dot(v_jr[r], view.r[i])));
+            let v_r = unroll!(i in 3 => unroll!(c in 3 => {
+                lens.jacobian[0][i] * v_jr[0][c] + lens.jacobian[1][i] * v_jr[1][c]
+            }));
+            (lens.vjp(v_out.xy, v_out.depth, v_jacobian), v_r)
         }
-        let v_j_scale = dot(v_jr[r], view.r[r]) - at.tangent[r] * dot(v_jr[r], view.r[2]);
-        v_x[2] -= v_j_scale * j_scale * at.inv_z;
-        let v_tangent = -j_scale * dot(v_jr[r], view.r[2]);
-        let tangent = at.x[r] * at.inv_z;
-        let [least, largest] = view.limits[r];
-        let v_tangent = v_tangent.masked(least.lt(tangent).and(tangent.lt(largest)));
-        // The pixel position moves with the tangent, too, unclamped.
-        let v_free = v_tangent + v_out.xy[r] * view.f[r];
-        v_x[r] += v_free * at.inv_z;
-        v_x[2] -= v_free * tangent * at.inv_z;
-    }
-    v_x[2] += v_out.depth;
+        None => pinhole_vjp(view, &at, v_out, v_jr),
+    };
     let v_mean = unroll!(j in 3 => dot(v_x, [view.r[0][j], view.r[1][j], view.r[2][j]]));
     for i in 0..3 {
         for j in 0..3 {
@@ -361,4 +367,37 @@ pub(super) fn project_vjp<F: Lanes>(
         translation: v_x,
     };
     (geometry, camera)
+}
+
+/// The gradients of the mean in the camera and of R, from that of `J R` and of the footprint.
+#[inline(always)]
+fn pinhole_vjp<F: Lanes>(
+    view: &ViewLanes<F>,
+    at: &Intermediate<F>,
+    v_out: &FootprintGradient<F>,
+    v_jr: [[F; 3]; 2],
+) -> ([F; 3], [[F; 3]; 3]) {
+    let zero = at.inv_z.splat(0.0);
+    // J R: row r is f_r / z (R_r - tangent_r R_2).
+    let mut v_x = [zero; 3];
+    let mut v_r = [[zero; 3]; 3];
+    for r in 0..2 {
+        let j_scale = view.f[r] * at.inv_z;
+        for c in 0..3 {
+            v_r[r][c] = j_scale * v_jr[r][c];
+            v_r[2][c] -= at.tangent[r] * v_r[r][c];
+        }
+        let v_j_scale = dot(v_jr[r], view.r[r]) - at.tangent[r] * dot(v_jr[r], view.r[2]);
+        v_x[2] -= v_j_scale * j_scale * at.inv_z;
+        let v_tangent = -j_scale * dot(v_jr[r], view.r[2]);
+        let tangent = at.x[r] * at.inv_z;
+        let [least, largest] = view.limits[r];
+        let v_tangent = v_tangent.masked(least.lt(tangent).and(tangent.lt(largest)));
+        // The pixel position moves with the tangent, too, unclamped.
+        let v_free = v_tangent + v_out.xy[r] * view.f[r];
+        v_x[r] += v_free * at.inv_z;
+        v_x[2] -= v_free * tangent * at.inv_z;
+    }
+    v_x[2] += v_out.depth;
+    (v_x, v_r)
 }

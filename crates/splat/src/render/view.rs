@@ -1,9 +1,10 @@
 use super::CameraGradient;
+use super::lens::{LensLanes, LensParams};
 use irradia_compute::simd::Simd;
 use irradia_compute::unroll;
 use irradia_scene::Camera;
 
-/// A pinhole camera as the renderer uses it, in double precision for the tests.
+/// A camera as the renderer uses it, in double precision for the tests.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ViewParams {
     /// Rotation of `x_cam = R x + t`, row-major.
@@ -20,10 +21,12 @@ pub struct ViewParams {
     pub height: u32,
     /// Near plane, world units.
     pub near: f64,
+    /// What bends the rays; `None` for a pinhole.
+    pub lens: Option<LensParams>,
 }
 
 impl ViewParams {
-    /// From a scene camera; its lens is ignored (readers undistort).
+    /// From a scene camera.
     pub fn new(camera: &Camera) -> Self {
         let (r, t) = camera.pose.camera_from_world_parts();
         let r = r.to_cols_array_2d();
@@ -36,6 +39,7 @@ impl ViewParams {
             width: k.width,
             height: k.height,
             near: f64::from(camera.near),
+            lens: LensParams::new(k),
         }
     }
 
@@ -87,6 +91,7 @@ impl ViewParams {
             size: [simd.splat(f64::from(self.width)), simd.splat(f64::from(self.height))],
             center: unroll!(i in 3 => simd.splat(center[i])),
             near: simd.splat(self.near),
+            lens: self.lens.as_ref().map(|lens| lens.lanes(simd)),
         }
     }
 }
@@ -101,4 +106,5 @@ pub(super) struct ViewLanes<F> {
     pub size: [F; 2],
     pub center: [F; 3],
     pub near: F,
+    pub lens: Option<LensLanes<F>>,
 }

@@ -27,10 +27,10 @@ const BLACK: u8 = 20;
 const RIM: f64 = 0.98;
 
 /// A side of the cube around a camera: what is added to the photograph's name, and the rotation from its axes to the photograph's.
-type Side = (&'static str, DQuat);
+pub(crate) type Side = (&'static str, DQuat);
 
 /// The sides in the order of their names.
-fn sides() -> [Side; 6] {
+pub(crate) fn sides() -> [Side; 6] {
     [
         ("back", DQuat::from_xyzw(0.0, 1.0, 0.0, 0.0)),
         ("down", DQuat::from_rotation_x(-FRAC_PI_2)),

@@ -2,6 +2,7 @@
 //! undistorts them or cuts them into faces, and downscales them.
 
 use super::declared::{Declared, DeclaredView};
+use super::panoramas;
 use super::split;
 use super::visible::find_points_seen;
 use super::world::world_from_dataset;
@@ -90,6 +91,9 @@ pub(super) fn assemble(declared: Declared, options: &DatasetOptions) -> Result<D
         downscale,
         mut warnings,
     } = declared;
+    if options.lenses != Lenses::Undistorted {
+        views = panoramas::join(views, &root);
+    }
     views.sort_by(|a, b| a.name.cmp(&b.name));
     let named = views.len();
 

@@ -18,6 +18,7 @@ mod nerfstudio;
 mod npy;
 pub(crate) mod nvm;
 pub(crate) mod opensfm;
+mod panoramas;
 pub(crate) mod phone;
 pub(crate) mod realitycapture;
 mod split;

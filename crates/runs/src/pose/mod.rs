@@ -2,7 +2,7 @@
 //!
 //! ```text
 //! images/          the posed photographs: links to the originals where the file system allows, else copies
-//! frames/, faces/  frames of films and faces of panoramas, which images/ links to
+//! frames/, faces/  frames of films, and faces of panoramas with these themselves, which images/ links to
 //! sparse/0/*.bin   cameras, poses and points with tracks, in COLMAP's format; further models in sparse/1, ..
 //! pose.json        what happened: numbers, times, and each photograph left out with its reason
 //! doctor.html      what is wrong with the capture, and where to take further photographs; doctor.json and doctor/*.png belong to it

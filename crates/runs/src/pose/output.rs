@@ -73,7 +73,7 @@ pub(super) fn link_photo(out: &Path, photo: &PhotoEntry) -> Result<(), RunError>
 }
 
 /// Makes `to` the file `from`: a hard link where the file system allows it, else a copy.
-fn link(from: &Path, to: &Path) -> Result<(), RunError> {
+pub(super) fn link(from: &Path, to: &Path) -> Result<(), RunError> {
     let same = |a: &Path, b: &Path| fs::canonicalize(a).is_ok_and(|a| fs::canonicalize(b).is_ok_and(|b| a == b));
     if same(from, to) {
         return Ok(());

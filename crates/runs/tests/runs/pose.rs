@@ -1,7 +1,7 @@
 //! Photographs in, a dataset out: ray-traced photographs whose poses are known, and folders with which nothing can be done.
 
 use glam::{Quat, Vec3};
-use irradia_runs::formats::{DatasetFormat, DatasetOptions, read_dataset, read_image, write_png};
+use irradia_runs::formats::{DatasetFormat, DatasetOptions, Lenses, read_dataset, read_image, write_png};
 use irradia_runs::scene::{Camera, Dataset, Photo, PointCloud, Rng, View};
 use irradia_runs::synth::{Capture, Part, SceneName, Shot, SynthOptions};
 use irradia_runs::{
@@ -532,6 +532,31 @@ fn panoramas_in_folders_are_posed_by_their_faces() {
             .position
     };
     assert!(of("front").distance(of("up")) < 1e-5);
+    // Kept whole, panoramas stand for their faces.
+    let options = DatasetOptions {
+        lenses: Lenses::Whole,
+        ..DatasetOptions::default()
+    };
+    let whole = read_dataset(&out, &options).unwrap();
+    assert_eq!(whole.views.len(), truth.len());
+    let points = &whole.points.as_ref().unwrap().positions;
+    for (view, (stem, _)) in whole.views.iter().zip(&truth) {
+        assert_eq!(view.name, format!("faces/panoramas/{stem}.png"));
+        let (pose, of_face) = (view.camera.pose, front(stem));
+        assert!(pose.position.distance(of_face.position) < 1e-5);
+        assert!(pose.rotation.angle_between(of_face.rotation) < 1e-3);
+        assert_eq!(
+            (view.photo.load().unwrap().width, view.camera.intrinsics.width),
+            (768, 768)
+        );
+        // Of a point that a face sees the direction is known: the panorama sees it as well.
+        assert!(view.points_seen.len() > 10);
+        assert!(
+            view.points_seen
+                .iter()
+                .all(|i| view.camera.sees(points[*i as usize]).is_some())
+        );
+    }
     // They are added to nothing.
     let into = PoseInput {
         into: true,

@@ -4,7 +4,7 @@ use crate::folder::camera_names_beside;
 use crate::scene_file::render_knobs_beside;
 use crate::{RunFolder, TrainInput};
 use irradia_edit::{Photographs, Taken};
-use irradia_scene::Photo;
+use irradia_scene::{Lens, Photo};
 use rayon::prelude::*;
 use std::path::Path;
 
@@ -23,6 +23,14 @@ pub fn photographs_of(scene: &Path) -> Option<Photographs> {
 fn read(scene: &Path) -> Option<Taken> {
     let input = TrainInput::of_run(scene.parent()?).ok()?;
     let dataset = input.reading.read(&input.data).ok()?;
+    // The cameras of the scene are pinholes: photographs that keep their distortion show something else.
+    if dataset
+        .views
+        .iter()
+        .any(|view| view.camera.intrinsics.lens != Lens::Pinhole)
+    {
+        return None;
+    }
     let background = render_knobs_beside(scene).background;
     let names = camera_names_beside(scene)?;
     let step = names.len().div_ceil(MOST).max(1);

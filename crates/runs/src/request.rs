@@ -265,6 +265,12 @@ impl TrainInput {
         })
     }
 
+    /// All changes of the recipe.
+    fn overrides(&self) -> Vec<String> {
+        let most = self.max_splats.map(|n| format!("max_splats={n}"));
+        self.set.iter().cloned().chain(most).collect()
+    }
+
     /// The validated request: every setting in range, the recipe read and resolved. Neither the dataset nor the run's folder is
     /// accessed.
     ///
@@ -286,9 +292,7 @@ impl TrainInput {
         }
         self.reading = self.reading.with_absolute_paths();
         let reading = self.reading.check()?;
-        let mut overrides = self.set.clone();
-        overrides.extend(self.max_splats.map(|n| format!("max_splats={n}")));
-        let recipe = read_recipe(&self.recipe, &overrides)?;
+        let recipe = read_recipe(&self.recipe, &self.overrides())?;
         self.data = std::path::absolute(&self.data).unwrap_or(self.data);
         if let Some(from) = &mut self.from {
             if recipe.stage[0].represents == Represents::Field {
@@ -373,6 +377,17 @@ impl TrainRequest {
         missing.then(line).into_iter().collect()
     }
 
+    /// Puts the recipe's changes for runs without a number of steps or a budget before those of the input, which take precedence.
+    pub(crate) fn choose_changes(&mut self) -> Result<(), RunError> {
+        let input = &mut self.input;
+        let is_free = input.steps.is_none() && input.budget.is_none() && input.replay.is_none();
+        if is_free && !self.recipe.unhurried.is_empty() {
+            input.set.splice(0..0, self.recipe.unhurried.iter().cloned());
+            self.recipe = read_recipe(&input.recipe, &input.overrides())?;
+        }
+        Ok(())
+    }
+
     /// Sets the number of steps if neither the input does nor a budget, and the recipe's own length would visit photographs too seldom.
     pub(crate) fn choose_length(&mut self, dataset: &Dataset) {
         let own = self.recipe.total_steps();
@@ -430,6 +445,27 @@ impl TrainRequest {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_run_without_a_given_length_has_the_changes_of_its_recipe_for_it() {
+        let finest = |change: fn(&mut TrainInput)| {
+            let mut input = TrainInput::new("photos", "run");
+            input.recipe = "hashgrid".into();
+            change(&mut input);
+            let mut request = input.check().expect("valid");
+            request.choose_changes().expect("valid");
+            let encoding = request.recipe.field.as_ref().expect("a field").net.encoding;
+            (
+                format!("{encoding:?}").contains("finest: 1024"),
+                request.input.set.len(),
+            )
+        };
+        assert_eq!(finest(|_| ()), (true, 2));
+        assert_eq!(finest(|input| input.budget = Some(60.0)), (false, 0));
+        assert_eq!(finest(|input| input.steps = Some(60)), (false, 0));
+        let set = |input: &mut TrainInput| input.set = vec!["field.net.encoding.finest=512".into()];
+        assert_eq!(finest(set), (false, 3), "what is set takes precedence");
+    }
 
     #[test]
     fn many_photographs_make_a_run_longer_unless_its_length_is_given() {

@@ -84,6 +84,7 @@ impl Run {
             let message = "no view is held out, so that PSNR cannot be measured";
             return Err(RunError::setting("until_psnr", psnr, message));
         }
+        request.choose_changes()?;
         request.choose_background(&dataset)?;
         request.choose_length(&dataset);
         let (out, overwrite) = (&request.input.out, request.input.overwrite);

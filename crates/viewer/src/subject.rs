@@ -6,6 +6,7 @@ use crate::levels::Levels;
 use crate::live::{Live, Watcher};
 use crate::views::Views;
 use irradia_edit::Transform;
+use irradia_runs::formats::Lenses;
 use irradia_runs::{Reading, Run, RunFolder, Scene, Snapshot, TrainInput, read_levels, read_lights, scene_of};
 use irradia_scene::Dataset;
 use irradia_splat::Splats;
@@ -106,7 +107,11 @@ impl Subject {
             (Some(data), _) => Some(reading.read(data)?),
             // A run's photographs may have moved: its scene can be looked at without them.
             (None, Some(folder)) => TrainInput::of_run(folder.path())
-                .and_then(|input| input.reading.read(&input.data))
+                .and_then(|mut input| {
+                    // Pictures of the viewer are by a pinhole, and compared with photographs that are.
+                    input.reading.lenses = Lenses::Undistorted;
+                    input.reading.read(&input.data)
+                })
                 .map_err(|error| warnings.push(format!("no photographs: {error}")))
                 .ok(),
             (None, None) => None,

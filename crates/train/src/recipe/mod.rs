@@ -98,6 +98,10 @@ documented! {
         /// seen from what they show, but at least a fifth of the recipe's own length; a budget that allows more is not used up. 0: no limit.
         #[serde(default, skip_serializing_if = "is_default")]
         pub sparse_visits: u64,
+        /// Changes, each as of `--set`, for runs that have neither a number of steps nor a budget: what pays only in runs of the recipe's length.
+        /// What is set otherwise takes precedence.
+        #[serde(default, skip_serializing_if = "Vec::is_empty")]
+        pub unhurried: Vec<String>,
         /// Steps between evaluations of held-out views while training; at least 1.
         pub eval_every: u64,
         /// Steps between checkpoints; at least 1.
@@ -676,6 +680,7 @@ mod tests {
         for (name, text) in BUILT_IN {
             let recipe = Recipe::parse(name, text, &[]).unwrap();
             assert_eq!(recipe.name, name);
+            assert!(Recipe::parse(name, text, &recipe.unhurried).is_ok());
             let again = Recipe::parse(name, &recipe.to_toml(), &[]).unwrap();
             assert_eq!((again.hash(), &again), (recipe.hash(), &recipe));
         }

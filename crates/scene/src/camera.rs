@@ -179,7 +179,7 @@ mod tests {
                 k: [-0.3, 0.0, 0.0, 0.0, 0.0, 0.0],
                 p: [0.001, -0.002],
             },
-            Lens::fisheye([0.02, -0.01, 0.0, 0.0]),
+            Lens::fisheye([0.02, 0.0, 0.0, 0.0]),
             Lens::Equirectangular,
         ];
         for lens in lenses {

@@ -1,7 +1,8 @@
 //! The posed photographs of a scene, as far as they are known.
 
-use irradia_scene::{Camera, Dataset, PhotoSource};
+use irradia_scene::{Camera, Dataset, Intrinsics, Lens, PhotoSource};
 use serde_json::{Value, json};
+use std::f32::consts::FRAC_PI_2;
 use std::sync::Arc;
 
 /// One view.
@@ -25,11 +26,18 @@ impl Views {
             let pose = place.and_then(|place| Some(refined?[place].pose));
             let mut camera = view.camera;
             camera.pose = pose.unwrap_or(camera.pose);
+            let k = &mut camera.intrinsics;
+            // Pictures of the page are by a pinhole: photographs that keep their distortion do not compare with them.
+            let is_pinhole = k.lens == Lens::Pinhole;
+            if k.lens.is_wide() {
+                *k = Intrinsics::from_fov_x(k.width, k.height, FRAC_PI_2);
+            }
+            k.lens = Lens::Pinhole;
             SeenView {
                 name: view.name.clone(),
                 camera,
                 trained: place.is_some(),
-                photo: Some(view.photo.clone()),
+                photo: is_pinhole.then(|| view.photo.clone()),
             }
         };
         Self(dataset.views.iter().enumerate().map(view).collect())

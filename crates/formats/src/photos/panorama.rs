@@ -17,6 +17,8 @@ use std::path::Path;
 const SMALL: [usize; 2] = [256, 128];
 /// Width below which nothing is a panorama, px: thumbnails.
 const SMALLEST: u32 = 512;
+/// Difference of the width from twice the height, by the width, at most: some programs miss it by a few pixels (4098 x 2048).
+const ASPECT: f64 = 0.004;
 /// What is written into panoramas by XMP's `GPano:ProjectionType`, and the bytes at the beginning of a file in which it is sought.
 const PROJECTION: &[u8] = b"equirectangular";
 const METADATA: u64 = 1 << 18;
@@ -44,7 +46,10 @@ pub struct PanoramaFace {
 /// the same size, continued from their right edge to their left one, with one direction in the row of a pole.
 pub fn find_panoramas(photos: &[PhotoEntry]) -> Vec<bool> {
     let mut signs: BTreeMap<u32, Vec<Signs>> = BTreeMap::new();
-    let could = |photo: &PhotoEntry| photo.width == 2 * photo.height && photo.width >= SMALLEST;
+    let could = |photo: &PhotoEntry| {
+        let missed = f64::from(photo.width.abs_diff(2 * photo.height)) / f64::from(photo.width);
+        missed <= ASPECT && photo.width >= SMALLEST
+    };
     let read: Vec<Option<Signs>> = photos
         .par_iter()
         // What cannot be decoded is found out elsewhere.

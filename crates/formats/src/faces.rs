@@ -6,7 +6,7 @@
 use crate::FormatError;
 use crate::Pixels;
 use crate::image_file::{Colour, decode};
-use crate::undistort::{Undistortion, plane_point};
+use crate::undistort::Undistortion;
 use glam::{DQuat, DVec2, DVec3};
 use image::metadata::Orientation;
 use irradia_scene::{Intrinsics, Lens, resize_area};
@@ -27,7 +27,7 @@ const BLACK: u8 = 20;
 const RIM: f64 = 0.98;
 
 /// A side of the cube around a camera: what is added to the photograph's name, and the rotation from its axes to the photograph's.
-pub(crate) type Side = (&'static str, DQuat);
+type Side = (&'static str, DQuat);
 
 /// The sides in the order of their names.
 pub(crate) fn sides() -> [Side; 6] {
@@ -99,7 +99,7 @@ fn shown(source: &Intrinsics, reach: f64, plan: &Undistortion) -> f64 {
         for column in 0..SAMPLES {
             let at = [(column, source.width), (row, source.height)];
             let [x, y] = at.map(|(i, side)| (f64::from(i) + 0.5) / f64::from(SAMPLES) * f64::from(side));
-            let direction = source.lens.direction(plane_point(source, x, y));
+            let direction = source.lens.direction(source.plane_of(DVec2::new(x, y)));
             if direction.is_some_and(|direction| angle(direction) < reach) {
                 all += 1;
                 seen += u32::from(plan.shows(x, y));
@@ -178,7 +178,7 @@ fn circle(source: &Intrinsics, width: u32, height: u32, brightest: &[u8]) -> Opt
     let mut rings: Vec<[u32; 2]> = Vec::new();
     for (at, value) in (0u32..).zip(brightest) {
         let (x, y) = (f64::from(at % width) + 0.5, f64::from(at / width) + 0.5);
-        let index = (plane_point(&k, x, y).length() / ring) as usize;
+        let index = (k.plane_of(DVec2::new(x, y)).length() / ring) as usize;
         rings.resize(rings.len().max(index + 1), [0; 2]);
         rings[index][0] += 1;
         rings[index][1] += u32::from(*value > BLACK);
@@ -220,7 +220,9 @@ mod tests {
         let mut data = Vec::new();
         for y in 0..k.height {
             for x in 0..k.width {
-                let direction = k.lens.direction(plane_point(k, f64::from(x) + 0.5, f64::from(y) + 0.5));
+                let direction = k
+                    .lens
+                    .direction(k.plane_of(DVec2::new(f64::from(x) + 0.5, f64::from(y) + 0.5)));
                 data.extend(direction.map_or([0.0; 3], color).map(|v| v.round() as u8));
             }
         }
@@ -253,7 +255,9 @@ mod tests {
                 let mut worst = 0f64;
                 for (at, pixel) in (0u32..).zip(image.data.chunks_exact(3)) {
                     let (x, y) = (at % image.width, at / image.width);
-                    let ray = plane_point(&pinhole, f64::from(x) + 0.5, f64::from(y) + 0.5).extend(1.0);
+                    let ray = pinhole
+                        .plane_of(DVec2::new(f64::from(x) + 0.5, f64::from(y) + 0.5))
+                        .extend(1.0);
                     for (value, expected) in pixel.iter().zip(color(plan.turn() * ray)) {
                         worst = worst.max((f64::from(*value) - expected).abs());
                     }
@@ -269,7 +273,7 @@ mod tests {
     fn faces_keep_what_is_almost_as_fine_as_the_pixels() {
         let k = panorama(512);
         let stripes = |longitude: f64| 128.0 + 90.0 * (100.0 * longitude).sin();
-        let row = (0..k.width).map(|x| stripes(plane_point(&k, f64::from(x) + 0.5, 0.0).x).round() as u8);
+        let row = (0..k.width).map(|x| stripes(k.plane_of(DVec2::new(f64::from(x) + 0.5, 0.0)).x).round() as u8);
         let photo = Pixels {
             width: k.width,
             height: k.height,
@@ -281,7 +285,9 @@ mod tests {
             let y = image.height / 2;
             let mut worst = 0f64;
             for x in 0..image.width {
-                let ray = plane_point(&pinhole, f64::from(x) + 0.5, f64::from(y) + 0.5).extend(1.0);
+                let ray = pinhole
+                    .plane_of(DVec2::new(f64::from(x) + 0.5, f64::from(y) + 0.5))
+                    .extend(1.0);
                 let direction = plan.turn() * ray;
                 let value = image.data[(y * image.width + x) as usize];
                 worst = worst.max((f64::from(value) - stripes(direction.x.atan2(direction.z))).abs());

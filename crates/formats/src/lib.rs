@@ -33,7 +33,9 @@ pub use atomic::write_atomic;
 pub use dataset::colmap::{
     ColmapCamera, ColmapImage, ColmapModel, ColmapPoint, PosedImage, TrackedPoint, read_colmap_poses, write_colmap,
 };
-pub use dataset::{DEFAULT_MAX_SIDE, DatasetFormat, DatasetOptions, Holdout, Lenses, read_dataset};
+pub use dataset::{
+    DEFAULT_MAX_SIDE, DatasetFormat, DatasetOptions, Holdout, Lenses, PANORAMA_MASKS, PANORAMAS, read_dataset,
+};
 pub use describe::{Description, Kind, describe, detect};
 pub use error::{FormatError, Malformed};
 pub use image_file::{Pixels, read_image, write_png, write_png_16};

@@ -1,6 +1,5 @@
 //! What photographs show that keep the distortion of their lens.
 
-use crate::undistort::plane_point;
 use glam::DVec2;
 use irradia_scene::{Intrinsics, Lens};
 use std::f64::consts::PI;
@@ -63,7 +62,7 @@ impl Shown {
         let corners = [[0.0, 0.0], [right, 0.0], [0.0, lower], [right, lower]];
         let is_whole = corners
             .iter()
-            .all(|[x, y]| region.contains(plane_point(source, *x, *y)));
+            .all(|[x, y]| region.contains(source.plane_of(DVec2::new(*x, *y))));
         (!is_whole).then_some(Self {
             source: *source,
             region,
@@ -78,7 +77,7 @@ impl Shown {
             for (value, x) in row.iter_mut().zip(0u32..) {
                 if !self
                     .region
-                    .contains(plane_point(&k, f64::from(x) + 0.5, f64::from(y) + 0.5))
+                    .contains(k.plane_of(DVec2::new(f64::from(x) + 0.5, f64::from(y) + 0.5)))
                 {
                     *value = 0;
                 }

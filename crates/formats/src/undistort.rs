@@ -92,7 +92,7 @@ impl Undistortion {
     /// The rectangle is found by peeling: of a box that is certainly too large, the side with the largest fraction outside is
     /// moved in until all four sides are inside. The valid region has no holes, so that the interior is valid, too.
     fn cropped(self, largest: Crop, shown: impl Fn(DVec2) -> bool) -> Option<Self> {
-        let valid = |x: f64, y: f64| shown(plane_point(&self.pinhole, x, y)) && self.is_in_photograph(x, y);
+        let valid = |x: f64, y: f64| shown(self.pinhole.plane_of(DVec2::new(x, y))) && self.is_in_photograph(x, y);
         let mut crop = largest;
         let step = (i64::from(self.source.width.max(self.source.height)) / 256).max(1);
         loop {
@@ -141,11 +141,11 @@ impl Undistortion {
 
     /// Whether the results show what is at the position `(x, y)` in the photograph, pixels.
     pub fn shows(&self, x: f64, y: f64) -> bool {
-        let direction = self.source.lens.direction(plane_point(&self.source, x, y));
+        let direction = self.source.lens.direction(self.source.plane_of(DVec2::new(x, y)));
         let ray = direction.map(|direction| self.turn.inverse() * direction);
         ray.filter(|ray| ray.z > 0.0).is_some_and(|ray| {
             let k = &self.pinhole;
-            let at = pixel(k, ray.truncate() / ray.z);
+            let at = k.pixel_of(ray.truncate() / ray.z);
             (0.0..=f64::from(k.width)).contains(&at.x) && (0.0..=f64::from(k.height)).contains(&at.y)
         })
     }
@@ -167,8 +167,8 @@ impl Undistortion {
 
     /// Position in the photograph, pixels, of a position in the results; `None` where the lens has none.
     fn source_position(&self, x: f64, y: f64) -> Option<DVec2> {
-        let direction = self.turn * plane_point(&self.pinhole, x, y).extend(1.0);
-        Some(pixel(&self.source, self.source.lens.project(direction)?))
+        let direction = self.turn * self.pinhole.plane_of(DVec2::new(x, y)).extend(1.0);
+        Some(self.source.pixel_of(self.source.lens.project(direction)?))
     }
 
     /// Whether a position in the results lies between the centres of the photograph's outermost pixels; the left and the right edge of a panorama
@@ -374,21 +374,6 @@ impl Crop {
     }
 }
 
-/// The point of the lens's plane at a pixel position.
-pub(crate) fn plane_point(k: &Intrinsics, x: f64, y: f64) -> DVec2 {
-    DVec2::new(
-        (x - f64::from(k.cx)) / f64::from(k.fx),
-        (y - f64::from(k.cy)) / f64::from(k.fy),
-    )
-}
-
-fn pixel(k: &Intrinsics, p: DVec2) -> DVec2 {
-    DVec2::new(
-        f64::from(k.fx) * p.x + f64::from(k.cx),
-        f64::from(k.fy) * p.y + f64::from(k.cy),
-    )
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -462,7 +447,7 @@ mod tests {
             };
             for y in 0..240 {
                 for x in 0..320 {
-                    let distorted = plane_point(&source, f64::from(x) + 0.5, f64::from(y) + 0.5);
+                    let distorted = source.plane_of(DVec2::new(f64::from(x) + 0.5, f64::from(y) + 0.5));
                     let p = lens.undistort(distorted).unwrap_or_default();
                     photo.data.extend(pattern(p).map(|v| v.round() as u8));
                 }
@@ -474,7 +459,7 @@ mod tests {
             let mut worst = 0f64;
             for (i, pixel) in straight.data.chunks_exact(3).enumerate() {
                 let (x, y) = (i as u32 % pinhole.width, i as u32 / pinhole.width);
-                let expected = pattern(plane_point(&pinhole, f64::from(x) + 0.5, f64::from(y) + 0.5));
+                let expected = pattern(pinhole.plane_of(DVec2::new(f64::from(x) + 0.5, f64::from(y) + 0.5)));
                 for c in 0..3 {
                     worst = worst.max((f64::from(pixel[c]) - expected[c].clamp(0.0, 255.0)).abs());
                 }
@@ -493,7 +478,7 @@ mod tests {
         let plan = Undistortion::plan(&folding).unwrap();
         // d(r - 0.9 r^3)/dr = 0 at r = 0.6086.
         let pinhole = plan.pinhole();
-        let corner = plane_point(&pinhole, 0.5, 0.5);
+        let corner = pinhole.plane_of(DVec2::new(0.5, 0.5));
         assert!(corner.length() < 0.6086, "{corner}");
         let outside = Intrinsics {
             cx: 5000.0,

@@ -61,6 +61,18 @@ impl Intrinsics {
         }
     }
 
+    /// The point of the lens's plane at a position in the image, pixels.
+    pub fn plane_of(&self, pixel: DVec2) -> DVec2 {
+        let [fx, fy, cx, cy] = [self.fx, self.fy, self.cx, self.cy].map(f64::from);
+        DVec2::new((pixel.x - cx) / fx, (pixel.y - cy) / fy)
+    }
+
+    /// The inverse of [`Self::plane_of`].
+    pub fn pixel_of(&self, plane: DVec2) -> DVec2 {
+        let [fx, fy, cx, cy] = [self.fx, self.fy, self.cx, self.cy].map(f64::from);
+        DVec2::new(fx * plane.x + cx, fy * plane.y + cy)
+    }
+
     /// Pixel coordinates of a point in the camera and its [depth](Self::depth); `None` where the lens shows nothing, such as behind a pinhole.
     pub fn project(&self, point: Vec3) -> Option<(Vec2, f32)> {
         let depth = self.depth(point);
@@ -76,8 +88,7 @@ impl Intrinsics {
         // Beyond the fold of a polynomial another direction has the same pixel.
         let back = self.lens.direction(plane)?;
         let is_same = back.angle_between(direction) < SAME_DIRECTION;
-        let [fx, fy, cx, cy] = [self.fx, self.fy, self.cx, self.cy].map(f64::from);
-        is_same.then(|| (DVec2::new(fx * plane.x + cx, fy * plane.y + cy).as_vec2(), depth))
+        is_same.then(|| (self.pixel_of(plane).as_vec2(), depth))
     }
 
     /// The depth of a point in the camera: along +Z, or for lenses that also show what is behind the camera the distance from it.
@@ -87,17 +98,12 @@ impl Intrinsics {
 
     /// The point in the camera that pixel coordinates `(x, y)` show at a [depth](Self::depth) of 1; straight ahead where the lens shows nothing.
     pub fn ray(&self, pixel: Vec2) -> Vec3 {
-        let plane = Vec2::new((pixel.x - self.cx) / self.fx, (pixel.y - self.cy) / self.fy);
         if self.lens == Lens::Pinhole {
-            return plane.extend(1.0);
+            return Vec3::new((pixel.x - self.cx) / self.fx, (pixel.y - self.cy) / self.fy, 1.0);
         }
-        let direction = self.lens.direction(plane.as_dvec2()).unwrap_or(DVec3::Z);
-        let depth = if self.lens.is_wide() {
-            direction.length()
-        } else {
-            direction.z
-        };
-        (direction / depth).as_vec3()
+        let direction = self.lens.direction(self.plane_of(pixel.as_dvec2()));
+        let direction = direction.unwrap_or(DVec3::Z).as_vec3();
+        direction / self.depth(direction)
     }
 
     /// Whether sizes are non-zero and every number is finite with positive focal lengths.

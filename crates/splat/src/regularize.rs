@@ -6,6 +6,7 @@
 
 use crate::render::CHUNK;
 use crate::{SplatGradients, Splats};
+use irradia_compute::Planes;
 use irradia_compute::simd::{Kernel, Lanes, Level, Mask, Simd};
 use irradia_compute::unroll;
 use irradia_scene::Camera;
@@ -182,20 +183,28 @@ fn regularizer<F: Lanes>(w: &WeightLanes<F>, log_scale: [F; 3], logit: F) -> (F,
 pub fn cap_condition(splats: &mut Splats, limit: f32) {
     // The condition number of the covariance is the squared ratio of the standard deviations.
     let span = 0.5 * limit.max(1.0).ln();
-    let n = splats.len();
-    let [x, y, z] = splats.log_scales.planes_mut().map(|plane: &mut [f32]| &mut plane[..n]);
+    for_each_size(&mut splats.log_scales, |_, sizes| {
+        let low = sizes.iter().fold(f32::MIN, |most, v| most.max(**v)) - span;
+        for v in sizes {
+            if *v < low {
+                *v = low;
+            }
+        }
+    });
+}
+
+/// Calls `change(splat, ln scales)` for every splat, on all cores.
+fn for_each_size(log_scales: &mut Planes, change: impl Fn(usize, [&mut f32; 3]) + Sync) {
+    let n = log_scales.len();
+    let [x, y, z] = log_scales.planes_mut().map(|plane: &mut [f32]| &mut plane[..n]);
     x.par_chunks_mut(CHUNK)
         .zip(y.par_chunks_mut(CHUNK))
         .zip(z.par_chunks_mut(CHUNK))
+        .enumerate()
         .with_min_len(8)
-        .for_each(|((x, y), z)| {
-            for ((x, y), z) in x.iter_mut().zip(y).zip(z) {
-                let low = f32::MIN.max(*x).max(*y).max(*z) - span;
-                for v in [x, y, z] {
-                    if *v < low {
-                        *v = low;
-                    }
-                }
+        .for_each(|(chunk, ((x, y), z))| {
+            for (i, ((x, y), z)) in x.iter_mut().zip(y).zip(z).enumerate() {
+                change(chunk * CHUNK + i, [x, y, z]);
             }
         });
 }
@@ -227,23 +236,17 @@ impl AngleCap {
 
 /// Lowers standard deviations that are too large for their distance.
 pub fn cap_angle(splats: &mut Splats, cap: &AngleCap) {
-    let largest: Vec<f32> = (0..splats.len())
-        .into_par_iter()
-        .with_min_len(CHUNK)
-        .map(|i| {
-            let mean = splats.mean(i);
-            let square: f32 = (0..3).map(|c| (mean[c] - cap.center[c]).powi(2)).sum();
-            0.5 * square.ln() + cap.largest.ln()
-        })
-        .collect();
-    for plane in splats.log_scales.planes_mut::<3>() {
-        for (scale, largest) in plane.iter_mut().zip(&largest) {
-            // What is at the camera itself has no size to which it could be limited.
-            if largest.is_finite() && *scale > *largest {
-                *scale = *largest;
+    let (means, of_distance) = (&splats.means, cap.largest.ln());
+    for_each_size(&mut splats.log_scales, |i, sizes| {
+        let square: f32 = (0..3).map(|c| (means.get(c, i) - cap.center[c]).powi(2)).sum();
+        let largest = 0.5 * square.ln() + of_distance;
+        // What is at the camera itself has no size to which it could be limited.
+        for v in sizes {
+            if largest.is_finite() && *v > largest {
+                *v = largest;
             }
         }
-    }
+    });
 }
 
 /// The size from which on splats are among the largest `fraction` of `sizes`; `None` if all are.

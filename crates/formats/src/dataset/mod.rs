@@ -37,6 +37,7 @@ pub(crate) use declared::DeclaredPoints;
 pub(crate) use files::{is_image_name, list_files};
 use irradia_scene::Dataset;
 pub(crate) use npy::parse_table;
+pub use panoramas::{PANORAMA_MASKS, PANORAMAS};
 use serde::{Deserialize, Serialize};
 pub use split::Holdout;
 use std::fmt;

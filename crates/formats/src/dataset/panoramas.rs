@@ -7,10 +7,10 @@ use std::collections::BTreeMap;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-/// The folder of the panoramas, whose faces are named after them: `a_front.jpg` of `a.jpg`.
-pub(crate) const PANORAMAS: &str = "faces/panoramas";
+/// The folder, in that of a dataset, of the panoramas, whose faces are named after them: `a_front.jpg` of `a.jpg`.
+pub const PANORAMAS: &str = "faces/panoramas";
 /// That of their masks: `a.jpg.png`.
-pub(crate) const MASKS: &str = "faces/panorama_masks";
+pub const PANORAMA_MASKS: &str = "faces/panorama_masks";
 
 /// The files of a folder by their name without the extension; none if there is no such folder.
 fn by_stem(folder: &Path) -> BTreeMap<String, PathBuf> {
@@ -25,7 +25,7 @@ pub(super) fn join(views: Vec<DeclaredView>, root: &Path) -> Vec<DeclaredView> {
     if panoramas.is_empty() {
         return views;
     }
-    let masks = by_stem(&root.join(MASKS));
+    let masks = by_stem(&root.join(PANORAMA_MASKS));
     let mut joined: BTreeMap<&Path, DeclaredView> = BTreeMap::new();
     let mut others = Vec::new();
     for view in views {

@@ -1,6 +1,6 @@
 //! What is posed: photographs of one or several folders, frames of films, faces of panoramas.
 
-use super::output::link;
+use super::output::link_panorama;
 use super::{PoseProgress, film, is_film};
 use crate::RunError;
 use glam::{DQuat, DVec3};
@@ -96,25 +96,6 @@ pub(super) fn begin(folder: &Path, record: &str) -> Result<(), RunError> {
     Ok(())
 }
 
-/// Brings a panorama and its mask beside its faces in `folder`, where training finds it again.
-fn link_panorama(panorama: &PhotoEntry, folder: &Path) -> Result<(), RunError> {
-    let mask = panorama.mask.as_ref();
-    let mask_name = |mask: &PathBuf| {
-        let extension = mask.extension().unwrap_or_default().to_string_lossy();
-        format!("{}.{extension}", panorama.name)
-    };
-    let files = [
-        Some((&panorama.path, "panoramas", panorama.name.clone())),
-        mask.map(|mask| (mask, "panorama_masks", mask_name(mask))),
-    ];
-    for (file, below, name) in files.into_iter().flatten() {
-        let below = folder.join(below);
-        fs::create_dir_all(&below).map_err(RunError::io("create", &below))?;
-        link(file, &below.join(name))?;
-    }
-    Ok(())
-}
-
 /// Photographs that are to be posed.
 #[derive(Debug)]
 pub(super) struct Capture {
@@ -156,8 +137,8 @@ impl Capture {
         };
         let panoramas = capture.take_panoramas();
         if !panoramas.is_empty() {
-            let folder = out.ok_or_else(|| needs_out("faces of panoramas"))?.join(FACES);
-            capture.add_faces(&panoramas, &folder)?;
+            let out = out.ok_or_else(|| needs_out("faces of panoramas"))?;
+            capture.add_faces(&panoramas, out)?;
         }
         Ok(capture)
     }
@@ -181,14 +162,15 @@ impl Capture {
         panoramas
     }
 
-    fn add_faces(&mut self, panoramas: &[PhotoEntry], folder: &Path) -> Result<(), RunError> {
+    fn add_faces(&mut self, panoramas: &[PhotoEntry], out: &Path) -> Result<(), RunError> {
+        let folder = &out.join(FACES);
         begin(folder, FACES_RECORD)?;
         let cut: Vec<Vec<PanoramaFace>> = panoramas
             .par_iter()
             .map(|panorama| panorama.cut_panorama(folder))
             .collect::<Result<_, _>>()?;
         for panorama in panoramas {
-            link_panorama(panorama, folder)?;
+            link_panorama(out, panorama)?;
         }
         let all = || cut.iter().flatten().map(|face| &face.name);
         let taken = |name: &&String| self.folder.photos.iter().any(|photo| photo.name == **name);

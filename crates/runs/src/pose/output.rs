@@ -4,8 +4,8 @@ use super::stages::Work;
 use super::{CameraReport, LeftOutPhoto, PoseReport};
 use crate::RunError;
 use irradia_formats::{
-    ColmapCamera, ColmapImage, ColmapModel, ColmapPoint, PhotoEntry, PhotoFolder, PosedImage, TrackedPoint,
-    write_colmap,
+    ColmapCamera, ColmapImage, ColmapModel, ColmapPoint, PANORAMA_MASKS, PANORAMAS, PhotoEntry, PhotoFolder,
+    PosedImage, TrackedPoint, write_colmap,
 };
 use irradia_sfm::geometry::camera::DCamera;
 use irradia_sfm::map::{Model, PhotoInfo, Reconstruction};
@@ -63,17 +63,33 @@ pub(super) fn link_photo(out: &Path, photo: &PhotoEntry) -> Result<(), RunError>
         (&photo.depth, "depths"),
         (&photo.normals, "normals"),
     ] {
-        let Some(file) = file else { continue };
-        let folder = out.join(folder);
-        fs::create_dir_all(&folder).map_err(RunError::io("create", &folder))?;
-        let extension = file.extension().unwrap_or_default().to_string_lossy();
-        link(file, &folder.join(format!("{}.{extension}", photo.name)))?;
+        if let Some(file) = file {
+            link_beside(file, &out.join(folder), &photo.name)?;
+        }
     }
     Ok(())
 }
 
+/// Brings a panorama and its mask into the dataset, where training finds them beside their faces.
+pub(super) fn link_panorama(out: &Path, panorama: &PhotoEntry) -> Result<(), RunError> {
+    let folder = out.join(PANORAMAS);
+    fs::create_dir_all(&folder).map_err(RunError::io("create", &folder))?;
+    link(&panorama.path, &folder.join(&panorama.name))?;
+    if let Some(mask) = &panorama.mask {
+        link_beside(mask, &out.join(PANORAMA_MASKS), &panorama.name)?;
+    }
+    Ok(())
+}
+
+/// Brings the file that belongs to the photograph `name` into `folder`, which is created, under that name with its own extension appended.
+fn link_beside(file: &Path, folder: &Path, name: &str) -> Result<(), RunError> {
+    fs::create_dir_all(folder).map_err(RunError::io("create", folder))?;
+    let extension = file.extension().unwrap_or_default().to_string_lossy();
+    link(file, &folder.join(format!("{name}.{extension}")))
+}
+
 /// Makes `to` the file `from`: a hard link where the file system allows it, else a copy.
-pub(super) fn link(from: &Path, to: &Path) -> Result<(), RunError> {
+fn link(from: &Path, to: &Path) -> Result<(), RunError> {
     let same = |a: &Path, b: &Path| fs::canonicalize(a).is_ok_and(|a| fs::canonicalize(b).is_ok_and(|b| a == b));
     if same(from, to) {
         return Ok(());

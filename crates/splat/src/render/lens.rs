@@ -5,6 +5,7 @@
 //! vector-Jacobian product the second.
 
 use super::project::dot;
+use glam::DVec2;
 use irradia_compute::simd::{Double, Lanes, Mask, Scalar, Simd};
 use irradia_compute::unroll;
 use irradia_scene::{Intrinsics, Lens};
@@ -33,13 +34,12 @@ impl LensParams {
         if lens == Lens::Pinhole {
             return None;
         }
-        let (width, height) = (k.width as f32, k.height as f32);
+        let size = DVec2::new(f64::from(k.width), f64::from(k.height));
         let border = (0..=SAMPLES).flat_map(|i| {
-            let t = i as f32 / SAMPLES as f32;
+            let t = f64::from(i) / f64::from(SAMPLES);
             [[t, 0.0], [t, 1.0], [0.0, t], [1.0, t]]
         });
-        let plane = border.map(|[x, y]| [(x * width - k.cx) / k.fx, (y * height - k.cy) / k.fy].map(f64::from));
-        let directions = plane.map(|[x, y]| lens.direction([x, y].into()));
+        let directions = border.map(|place| lens.direction(k.plane_of(DVec2::from(place) * size)));
         let (limit, ends) = if lens.is_wide() {
             let angles = directions.map(|d| d.map_or(f64::INFINITY, |d| d.truncate().length().atan2(d.z)));
             (angles.fold(0.0, f64::max).min(lens.reach_in_angle()).cos(), true)
@@ -357,8 +357,17 @@ impl<F: Lanes> Jet<F> {
     /// `atan(sqrt(w)) / sqrt(w)`, which is smooth at 0.
     #[inline(always)]
     fn arctangent_ratio(self) -> Self {
-        let derivative = |n: usize| self.value.map(|w| Scalar::from_f64(arctangent_ratio(w.to_f64())[n]));
-        self.chain(derivative(0), derivative(1), derivative(2))
+        let simd = self.value.simd();
+        let mut lanes = [F::Scalar::default(); 16];
+        self.value.store(&mut lanes);
+        let mut derivatives = [[F::Scalar::default(); 16]; 3];
+        for lane in 0..F::Simd::LANES {
+            for (n, value) in arctangent_ratio(lanes[lane].to_f64()).into_iter().enumerate() {
+                derivatives[n][lane] = Scalar::from_f64(value);
+            }
+        }
+        let [value, first, second] = unroll!(n in 3 => simd.load(&derivatives[n]));
+        self.chain(value, first, second)
     }
 }
 

@@ -118,8 +118,8 @@ impl RayBatch {
                 .map_or(1.0, |a| f32::from(*a) / 255.0);
             let target = |c: usize| f32::from(rgb[c]) / 255.0 + (1.0 - alpha) * (background[c] - view.over[c]);
             let (x, y) = (pixel % width, pixel / width);
-            let direction = view.camera.ray_direction(Vec2::new(x as f32 + 0.5, y as f32 + 0.5));
-            let ray = space.ray(view.camera.pose.position.to_array(), direction.to_array());
+            let (from, direction) = view.camera.ray(Vec2::new(x as f32 + 0.5, y as f32 + 0.5));
+            let ray = space.ray(from.to_array(), direction.to_array());
             let cosine = view.camera.depth_along(direction);
             let known = depth > 0.0 && depth.is_finite();
             self.depths.push(if known { ray.distance(depth / cosine) } else { 0.0 });

@@ -158,8 +158,8 @@ impl Space {
             let k = &camera.intrinsics;
             let (w, h) = (k.width as f32, k.height as f32);
             for corner in [[0.0, 0.0], [w, 0.0], [0.0, h], [w, h]] {
-                let direction = camera.ray_direction(Vec2::from(corner)).to_array();
-                let (from, along, _) = frustum.line(camera.pose.position.to_array(), direction)?;
+                let (from, direction) = camera.ray(Vec2::from(corner));
+                let (from, along, _) = frustum.line(from.to_array(), direction.to_array())?;
                 for c in 0..2 {
                     extent[c] = extent[c].max(from[c].abs()).max((from[c] + along[c]).abs());
                 }

@@ -24,7 +24,7 @@ fn normalised_device_coordinates_keep_rays_straight_and_invert() {
     for _ in 0..200 {
         let camera = &cameras[rng.below(5) as usize];
         let pixel = glam::Vec2::new(rng.uniform() * 40.0, rng.uniform() * 30.0);
-        let (o, d) = (camera.pose.position, camera.ray_direction(pixel));
+        let (o, d) = camera.ray(pixel);
         let ray = space.ray(o.to_array(), d.to_array());
         for t in [0.01, 0.3, 0.6, 0.9] {
             let p = ray.at(ray.far * t);

@@ -39,7 +39,7 @@ fn ball(camera: &Camera) -> Ball {
         depths: Vec::new(),
     };
     for pixel in 0..SIDE * SIDE {
-        let d = camera.ray_direction(glam::Vec2::new(
+        let (_, d) = camera.ray(glam::Vec2::new(
             (pixel % SIDE) as f32 + 0.5,
             (pixel / SIDE) as f32 + 0.5,
         ));
@@ -290,7 +290,7 @@ fn a_learnt_background_represents_the_sky() {
     for (camera, ball) in cameras.iter().zip(&mut balls) {
         for pixel in (0..SIDE * SIDE).filter(|pixel| ball.alpha[*pixel as usize] == 0) {
             let at = glam::Vec2::new((pixel % SIDE) as f32 + 0.5, (pixel / SIDE) as f32 + 0.5);
-            let sky = [0.2, 0.5, blue(camera.ray_direction(at))];
+            let sky = [0.2, 0.5, blue(camera.ray(at).1)];
             ball.rgb[3 * pixel as usize..][..3].copy_from_slice(&sky.map(|v| (v * 255.0).round() as u8));
         }
     }

@@ -127,7 +127,7 @@ fn assert_same(got: &Dataset, truth: &Truth) {
             got.name
         );
         for pixel in [Vec2::new(0.5, 0.5), Vec2::new(60.0, 3.0), Vec2::new(31.0, 44.0)] {
-            let turned = (a.ray_direction(pixel) - b.ray_direction(pixel)).length();
+            let turned = a.ray(pixel).1.distance(b.ray(pixel).1);
             assert!(
                 turned < TOLERANCE,
                 "{}: the ray of {pixel} is off by {turned}",

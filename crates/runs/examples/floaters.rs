@@ -118,7 +118,7 @@ fn plant(cloud: &mut GaussianCloud, cameras: &[Camera], seed: u64) {
                 let k = camera.intrinsics;
                 let mut inside = |side: u32| rng.range(0.1, 0.9) * side as f32;
                 let pixel = Vec2::new(inside(k.width), inside(k.height));
-                let ray = camera.ray_direction(pixel) * distance;
+                let ray = camera.ray(pixel).1 * distance;
                 let mut from_eye = |from: f32, to: f32| camera.pose.position + ray * rng.range(from, to);
                 let (mean, sizes) = match kind {
                     0 => (from_eye(0.3, 0.6), [rng.range(0.003, 0.01); 3]),

@@ -4,7 +4,7 @@ use crate::folder::camera_names_beside;
 use crate::scene_file::render_knobs_beside;
 use crate::{RunFolder, TrainInput};
 use irradia_edit::{Photographs, Taken};
-use irradia_scene::{Lens, Photo};
+use irradia_scene::Photo;
 use rayon::prelude::*;
 use std::path::Path;
 
@@ -23,12 +23,8 @@ pub fn photographs_of(scene: &Path) -> Option<Photographs> {
 fn read(scene: &Path) -> Option<Taken> {
     let input = TrainInput::of_run(scene.parent()?).ok()?;
     let dataset = input.reading.read(&input.data).ok()?;
-    // The cameras of the scene are pinholes: photographs that keep their distortion show something else.
-    if dataset
-        .views
-        .iter()
-        .any(|view| view.camera.intrinsics.lens != Lens::Pinhole)
-    {
+    // The cameras of the scene are pinholes: photographs with distortion or a rolling shutter show something else.
+    if dataset.views.iter().any(|view| !view.camera.is_pinhole()) {
         return None;
     }
     let background = render_knobs_beside(scene).background;

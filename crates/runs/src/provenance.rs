@@ -106,6 +106,9 @@ pub fn data_fingerprint(dataset: &Dataset, root: &Path) -> String {
         if k.lens != Lens::Pinhole {
             hash.add(format!("{:?}", k.lens).as_bytes());
         }
+        if let Some(shutter) = &view.camera.shutter {
+            hash.add(format!("{shutter:?}").as_bytes());
+        }
         let bytes = std::fs::metadata(root.join(&view.name)).map_or(0, |file| file.len());
         hash.add(&bytes.to_le_bytes());
     }

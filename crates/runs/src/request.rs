@@ -2,7 +2,9 @@
 
 use crate::{Background, RunError, RunFolder, scene_of};
 use irradia_compute::DeviceChoice;
-use irradia_formats::{DEFAULT_MAX_SIDE, DatasetFormat, DatasetOptions, Holdout, Lenses, read_dataset, read_splats};
+use irradia_formats::{
+    DEFAULT_MAX_SIDE, DatasetFormat, DatasetOptions, Holdout, Lenses, Readout, read_dataset, read_splats,
+};
 use irradia_scene::{Dataset, sh};
 use irradia_splat::Splats;
 use irradia_train::Recipe;
@@ -46,6 +48,9 @@ pub struct Reading {
     /// What becomes of distorted photographs.
     #[serde(default)]
     pub lenses: Lenses,
+    /// The readout of the film of which the photographs are frames, in the form of [`Readout`].
+    #[serde(default)]
+    pub readout: Option<String>,
 }
 
 impl Default for Reading {
@@ -58,6 +63,7 @@ impl Default for Reading {
             holdout: None,
             images: None,
             lenses: Lenses::default(),
+            readout: None,
         }
     }
 }
@@ -73,6 +79,10 @@ impl Reading {
                 name.parse()
                     .map_err(|e| RunError::setting("format", name, format!("{e}")))?,
             ),
+            None => None,
+        };
+        let readout: Option<Readout> = match &self.readout {
+            Some(text) => Some(text.parse().map_err(|e| RunError::setting("readout", text, e))?),
             None => None,
         };
         if !self.downscale.is_finite() || self.downscale < 1.0 {
@@ -95,6 +105,7 @@ impl Reading {
             holdout: self.holdout()?,
             images: self.images.clone(),
             lenses: self.lenses,
+            readout,
         })
     }
 

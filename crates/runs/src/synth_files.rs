@@ -23,6 +23,8 @@ use std::{fmt, fs};
 const DEPTH_SCALE: f32 = 0.0005;
 /// The same outdoors: they reach 655 units.
 const DEPTH_SCALE_OUTDOOR: f32 = 0.01;
+/// Seconds in which photographs by moving cameras are read out; only its product with the velocities matters.
+const READOUT: f32 = 0.02;
 
 /// Summary of the dataset.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -78,12 +80,18 @@ pub fn write_synth_dataset(out: impl AsRef<Path>, options: &SynthOptions) -> Res
         let found = capture.points(shot, &frame);
         points.positions.extend(found.positions);
         points.colors.extend(found.colors);
-        frames[shot.part as usize].push(json!({
+        let mut entry = json!({
             "file_path": format!("./{name}"),
             "depth_file_path": format!("./depth/{name}.png"),
             "normal_file_path": format!("./normal/{name}.png"),
             "transform_matrix": blender_matrix(&shot.camera),
-        }));
+        });
+        if let Some(shutter) = &shot.camera.shutter {
+            let velocity = |way: Vec3| (way * Vec3::new(1.0, -1.0, -1.0) / READOUT).to_array();
+            entry["camera_linear_velocity"] = json!(velocity(shutter.translation));
+            entry["camera_angular_velocity"] = json!(velocity(shutter.rotation));
+        }
+        frames[shot.part as usize].push(entry);
     }
     write_points_ply(&out.join("points.ply"), &points)?;
     let [train, val, test] = [0, 1, 2].map(|part| frames[part].len() as u32);
@@ -96,6 +104,9 @@ pub fn write_synth_dataset(out: impl AsRef<Path>, options: &SynthOptions) -> Res
             "depth_scale": depth_scale,
             "frames": frames,
         });
+        if options.turn > 0.0 {
+            transforms["rolling_shutter_time"] = json!(READOUT);
+        }
         match k.lens {
             Lens::Fisheye { .. } => {
                 transforms["camera_model"] = json!("OPENCV_FISHEYE");
@@ -153,6 +164,7 @@ mod tests {
         height: 16,
         seed: 5,
         lens: SynthLens::Pinhole,
+        turn: 0.0,
     };
 
     fn all_files(folder: &Path) -> Vec<(PathBuf, Vec<u8>)> {
@@ -252,5 +264,25 @@ mod tests {
             assert!(error.to_string().contains("must be"), "{error}");
         }
         assert!(!Path::new("never-made").exists());
+    }
+
+    #[test]
+    fn movements_are_read_as_they_were() {
+        let dir = tempfile::tempdir().expect("dir");
+        let options = SynthOptions { turn: 0.05, ..SMALL };
+        write_synth_dataset(dir.path(), &options).expect("writes");
+        let capture = Capture::new(&options).expect("options");
+        let read = irradia_formats::read_dataset(dir.path(), &Default::default()).expect("a dataset");
+        for (index, shot) in read.train.iter().zip(capture.shots()) {
+            let [found, made] =
+                [read.views[*index].camera, shot.camera].map(|camera| camera.shutter.expect("it moves"));
+            assert_eq!(found.first, made.first);
+            assert!(
+                found.translation.distance(made.translation) < 1e-6,
+                "{found:?} {made:?}"
+            );
+            assert!(found.rotation.distance(made.rotation) < 1e-6 && made.rotation.length() > 0.049);
+        }
+        assert!(read.test.iter().all(|index| read.views[*index].camera.is_pinhole()));
     }
 }

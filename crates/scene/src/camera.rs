@@ -1,4 +1,4 @@
-use crate::{Lens, Pose};
+use crate::{Lens, Pose, RollingShutter};
 use glam::{DVec2, DVec3, Vec2, Vec3};
 
 /// A direction and that of its own pixel differ by less than this, radians, unless a lens folds.
@@ -125,25 +125,39 @@ pub struct Camera {
     pub intrinsics: Intrinsics,
     /// Near plane: nothing at a smaller [depth](Intrinsics::depth) is drawn, world units.
     pub near: f32,
+    /// How it moves during the exposure of a photograph; `None` if it does not.
+    pub shutter: Option<RollingShutter>,
 }
 
 impl Camera {
     /// Default near plane: gsplat's 0.01.
     pub const DEFAULT_NEAR: f32 = 0.01;
 
-    /// A camera with the default near plane.
+    /// A camera at rest with the default near plane.
     pub fn new(pose: Pose, intrinsics: Intrinsics) -> Self {
         Self {
             pose,
             intrinsics,
             near: Self::DEFAULT_NEAR,
+            shutter: None,
         }
+    }
+
+    /// Whether it is a pinhole at rest: without distortion or rolling shutter.
+    pub fn is_pinhole(&self) -> bool {
+        self.intrinsics.lens == Lens::Pinhole && self.shutter.is_none()
     }
 
     /// Pixel coordinates of a world point and its [depth](Intrinsics::depth); `None` in front of the near plane and where the lens shows nothing.
     pub fn project(&self, world: Vec3) -> Option<(Vec2, f32)> {
-        let point = self.pose.camera_from_world(world);
-        let projected = self.intrinsics.project(point);
+        let (point, k) = (self.pose.camera_from_world(world), &self.intrinsics);
+        let projected = match &self.shutter {
+            None => k.project(point),
+            Some(shutter) => {
+                let seen = shutter.seen([k.width, k.height], |time| k.project(shutter.at(point, time)));
+                seen.map(|(at, _)| (at, k.depth(point)))
+            }
+        };
         projected.filter(|(_, depth)| *depth > self.near)
     }
 
@@ -154,9 +168,18 @@ impl Camera {
             .filter(|(at, _)| (0.0..k.width as f32).contains(&at.x) && (0.0..k.height as f32).contains(&at.y))
     }
 
-    /// Unit direction in the world of the ray through pixel coordinates `(x, y)`; straight ahead where the lens shows nothing.
-    pub fn ray_direction(&self, pixel: Vec2) -> Vec3 {
-        (self.pose.rotation * self.intrinsics.ray(pixel)).normalize()
+    /// The ray through pixel coordinates `(x, y)`: a point of it and its unit direction, in the world. It goes straight ahead where the lens shows
+    /// nothing.
+    pub fn ray(&self, pixel: Vec2) -> (Vec3, Vec3) {
+        let (k, ray) = (&self.intrinsics, self.intrinsics.ray(pixel));
+        let (from, along) = match &self.shutter {
+            None => (self.pose.position, ray),
+            Some(shutter) => {
+                let (from, along) = shutter.line(ray, shutter.time(pixel, [k.width, k.height]));
+                (self.pose.world_from_camera(from), along)
+            }
+        };
+        (from, (self.pose.rotation * along).normalize())
     }
 
     /// [Depth](Intrinsics::depth) per world unit along a unit direction in the world.
@@ -168,6 +191,8 @@ impl Camera {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::FirstSide;
+    use glam::Quat;
 
     #[test]
     fn scaling_odd_sizes_preserves_the_field_of_view() {
@@ -214,9 +239,43 @@ mod tests {
         );
         let point = Vec3::new(0.2, -0.1, 0.3);
         let (pixel, depth) = camera.project(point).expect("in front");
-        let direction = camera.ray_direction(pixel);
+        let (_, direction) = camera.ray(pixel);
         let expected = (point - camera.pose.position).normalize();
         assert!((direction - expected).length() < 1e-5 && depth > 3.0);
         assert!(camera.project(Vec3::new(2.0, 4.0, 6.0)).is_none(), "behind");
+    }
+
+    #[test]
+    fn a_rolling_shutter_shows_points_where_their_rows_see_them() {
+        let still = Camera::new(
+            Pose::look_at(Vec3::new(1.0, 2.0, 3.0), Vec3::ZERO, Vec3::Z),
+            Intrinsics::from_fov_x(640, 480, 0.9),
+        );
+        let shutter = RollingShutter {
+            first: FirstSide::Top,
+            translation: Vec3::new(0.02, -0.01, 0.03),
+            rotation: Vec3::new(0.01, 0.06, -0.02),
+        };
+        let camera = Camera {
+            shutter: Some(shutter),
+            ..still
+        };
+        assert!(still.is_pinhole() && !camera.is_pinhole());
+        for world in [Vec3::new(0.2, -0.1, 0.9), Vec3::new(-0.4, 0.3, -0.8), Vec3::ZERO] {
+            let (pixel, depth) = camera.project(world).expect("in front");
+            let (at_rest, same_depth) = still.project(world).expect("in front");
+            assert_eq!(depth, same_depth);
+            // The camera as it is when the row is exposed.
+            let time = pixel.y / 480.0 - 0.5;
+            let mut moved = still;
+            moved.pose.position = still.pose.world_from_camera(time * shutter.translation);
+            moved.pose.rotation = still.pose.rotation * Quat::from_scaled_axis(time * shutter.rotation);
+            let (expected, _) = moved.project(world).expect("in front");
+            let apart = pixel.distance(expected);
+            assert!(apart < 0.1, "{world} {pixel} {expected} at rest {at_rest}");
+            let (from, along) = camera.ray(pixel);
+            let nearest = from + along * (world - from).dot(along);
+            assert!(nearest.distance(world) < 1e-4, "{world} {nearest}");
+        }
     }
 }

@@ -21,6 +21,7 @@ mod pose;
 mod resize;
 pub mod rng;
 pub mod sh;
+mod shutter;
 mod similarity;
 mod srgb;
 
@@ -36,5 +37,6 @@ pub use points::PointCloud;
 pub use pose::Pose;
 pub use resize::{Part, resize_area, resize_part};
 pub use rng::Rng;
+pub use shutter::{FirstSide, RollingShutter};
 pub use similarity::Similarity;
 pub use srgb::{srgb_from_linear, srgb_slope};

@@ -7,7 +7,7 @@ use crate::scenes::SceneName;
 use crate::shape::Ray;
 use crate::trace::{SynthFrame, depth_per_distance, pixel_ray};
 use glam::{Vec2, Vec3};
-use irradia_scene::{Camera, Dataset, Photo, PointCloud, Rng, View};
+use irradia_scene::{Camera, Dataset, FirstSide, Photo, PointCloud, Rng, RollingShutter, View};
 use std::sync::Arc;
 
 /// Most samples per pixel.
@@ -25,7 +25,7 @@ const FAR: f32 = 100.0;
 const CONTRAST: f32 = 0.06;
 
 /// Options of a dataset.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SynthOptions {
     /// The scene.
     pub scene: SceneName,
@@ -41,6 +41,9 @@ pub struct SynthOptions {
     /// The lens of the training and validation views. Held-out views are always by a pinhole, so that lenses can be compared, and of a size at
     /// which they have as many pixels an angle.
     pub lens: SynthLens,
+    /// By how much the camera of a training or validation view turns while it is read out from top to bottom, radians; it moves by as much, world
+    /// units a radian, both in directions of their own. Held-out views are by a camera at rest.
+    pub turn: f32,
 }
 
 impl Default for SynthOptions {
@@ -53,12 +56,13 @@ impl Default for SynthOptions {
             height: 256,
             seed: 0,
             lens: SynthLens::Pinhole,
+            turn: 0.0,
         }
     }
 }
 
 /// Invalid options, in one line.
-#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum SynthError {
     /// Too few or too many views.
     #[error("{0} views: must be 3 to 1000")]
@@ -66,6 +70,9 @@ pub enum SynthError {
     /// Too small or too large.
     #[error("size {0}x{1}: each side must be 8 to 4096 pixels")]
     Size(u32, u32),
+    /// Too fast, or not a number.
+    #[error("a turn of {0} radians during the readout: must be 0 to 0.5")]
+    Turn(f32),
 }
 
 /// A view to trace.
@@ -110,12 +117,16 @@ impl Capture {
             height,
             seed,
             lens,
+            turn,
         } = *options;
         if !(3..=1000).contains(&views) {
             return Err(SynthError::Views(views));
         }
         if ![width, height].iter().all(|side| (8..=4096).contains(side)) {
             return Err(SynthError::Size(width, height));
+        }
+        if !(0.0..=0.5).contains(&turn) {
+            return Err(SynthError::Turn(turn));
         }
         let (scene, rig) = scene.build(seed);
         let mut shots: Vec<Shot> = Vec::new();
@@ -127,6 +138,9 @@ impl Capture {
                     Part::Train | Part::Val => wide,
                     Part::Test => camera.intrinsics.scaled(wide.fx / camera.intrinsics.fx),
                 };
+                if turn > 0.0 && part != Part::Test {
+                    camera.shutter = Some(moving(turn, &mut Rng::new(seed, 2000 + shots.len() as u64)));
+                }
                 let seed = seed.wrapping_mul(1_000_003).wrapping_add(shots.len() as u64);
                 shots.push(Shot {
                     part,
@@ -242,17 +256,25 @@ pub fn dataset(options: &SynthOptions) -> Result<Dataset, SynthError> {
     Ok(dataset)
 }
 
+/// A camera that turns by `turn` in some direction while it is read out, and moves.
+fn moving(turn: f32, rng: &mut Rng) -> RollingShutter {
+    let mut direction = || Vec3::new(rng.normal(), rng.normal(), rng.normal()).normalize_or(Vec3::X);
+    RollingShutter {
+        first: FirstSide::Top,
+        translation: turn * direction(),
+        rotation: turn * direction(),
+    }
+}
+
 /// Adds the surface point under a pixel, with noise.
 fn add_point(points: &mut PointCloud, camera: &Camera, frame: &SynthFrame, [x, y]: [u32; 2], rng: &mut Rng) {
-    let Some(Ray { direction, .. }) = pixel_ray(camera, Vec2::new(x as f32 + 0.5, y as f32 + 0.5)) else {
+    let Some(Ray { origin, direction }) = pixel_ray(camera, Vec2::new(x as f32 + 0.5, y as f32 + 0.5)) else {
         return;
     };
     let depth = frame.depth.pixel(x, y)[0];
     let distance = depth / depth_per_distance(camera, direction);
     let error = Vec3::new(rng.normal(), rng.normal(), rng.normal()) * (POINT_ERROR * distance);
-    points
-        .positions
-        .push(camera.pose.position + direction * distance + error);
+    points.positions.push(origin + direction * distance + error);
     let color = frame.color.pixel(x, y);
     points.colors.push([0, 1, 2].map(|c| (color[c] * 255.0).round() as u8));
 }
@@ -268,6 +290,7 @@ mod tests {
         height: 32,
         seed: 5,
         lens: SynthLens::Pinhole,
+        turn: 0.0,
     };
 
     #[test]

@@ -6,7 +6,7 @@ use crate::lens::direction;
 use crate::scene::{Hit, SynthScene};
 use crate::shape::Ray;
 use crate::sky;
-use glam::{Vec2, Vec3};
+use glam::{Quat, Vec2, Vec3};
 use irradia_scene::{Camera, Image, Rng, srgb_from_linear};
 use rayon::prelude::*;
 use std::f32::consts::TAU;
@@ -211,9 +211,15 @@ pub(crate) fn depth_per_distance(camera: &Camera, direction: Vec3) -> f32 {
 
 /// The ray through pixel coordinates; `None` outside the image circle of a fisheye.
 pub(crate) fn pixel_ray(camera: &Camera, pixel: Vec2) -> Option<Ray> {
+    let (k, mut pose) = (&camera.intrinsics, camera.pose);
+    if let Some(shutter) = &camera.shutter {
+        let time = shutter.time(pixel, [k.width, k.height]);
+        pose.position = pose.world_from_camera(time * shutter.translation);
+        pose.rotation *= Quat::from_scaled_axis(time * shutter.rotation);
+    }
     Some(Ray {
-        origin: camera.pose.position,
-        direction: camera.pose.rotation * direction(&camera.intrinsics, pixel)?,
+        origin: pose.position,
+        direction: pose.rotation * direction(k, pixel)?,
     })
 }
 

@@ -6,7 +6,7 @@ use crate::recipe::Recipe;
 use crate::schedule::StepPlan;
 use crate::trainer::{TrainError, Trainer};
 use irradia_compute::{Device, DeviceError};
-use irradia_scene::{Camera, Lens};
+use irradia_scene::Camera;
 use irradia_splat::{Engine, RenderOptions, Update};
 #[cfg(feature = "gpu")]
 use {
@@ -34,8 +34,8 @@ pub(crate) fn use_device(
     if fields < recipe.stage.len() {
         told.push(if recipe.residual.is_some() {
             format!("splats with a residual field are trained on the CPU, not on {device}")
-        } else if cameras.iter().any(|camera| camera.intrinsics.lens != Lens::Pinhole) {
-            format!("splats in distorted photographs are trained on the CPU, not on {device}")
+        } else if !cameras.iter().all(Camera::is_pinhole) {
+            format!("splats in photographs with distortion or a rolling shutter are trained on the CPU, not on {device}")
         } else {
             engine.use_device(device)?;
             let most = engine.most_splats();

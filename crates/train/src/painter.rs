@@ -9,7 +9,6 @@ use irradia_splat::Renderer;
 #[cfg(feature = "gpu")]
 use {
     irradia_field::gpu::{GpuFieldRenderer, supports},
-    irradia_scene::Lens,
     irradia_splat::GpuRenderer,
 };
 
@@ -50,7 +49,7 @@ impl<'m> Painter<'m> {
         #[cfg(feature = "gpu")]
         match (&mut self.gpu, self.model) {
             // The kernels of splats are those of a pinhole.
-            (Some(OnGpu::Splats(gpu)), _) if camera.intrinsics.lens == Lens::Pinhole => {
+            (Some(OnGpu::Splats(gpu)), _) if camera.is_pinhole() => {
                 gpu.render(&irradia_splat::ViewParams::new(camera), options);
                 let frame = Frame::of_planes(gpu.frame(), camera);
                 gpu.gpu().check()?;

@@ -371,7 +371,7 @@ impl Painter {
                 ((depth > 0.0).then_some(depth), None)
             }
         };
-        let direction = shot.camera.ray_direction(pixel);
+        let (_, direction) = shot.camera.ray(pixel);
         let along = direction.dot(shot.camera.pose.rotation * Vec3::Z);
         Picked {
             point: depth.map(|depth| (shot.camera.pose.position + direction * (depth / along)).to_array()),

@@ -26,9 +26,10 @@ impl Views {
             let pose = place.and_then(|place| Some(refined?[place].pose));
             let mut camera = view.camera;
             camera.pose = pose.unwrap_or(camera.pose);
+            // Pictures of the page are by a pinhole at rest: photographs with distortion or a rolling shutter do not compare with them.
+            let is_pinhole = camera.is_pinhole();
+            camera.shutter = None;
             let k = &mut camera.intrinsics;
-            // Pictures of the page are by a pinhole: photographs that keep their distortion do not compare with them.
-            let is_pinhole = k.lens == Lens::Pinhole;
             if k.lens.is_wide() {
                 *k = Intrinsics::from_fov_x(k.width, k.height, FRAC_PI_2);
             }

@@ -63,7 +63,7 @@ fn plant(draft: &Draft, scale: f32) -> Draft {
                 rng.range(0.1, 0.9) * k.width as f32,
                 rng.range(0.1, 0.9) * k.height as f32,
             );
-            let (eye, ray) = (camera.pose.position, camera.ray_direction(pixel));
+            let (eye, ray) = camera.ray(pixel);
             let ball = |size: f32| [size * scale; 3];
             let direction = Vec3::new(rng.normal(), rng.normal(), rng.normal()).normalize();
             let opacity = rng.range(0.3, 0.95);

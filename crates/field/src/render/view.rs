@@ -42,8 +42,8 @@ pub struct FieldView {
 
 /// The field's ray through pixel coordinates `(x, y)` of `camera`, and the depth per world unit along it.
 pub fn camera_ray(field: &Field, camera: &Camera, x: f32, y: f32) -> (Ray, f32) {
-    let direction = camera.ray_direction(Vec2::new(x, y));
-    let ray = field.space.ray(camera.pose.position.to_array(), direction.to_array());
+    let (from, direction) = camera.ray(Vec2::new(x, y));
+    let ray = field.space.ray(from.to_array(), direction.to_array());
     (ray, camera.depth_along(direction))
 }
 

@@ -3,6 +3,7 @@
 
 use super::declared::{Declared, DeclaredView};
 use super::panoramas;
+use super::readout;
 use super::split;
 use super::visible::find_points_seen;
 use super::world::world_from_dataset;
@@ -16,7 +17,7 @@ use crate::shown::Shown;
 use crate::undistort::Undistortion;
 use glam::DQuat;
 use image::metadata::Orientation;
-use irradia_scene::{Camera, Dataset, Intrinsics, Lens, PointCloud, Similarity, View};
+use irradia_scene::{Camera, Dataset, Intrinsics, Lens, PointCloud, RollingShutter, Similarity, View};
 use rayon::prelude::*;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -96,6 +97,15 @@ pub(super) fn assemble(declared: Declared, options: &DatasetOptions) -> Result<D
     }
     views.sort_by(|a, b| a.name.cmp(&b.name));
     let named = views.len();
+    if let Some(readout) = &options.readout {
+        let moving = readout::of_neighbours(&mut views, readout);
+        if moving < named {
+            warnings.push(format!(
+                "{} of {named} photographs are taken as if exposed at once: their names have no numbers of frames, or no neighbour has a pose",
+                named - moving
+            ));
+        }
+    }
 
     let mut probed: Vec<Result<Probed, Skipped>> = views.par_iter().map(|view| probe(view, ignores_exif)).collect();
     plan_cuts(&views, &mut probed, options.lenses);
@@ -295,8 +305,9 @@ impl Finishing<'_> {
                 .filter_map(|(name, plan)| {
                     let mut face = self.view(&view, probed, Some(*plan))?;
                     face.name = format!("{}/{name}", view.name);
-                    // Depths and normals have the axes of the photograph, not of the face.
+                    // Depths, normals and movement have the axes of the photograph, not of the face.
                     face.depth_bounds = None;
+                    face.camera.shutter = None;
                     face.depth_map = None;
                     face.normal_map = None;
                     face.points_seen.retain(|point| self.is_seen(&face.camera, *point));
@@ -342,9 +353,14 @@ impl Finishing<'_> {
         };
         let mut pose = view.pose?;
         pose.rotation *= plan.map_or(DQuat::IDENTITY, |plan| plan.turn());
+        let camera = Camera::new(pose.in_world(self.world_from_dataset), intrinsics);
+        let shutter = view.shutter.map(|shutter| RollingShutter {
+            translation: shutter.translation * self.world_from_dataset.scale as f32,
+            ..shutter
+        });
         Some(View {
             name: view.name.clone(),
-            camera: Camera::new(pose.in_world(self.world_from_dataset), intrinsics),
+            camera: Camera { shutter, ..camera },
             photo: Arc::new(photo),
             depth_bounds: view
                 .depth_bounds

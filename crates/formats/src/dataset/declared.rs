@@ -2,7 +2,7 @@
 
 use super::files::relative_name;
 use glam::{DMat3, DQuat, DVec3};
-use irradia_scene::{Intrinsics, Lens, PointCloud, Pose, Similarity};
+use irradia_scene::{Intrinsics, Lens, PointCloud, Pose, RollingShutter, Similarity};
 use std::f64::consts::{PI, TAU};
 use std::path::{Path, PathBuf};
 
@@ -38,6 +38,8 @@ pub(super) struct DeclaredView {
     /// In the source's own unit.
     pub time: Option<f32>,
     pub points_seen: Vec<u32>,
+    /// How the camera moved, in the files' own unit.
+    pub shutter: Option<RollingShutter>,
     /// `None` when the dataset does not declare it.
     pub split: Option<Split>,
 }
@@ -64,6 +66,7 @@ impl DeclaredView {
             depth_bounds: None,
             time: None,
             points_seen: Vec::new(),
+            shutter: None,
             split: None,
         }
     }

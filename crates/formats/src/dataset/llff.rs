@@ -100,6 +100,7 @@ pub(super) fn read(root: &Path, downscale: f32) -> Result<Declared, FormatError>
                 depth_bounds: Some(pose.bounds),
                 time: None,
                 points_seen: Vec::new(),
+                shutter: None,
                 split: None,
                 depth: None,
                 normals: None,

@@ -20,6 +20,7 @@ pub(crate) mod nvm;
 pub(crate) mod opensfm;
 mod panoramas;
 pub(crate) mod phone;
+mod readout;
 pub(crate) mod realitycapture;
 mod split;
 mod tokens;
@@ -38,6 +39,7 @@ pub(crate) use files::{is_image_name, list_files};
 use irradia_scene::Dataset;
 pub(crate) use npy::parse_table;
 pub use panoramas::{PANORAMA_MASKS, PANORAMAS};
+pub use readout::Readout;
 use serde::{Deserialize, Serialize};
 pub use split::Holdout;
 use std::fmt;
@@ -187,6 +189,8 @@ pub struct DatasetOptions {
     pub images: Option<PathBuf>,
     /// What becomes of distorted photographs.
     pub lenses: Lenses,
+    /// Of the film of which the photographs are frames; how the camera moved follows from the poses of their neighbours.
+    pub readout: Option<Readout>,
 }
 
 /// What becomes of photographs by lenses that are no pinholes. Where they keep their distortion, [`irradia_scene::Intrinsics::lens`] has the lens.
@@ -237,6 +241,7 @@ impl Default for DatasetOptions {
             holdout: Holdout::AsDeclared,
             images: None,
             lenses: Lenses::default(),
+            readout: None,
         }
     }
 }

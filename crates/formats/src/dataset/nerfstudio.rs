@@ -118,6 +118,7 @@ pub(super) fn declared_views(
                 depth_bounds: None,
                 time: frame.time.map(|time| time as f32).filter(|time| time.is_finite()),
                 points_seen: Vec::new(),
+                shutter: frame.shutter(transforms.rolling_shutter_time),
                 split: split_of(&frame.file_path),
             })
         })

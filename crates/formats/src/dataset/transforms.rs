@@ -1,9 +1,10 @@
 //! `transforms*.json`: cameras and frames of NeRF's Blender scenes, instant-ngp and nerfstudio.
 
 use super::declared::{DeclaredCamera, DeclaredPose, Focal, lens_or_pinhole, pose_from_axes};
+use super::readout::of_velocities;
 use crate::Malformed;
 use glam::DVec3;
-use irradia_scene::Lens;
+use irradia_scene::{Lens, RollingShutter};
 use serde::Deserialize;
 
 /// A `transforms.json`.
@@ -14,6 +15,8 @@ pub struct Transforms {
     pub camera: CameraKeys,
     /// The photographs.
     pub frames: Vec<Frame>,
+    /// How long the rows of a photograph are exposed one after another, seconds.
+    pub rolling_shutter_time: Option<f64>,
     /// A point cloud in the same world, relative to the file.
     pub ply_file_path: Option<String>,
     /// `file_path` of the training frames.
@@ -41,6 +44,10 @@ pub struct Frame {
     pub normal_file_path: Option<String>,
     /// Time of capture (D-NeRF: 0 to 1 over the capture).
     pub time: Option<f64>,
+    /// Velocity of the camera along its own OpenGL axes, per second (this key and the next: "Gaussian Splatting on the Move").
+    pub camera_linear_velocity: Option<[f64; 3]>,
+    /// Angular velocity about its own OpenGL axes, radians per second.
+    pub camera_angular_velocity: Option<[f64; 3]>,
     /// Intrinsics of this frame only.
     #[serde(flatten)]
     pub camera: CameraKeys,
@@ -215,6 +222,11 @@ impl Frame {
         let column = |c: usize| Some(DVec3::new(number(0, c)?, number(1, c)?, number(2, c)?));
         pose_from_axes(column(0)?, -column(1)?, -column(2)?, column(3)?)
     }
+
+    /// How the camera moved while the photograph was read out.
+    pub(super) fn shutter(&self, seconds: Option<f64>) -> Option<RollingShutter> {
+        of_velocities(self.camera_linear_velocity?, self.camera_angular_velocity?, seconds?)
+    }
 }
 
 #[cfg(test)]
@@ -290,6 +302,8 @@ mod tests {
             depth_file_path: None,
             normal_file_path: None,
             time: None,
+            camera_linear_velocity: None,
+            camera_angular_velocity: None,
             camera: CameraKeys::default(),
         };
         let good = [[2.0, 0.0, 0.0, 0.0], [0.0, 2.0, 0.0, 0.0], [0.0, 0.0, 2.0, 0.0]];

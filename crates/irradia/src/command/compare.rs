@@ -265,6 +265,7 @@ fn sources(args: &Args) -> Result<Vec<Source>> {
                 format: args.reading.format.clone(),
                 images: args.reading.images.clone(),
                 lenses: args.reading.training(None).lenses,
+                readout: args.reading.readout.clone(),
                 ..protocol.reading(&scene)
             },
             None => args.reading.training(None),
@@ -367,6 +368,7 @@ fn request(args: &Args, program: &str, source: &Source, variant: &Variant, seed:
         None => option("--downscale", Some(reading.downscale.to_string())),
     }
     option("--lenses", Some(reading.lenses.name().to_owned()));
+    option("--readout", reading.readout.clone());
     option("--holdout", reading.holdout.clone());
     let images = reading.images.as_ref().map(std::path::absolute);
     option(

@@ -48,6 +48,9 @@ pub struct SynthArgs {
     /// Lens of the photographs to train on: pinhole, fisheye or equirectangular; held-out views are by a pinhole
     #[arg(long, value_name = "NAME", default_value_t = SynthLens::Pinhole)]
     pub lens: SynthLens,
+    /// The camera of the photographs to train on moves while they are read out from top to bottom (rolling shutter), turning by this
+    #[arg(long, value_name = "DEGREES", default_value_t = 0.0)]
+    pub turn: f32,
 }
 
 pub fn run(args: &Args) -> Result<()> {
@@ -91,6 +94,7 @@ pub fn synth(args: &SynthArgs) -> Result<()> {
         height: args.size.1,
         seed: args.seed,
         lens: args.lens,
+        turn: args.turn.to_radians(),
     };
     let summary = write_synth_dataset(&args.out, &options)?;
     say(format_args!("{}: {summary}", args.out.display()))

@@ -81,6 +81,9 @@ pub fn run(args: &Args) -> Result<()> {
     if reading.lenses.is_none() {
         reading.lenses = run.as_ref().map(|record| record.input.reading.lenses);
     }
+    if reading.readout.is_none() {
+        reading.readout = run.as_ref().and_then(|record| record.input.reading.readout.clone());
+    }
     let dataset = scene.place(reading.read(&args.data)?);
     let background = match (args.background, &run) {
         (None, None) => Background::usual(&dataset, false)?,

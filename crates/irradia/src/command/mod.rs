@@ -74,6 +74,11 @@ pub struct DataArgs {
     /// them in place of faces (whole: the default of training on the CPU); or kept in any case (distorted)
     #[arg(long, value_name = "undistorted|whole|distorted", hide_possible_values = true)]
     pub lenses: Option<Lenses>,
+    /// The photographs are frames of a film whose rows are exposed one after another (rolling shutter), during this fraction of a frame: 0.5, or
+    /// 0.5:left where the left side is exposed first. How the camera moves is taken from the poses of neighbouring frames, by the numbers in their
+    /// names. Training is on the CPU
+    #[arg(long, value_name = "FRAMES[:SIDE]")]
+    pub readout: Option<String>,
     /// colmap, nerfstudio, blender, llff, nerfies, opensfm, metashape, realitycapture, polycam, record3d, nvm or bundler; detected
     /// from the folder when absent
     #[arg(long)]
@@ -92,6 +97,7 @@ impl DataArgs {
             holdout: self.holdout.clone(),
             images: self.images.clone(),
             lenses: self.lenses.unwrap_or(usual.lenses),
+            readout: self.readout.clone(),
         }
     }
 

@@ -189,6 +189,37 @@ fn views_with_colliding_names_get_separate_files() {
     }
 }
 
+/// Cameras that turn by 4 degrees during the readout are trained on as what they are; without their velocities the scene is a blur.
+#[test]
+fn photographs_by_a_rolling_shutter_train_a_sharp_scene() {
+    let folder = tempfile::tempdir().expect("a folder");
+    irradia(folder.path(), "synth data --views 16 --size 96x96 --turn 4").success();
+    let trained = |run: &str| {
+        irradia(
+            folder.path(),
+            &format!("train data --out {run} --steps 300 --threads 2"),
+        )
+        .success();
+        json(&folder.path().join(run).join("report.json"))["psnr"]
+            .as_f64()
+            .expect("PSNR")
+    };
+    let moving = trained("moving");
+    // The velocities of no readout are those of a camera at rest.
+    let path = folder.path().join("data/transforms_train.json");
+    let mut transforms = json(&path);
+    transforms["rolling_shutter_time"] = 0.0.into();
+    fs::write(&path, transforms.to_string()).expect("a file");
+    let at_rest = trained("at_rest");
+    assert!(moving > 26.0 && moving > at_rest + 3.0, "{moving} dB and {at_rest} dB");
+
+    // A film's frames have numbers, which those of a rendered scene have, too.
+    let said = irradia(folder.path(), "train data --out numbered --steps 2 --readout 1:left").success();
+    assert!(!said.stderr.contains("as if exposed at once"), "{}", said.stderr);
+    irradia(folder.path(), "train data --out wrong --steps 2 --readout 2")
+        .refused(2, &["--readout 2: expected 0 to 1 frames"]);
+}
+
 /// A fisheye of 190 degrees is trained on as it is: no faces, no pixels beyond its circle, and views by a pinhole look right.
 #[test]
 fn photographs_of_wide_lenses_are_trained_on_and_evaluated_as_they_are() {

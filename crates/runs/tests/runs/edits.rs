@@ -202,6 +202,7 @@ fn floaters_planted_in_a_trained_scene_are_removed() {
         height: 72,
         seed: 2,
         lens: SynthLens::Pinhole,
+        turn: 0.0,
     };
     let data = traced(&options).expect("options");
     let request = input(folder.path(), "run", 300).check().expect("a request");
@@ -267,7 +268,7 @@ fn planted(clean: &GaussianCloud, cameras: &[Camera]) -> GaussianCloud {
             let camera = &cameras[rng.below(cameras.len() as u32) as usize];
             let k = camera.intrinsics;
             let pixel = glam::Vec2::new(rng.uniform() * k.width as f32, rng.uniform() * k.height as f32);
-            let (eye, ray) = (camera.pose.position, camera.ray_direction(pixel));
+            let (eye, ray) = camera.ray(pixel);
             let direction = Vec3::new(rng.normal(), rng.normal(), rng.normal()).normalize();
             let opacity = rng.range(0.3, 0.95);
             let mut ball = |low: f32, high: f32| [unit * rng.range(low, high); 3];

@@ -25,6 +25,7 @@ const SMALL: SynthOptions = SynthOptions {
     height: 16,
     seed: 1,
     lens: irradia_runs::synth::SynthLens::Pinhole,
+    turn: 0.0,
 };
 
 fn folder() -> TempDir {

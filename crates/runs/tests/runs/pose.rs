@@ -23,6 +23,7 @@ const OPTIONS: SynthOptions = SynthOptions {
     height: 240,
     seed: 3,
     lens: irradia_runs::synth::SynthLens::Pinhole,
+    turn: 0.0,
 };
 
 /// The training photographs of a ray-traced scene, and their true cameras by name.
@@ -431,6 +432,7 @@ fn a_fisheye_is_found_without_metadata_and_photographs_are_added_to_it() {
         width: 480,
         height: 480,
         lens: irradia_runs::synth::SynthLens::Fisheye,
+        turn: 0.0,
         ..OPTIONS
     };
     let capture = Capture::new(&options).unwrap();
@@ -479,6 +481,7 @@ fn panoramas_in_folders_are_posed_by_their_faces() {
         width: 768,
         height: 384,
         lens: irradia_runs::synth::SynthLens::Equirectangular,
+        turn: 0.0,
         ..OPTIONS
     };
     let capture = Capture::new(&options).unwrap();

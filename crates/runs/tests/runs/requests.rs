@@ -163,6 +163,7 @@ fn a_request_round_trips() {
             holdout: Some("5".into()),
             images: Some(std::path::absolute("photographs").expect("a path")),
             lenses: irradia_formats::Lenses::Whole,
+            readout: Some("0.5:left".to_owned()),
         },
         ..input(folder.path(), "run", 4)
     };

@@ -23,6 +23,7 @@ fn faces_are_right(lens: SynthLens, (width, height): (u32, u32), expected: &[&st
         height,
         seed: 4,
         lens,
+        turn: 0.0,
     };
     write_synth_dataset(folder.path(), &options).unwrap();
     let dataset = read_dataset(folder.path(), &DatasetOptions::default()).unwrap();

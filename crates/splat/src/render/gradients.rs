@@ -8,9 +8,9 @@ use super::sh::{MAX_COEFFICIENTS, basis, basis_vjp, direction, direction_vjp};
 use super::view::ViewParams;
 use super::{CameraGradient, Gather, OutputGradient, RenderOptions, Renderer, SplatGradients};
 use crate::{COLUMN_NAMES, Splats};
-use glam::DVec3;
+use glam::{DVec3, Quat, Vec3};
 use irradia_compute::simd::{Double, Level};
-use irradia_scene::{GaussianCloud, Intrinsics, Lens, Rng, sh::coefficients};
+use irradia_scene::{Camera, FirstSide, GaussianCloud, Intrinsics, Lens, Pose, Rng, RollingShutter, sh::coefficients};
 use irradia_testkit::differences::Differences;
 use irradia_testkit::relative_difference;
 
@@ -67,9 +67,29 @@ const LENSES: [Lens; 5] = [
     Lens::Equirectangular,
 ];
 
-fn intrinsics(view: &ViewParams, lens: Lens) -> Intrinsics {
+/// Lenses of cameras that move while they are read out, from each side: of a pinhole, a distorted lens and two wide ones.
+const MOVING: [(Lens, FirstSide); 4] = [
+    (Lens::Pinhole, FirstSide::Top),
+    (LENSES[0], FirstSide::Right),
+    (LENSES[2], FirstSide::Bottom),
+    (LENSES[4], FirstSide::Left),
+];
+
+/// The largest seed of a [`Scene`].
+const SEEDS: u64 = 15;
+
+fn moving(first: FirstSide) -> RollingShutter {
+    RollingShutter {
+        first,
+        translation: Vec3::new(0.1, -0.15, 0.05),
+        rotation: Vec3::new(-0.06, 0.08, 0.1),
+    }
+}
+
+/// A camera with the intrinsics of `view`, at the origin.
+fn camera(view: &ViewParams, lens: Lens, shutter: Option<RollingShutter>) -> Camera {
     let [[fx, fy], [cx, cy]] = [view.focal, view.principal].map(|pair| pair.map(|v| v as f32));
-    Intrinsics {
+    let intrinsics = Intrinsics {
         width: view.width,
         height: view.height,
         fx,
@@ -77,11 +97,16 @@ fn intrinsics(view: &ViewParams, lens: Lens) -> Intrinsics {
         cx,
         cy,
         lens,
+    };
+    Camera {
+        shutter,
+        near: 0.0,
+        ..Camera::new(Pose::from_camera_from_world(Quat::IDENTITY, Vec3::ZERO), intrinsics)
     }
 }
 
 impl Scene {
-    /// One of six configurations with an image of this size, by a pinhole for `seed` 1 to 6, by a lens for 7 to 11.
+    /// One of six configurations with an image of this size, by a pinhole for `seed` 1 to 6, by a lens for 7 to 11, by a moving camera for 12 to 15.
     fn new(seed: u64, width: u32, height: u32) -> Self {
         let (antialias, filter, degree) = [
             (false, None, 3),
@@ -92,10 +117,10 @@ impl Scene {
             (false, Some(0.1), 1),
         ][(seed as usize - 1) % 6];
         let mut rng = Rng::new(seed, 77);
-        let lens = if seed <= 6 {
-            Lens::Pinhole
-        } else {
-            LENSES[seed as usize - 7]
+        let (lens, shutter) = match seed as usize {
+            ..=6 => (Lens::Pinhole, None),
+            at @ 7..=11 => (LENSES[at - 7], None),
+            at => (MOVING[at - 12].0, Some(moving(MOVING[at - 12].1))),
         };
         // Wide lenses show what is behind the camera as well.
         let scale = f64::from(width) / 21.0;
@@ -111,7 +136,7 @@ impl Scene {
             near: 0.2,
             lens: None,
         };
-        view.lens = LensParams::new(&intrinsics(&view, lens));
+        view.lens = LensParams::new(&camera(&view, lens, shutter));
         Self {
             view,
             antialias,
@@ -356,7 +381,7 @@ fn splats(rng: &mut Rng, degree: u32) -> Vec<Flat> {
 #[test]
 fn every_gradient_matches_finite_differences() {
     let mut compared = 0;
-    for seed in 1..=11 {
+    for seed in 1..=SEEDS {
         let scene = Scene::new(seed, 21, 18);
         let splats = splats(&mut Rng::new(seed, 78), scene.degree);
         assert!(scene.project(&splats).len() >= 7, "most are visible");
@@ -419,19 +444,25 @@ fn every_gradient_matches_finite_differences() {
     assert!(compared > 1000);
 }
 
-/// The renderer's own code for lenses against the lenses of cameras, before and behind them, and the limit of a lens that folds.
+/// The renderer's own code for lenses and shutters against those of cameras, before and behind them, and the limit of a lens that folds.
 #[test]
 fn a_lens_shows_points_where_its_camera_has_them() {
-    for lens in LENSES {
-        let view = Scene::new(1, 640, 480).view;
-        let k = intrinsics(&view, lens);
-        let params = LensParams::new(&k).expect("not a pinhole");
+    let still = LENSES.map(|lens| (lens, None));
+    let moving = MOVING.map(|(lens, first)| (lens, Some(moving(first))));
+    for (lens, shutter) in still.into_iter().chain(moving) {
+        let camera = camera(&Scene::new(1, 640, 480).view, lens, shutter);
+        let k = camera.intrinsics;
+        let params = LensParams::new(&camera).expect("not a pinhole at rest");
         let focal = [k.fx, k.fy].map(f64::from);
         let (mut shown, mut rng) = (0, Rng::new(5, 5));
         for _ in 0..1000 {
             let point = [0; 3].map(|_| f64::from(rng.range(-2.0, 2.0)));
+            // Next to a moving camera the direction of the middle row says nothing of others.
+            if shutter.is_some() && DVec3::from(point).length() < 1.0 {
+                continue;
+            }
             let ours = params.project(point, focal, [k.cx, k.cy].map(f64::from));
-            let expected = k.project(DVec3::from(point).as_vec3());
+            let expected = camera.project(DVec3::from(point).as_vec3());
             let inside = expected
                 .filter(|(at, _)| (0.0..k.width as f32).contains(&at.x) && (0.0..k.height as f32).contains(&at.y));
             if let Some((at, depth)) = inside {
@@ -458,7 +489,7 @@ fn a_lens_shows_points_where_its_camera_has_them() {
 /// The whole renderer, with its own loops over chunks, tiles, blocks and lanes, against the simple loops above.
 #[test]
 fn every_level_matches_double_precision() {
-    for seed in 1..=11 {
+    for seed in 1..=SEEDS {
         // Four tiles, complete or three cut by the image's border; 66 splats do not fill a whole number of vectors.
         let whole = seed % 2 == 0;
         let (width, height) = if whole { (64, 64) } else { (63, 54) };

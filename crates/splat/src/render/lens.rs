@@ -8,32 +8,64 @@ use super::project::dot;
 use glam::DVec2;
 use irradia_compute::simd::{Double, Lanes, Mask, Scalar, Simd};
 use irradia_compute::unroll;
-use irradia_scene::{Intrinsics, Lens};
+use irradia_scene::{Camera, Lens, RollingShutter};
 use std::ops::{Add, Mul};
 
 /// Perspective lenses are evaluated up to this multiple of the radius that the image's corners have on the undistorted plane; beyond it they are
 /// continued by their tangent, as gsplat limits the Jacobian of pinholes. Beyond a fold they show nothing.
 const BEYOND_CORNERS: f64 = 1.3;
+/// What the camera of the middle row does not see may be seen by others: wide lenses that move are evaluated up to this multiple of their angle.
+const BEYOND_MOVED: f64 = 1.1;
+/// Rounds in which the time at which a rolling shutter sees a position is found, with its derivatives: see [`RollingShutter`].
+const ROUNDS: usize = 4;
 /// Positions along each side of an image at which its largest radius or angle is searched.
 const SAMPLES: u32 = 16;
 
-/// A lens other than a pinhole, and how far from its axis it is evaluated.
+/// A lens other than a pinhole at rest, and how far from its axis it is evaluated.
 #[derive(Clone, Debug, PartialEq)]
 pub struct LensParams {
     lens: Lens,
+    shutter: Option<Shutter>,
     /// The radius on the undistorted plane, or for wide lenses the cosine of the angle.
     limit: f64,
     /// Whether nothing is shown beyond the limit.
     ends: bool,
 }
 
+/// A [`RollingShutter`] of an image of known size.
+#[derive(Clone, Debug, PartialEq)]
+struct Shutter {
+    /// The image axis along which time passes.
+    axis: usize,
+    /// The pixel coordinate of time 0.
+    middle: f64,
+    /// Time per pixel.
+    rate: f64,
+    translation: [f64; 3],
+    rotation: [f64; 3],
+}
+
+impl Shutter {
+    fn new(shutter: &RollingShutter, size: [u32; 2]) -> Self {
+        let axis = shutter.first.axis();
+        let length = f64::from(size[axis]);
+        Self {
+            axis,
+            middle: 0.5 * length,
+            rate: if shutter.first.is_reversed() { -1.0 } else { 1.0 } / length,
+            translation: shutter.translation.to_array().map(f64::from),
+            rotation: shutter.rotation.to_array().map(f64::from),
+        }
+    }
+}
+
 impl LensParams {
-    /// The lens of `k`; `None` for a pinhole.
-    pub fn new(k: &Intrinsics) -> Option<Self> {
-        let lens = k.lens;
-        if lens == Lens::Pinhole {
+    /// The lens and the shutter of `camera`; `None` for a pinhole at rest.
+    pub fn new(camera: &Camera) -> Option<Self> {
+        if camera.is_pinhole() {
             return None;
         }
+        let (k, lens) = (&camera.intrinsics, camera.intrinsics.lens);
         let size = DVec2::new(f64::from(k.width), f64::from(k.height));
         let border = (0..=SAMPLES).flat_map(|i| {
             let t = f64::from(i) / f64::from(SAMPLES);
@@ -42,14 +74,24 @@ impl LensParams {
         let directions = border.map(|place| lens.direction(k.plane_of(DVec2::from(place) * size)));
         let (limit, ends) = if lens.is_wide() {
             let angles = directions.map(|d| d.map_or(f64::INFINITY, |d| d.truncate().length().atan2(d.z)));
-            (angles.fold(0.0, f64::max).min(lens.reach_in_angle()).cos(), true)
+            let moved = camera.shutter.map_or(1.0, |_| BEYOND_MOVED);
+            let largest = moved * angles.fold(0.0, f64::max);
+            (largest.min(lens.reach_in_angle()).cos(), true)
         } else {
             let known = directions.flatten().map(|d| d.truncate().length() / d.z);
             let limit = BEYOND_CORNERS * known.fold(0.0, f64::max);
             let reach = lens.reach_on_plane(limit);
             (limit.min(reach), reach < limit)
         };
-        Some(Self { lens, limit, ends })
+        let shutter = camera
+            .shutter
+            .map(|shutter| Shutter::new(&shutter, [k.width, k.height]));
+        Some(Self {
+            lens,
+            shutter,
+            limit,
+            ends,
+        })
     }
 
     /// Whether the lens also shows what is behind the camera.
@@ -82,8 +124,16 @@ impl LensParams {
                 omega: simd.splat(omega),
             },
         };
+        let shutter = self.shutter.as_ref().map(|shutter| ShutterLanes {
+            axis: shutter.axis,
+            middle: simd.splat(shutter.middle),
+            rate: simd.splat(shutter.rate),
+            translation: unroll!(i in 3 => simd.splat(shutter.translation[i])),
+            rotation: unroll!(i in 3 => simd.splat(shutter.rotation[i])),
+        });
         LensLanes {
             bend,
+            shutter,
             limit: simd.splat(self.limit),
             ends: self.ends,
         }
@@ -93,8 +143,18 @@ impl LensParams {
 /// [`LensParams`] broadcast to all lanes.
 pub(super) struct LensLanes<F> {
     bend: Bend<F>,
+    shutter: Option<ShutterLanes<F>>,
     limit: F,
     ends: bool,
+}
+
+/// [`Shutter`] broadcast to all lanes.
+struct ShutterLanes<F> {
+    axis: usize,
+    middle: F,
+    rate: F,
+    translation: [F; 3],
+    rotation: [F; 3],
 }
 
 /// The models of [`Lens`], with their coefficients.
@@ -165,7 +225,11 @@ impl<F: Lanes> LensLanes<F> {
             let shown = if self.ends { shown.and_not(beyond) } else { shown };
             (from, Some(limited), x[2], [zero, zero, one], shown)
         };
-        let plane = self.plane(unroll!(i in 3 => Jet::variable(from[i], i)));
+        let position = unroll!(i in 3 => Jet::variable(from[i], i));
+        let plane = match &self.shutter {
+            None => self.plane(position),
+            Some(shutter) => self.plane(self.when_exposed(shutter, position, focal, principal)),
+        };
         let jacobian: [[F; 3]; 2] = unroll!(r in 2 => unroll!(i in 3 => focal[r] * plane[r].first[i]));
         let mut xy: [F; 2] = unroll!(r in 2 => focal[r].mul_add(plane[r].value, principal[r]));
         if let Some(Limited { rest, .. }) = &limited {
@@ -182,6 +246,33 @@ impl<F: Lanes> LensLanes<F> {
             depth_gradient,
             limited,
         }
+    }
+
+    /// The position in the camera at the time at which its row is exposed; see [`RollingShutter`].
+    #[inline(always)]
+    fn when_exposed(
+        &self,
+        shutter: &ShutterLanes<F>,
+        position: [Jet<F>; 3],
+        focal: [F; 2],
+        principal: [F; 2],
+    ) -> [Jet<F>; 3] {
+        let axis = shutter.axis;
+        let [a, b, c] = shutter.rotation;
+        let [x, y, z] = position;
+        let turned = [
+            z.scale(b) + y.scale(-c),
+            x.scale(c) + z.scale(-a),
+            y.scale(a) + x.scale(-b),
+        ];
+        let back = unroll!(i in 3 => turned[i].plus(shutter.translation[i]).scale(-shutter.rate));
+        let mut seen = position;
+        for _ in 0..ROUNDS {
+            let pixel = self.plane(seen)[axis].scale(focal[axis]);
+            let rows = pixel.plus(principal[axis] - shutter.middle);
+            seen = unroll!(i in 3 => position[i] + back[i] * rows);
+        }
+        seen
     }
 
     /// The point of the lens's plane; see [`Lens::project`].

@@ -21,7 +21,7 @@ pub struct ViewParams {
     pub height: u32,
     /// Near plane, world units.
     pub near: f64,
-    /// What bends the rays; `None` for a pinhole.
+    /// What bends the rays, or moves while they are exposed; `None` for a pinhole at rest.
     pub lens: Option<LensParams>,
 }
 
@@ -39,7 +39,7 @@ impl ViewParams {
             width: k.width,
             height: k.height,
             near: f64::from(camera.near),
-            lens: LensParams::new(k),
+            lens: LensParams::new(camera),
         }
     }
 

@@ -214,6 +214,7 @@ pub(super) fn read(root: &Path, downscale: f32) -> Result<Declared, FormatError>
             depth_bounds: None,
             time: None,
             points_seen,
+            shutter: None,
             split: None,
             depth: None,
             normals: None,

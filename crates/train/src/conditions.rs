@@ -16,6 +16,7 @@ use crate::depth_maps::DepthMaps;
 use crate::first_splats::has_points;
 use crate::normal_maps::NormalMaps;
 use crate::recipe::{Param, Params};
+use crate::robust::median;
 use crate::spacing::spacing;
 use crate::trainer::{TrainError, Trainer};
 use glam::Vec3;
@@ -162,6 +163,7 @@ impl Trainer {
             self.put_into_effect("masks leave out all but an object", "cut_out", cut_out);
         }
         self.settle_lenses();
+        self.tell_shutters();
         self.settle_spacing();
         self.settle_maps();
         Ok(())
@@ -192,6 +194,21 @@ impl Trainer {
             self.recipe.render.antialias = true;
             self.decisions
                 .push("photographs of wide lenses keep their distortion: splats are antialiased".into());
+        }
+    }
+
+    /// Says how fast cameras move, so that velocities of another unit are seen.
+    fn tell_shutters(&mut self) {
+        let (train, views) = (&self.dataset.train, &self.dataset.views);
+        let shutters = train.iter().filter_map(|view| views[*view].camera.shutter);
+        let turns: Vec<f64> = shutters.map(|shutter| f64::from(shutter.rotation.length())).collect();
+        if !turns.is_empty() {
+            self.decisions.push(format!(
+                "{} of {} cameras move while their rows are exposed (rolling shutter), and turn by {:.2} degrees in the median",
+                turns.len(),
+                train.len(),
+                median(turns).to_degrees()
+            ));
         }
     }
 

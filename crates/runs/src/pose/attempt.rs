@@ -3,7 +3,7 @@
 use super::capture::Capture;
 use super::known::KnownPoses;
 use super::stages::Work;
-use super::{Clock, ENOUGH_POSED, PoseInput, PoseProgress};
+use super::{AttemptReport, Clock, ENOUGH_POSED, PoseInput, PoseProgress};
 use crate::RunError;
 use irradia_sfm::PairMatches;
 use irradia_sfm::map::{PhotoInfo, Progress, Reconstruction, extend, reconstruct};
@@ -80,6 +80,15 @@ impl<'a> Attempt<'a> {
     /// Photographs with a pose in the largest model.
     pub fn registered(&self) -> usize {
         self.reconstruction.models.first().map_or(0, |model| model.registered())
+    }
+
+    /// For the report.
+    pub fn report(&self) -> AttemptReport {
+        AttemptReport {
+            max_features: self.work.max_features(),
+            registered: self.registered(),
+            warnings: self.work.warnings().to_vec(),
+        }
     }
 
     /// The same photographs, to be searched for more features, if too few of them have a pose and more can be found in most of the others. Parts that look

@@ -137,6 +137,8 @@ pub struct PoseReport {
     pub scale: Option<ScaleReport>,
     /// Its cameras.
     pub cameras: Vec<CameraReport>,
+    /// What was tried: a second time, with more features, where too few photographs had a pose. The one with more poses was written.
+    pub attempts: Vec<AttemptReport>,
     /// Pairs of photographs that were matched.
     pub pairs: usize,
     /// Pairs with a common geometry.
@@ -149,6 +151,17 @@ pub struct PoseReport {
     pub warnings: Vec<String>,
     /// What is wrong with the capture, the gravest first.
     pub findings: Vec<Finding>,
+}
+
+/// One search for poses; [`PoseReport::attempts`].
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct AttemptReport {
+    /// The most features of a photograph.
+    pub max_features: usize,
+    /// Photographs with a pose in its largest model.
+    pub registered: usize,
+    /// What it warned of.
+    pub warnings: Vec<String>,
 }
 
 impl PoseReport {
@@ -278,6 +291,7 @@ pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Resu
     let is_new = known.is_none();
     let work = Work::new(input.max_features, Some(out), folder, progress);
     let mut attempt = Attempt::make(work, input, &capture, known, &mut clock, progress)?;
+    let mut attempts = vec![attempt.report()];
     if is_new
         && input.max_features.is_none()
         && let Some(work) = attempt.with_more_features(out)
@@ -289,6 +303,7 @@ pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Resu
             work.max_features()
         )));
         let again = Attempt::make(work, input, &capture, None, &mut clock, progress)?;
+        attempts.push(again.report());
         if again.registered() > attempt.registered() {
             attempt = again;
         }
@@ -326,6 +341,7 @@ pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Resu
     let mut report = output::report(folder, &work, &infos, &reconstruction);
     report.findings = examined.findings;
     report.scale = scale;
+    report.attempts = attempts;
     report.pairs = pairs.len();
     report.warnings = work.warnings().to_vec();
     report.stages = clock.stages;

@@ -231,6 +231,7 @@ pub(super) fn report(folder: &PhotoFolder, work: &Work, infos: &[PhotoInfo], fou
         mean_error_px: model.mean_error(),
         scale: None,
         cameras,
+        attempts: Vec::new(),
         pairs: 0,
         verified_pairs: found.pairs.len(),
         stages: Vec::new(),

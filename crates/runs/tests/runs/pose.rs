@@ -168,6 +168,11 @@ fn ray_traced_photographs_get_their_poses_back_and_a_second_call_reuses_the_feat
             .any(|left| left.name == "broken.jpg" && left.reason.contains("not a readable"))
     );
     assert_eq!(report.registered + report.left_out.len(), report.photos);
+    // One search was enough.
+    let [attempt] = &report.attempts[..] else {
+        panic!("{:?}", report.attempts)
+    };
+    assert_eq!(attempt.registered, report.registered);
 
     assert_eq!(DatasetFormat::recognise(&out), Some(DatasetFormat::Colmap));
     let dataset = read_dataset(&out, &DatasetOptions::default()).unwrap();

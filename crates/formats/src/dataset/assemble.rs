@@ -101,7 +101,7 @@ pub(super) fn assemble(declared: Declared, options: &DatasetOptions) -> Result<D
         let moving = readout::of_neighbours(&mut views, readout);
         if moving < named {
             warnings.push(format!(
-                "{} of {named} photographs are taken as if exposed at once: their names have no numbers of frames, or no neighbour has a pose",
+                "{} of {named} photographs are taken as if exposed at once: their names have no numbers of frames, no neighbour has a pose, or they would turn by more than half a radian",
                 named - moving
             ));
         }

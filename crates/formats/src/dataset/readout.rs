@@ -5,13 +5,20 @@ use glam::DVec3;
 use irradia_scene::{FirstSide, RollingShutter};
 use std::collections::BTreeMap;
 use std::fmt;
+use std::ops::Bound::{Excluded, Unbounded};
 use std::path::Path;
 use std::str::FromStr;
+
+/// Radians by which a camera may turn during a readout: a first-order model is far off before.
+const MOST_TURNED: f32 = 0.5;
+
+/// Numbers that are not finite are `None`.
+pub(super) type Velocity = [Option<f64>; 3];
 
 /// The rolling shutter of a film's camera.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Readout {
-    /// The time from the first row to the last, in frames of the film: 0.4 to 0.9 of most phones at 30 frames a second.
+    /// The time from the first row to the last, in frames of the film: 10 ms are 0.3 of a film of 30 frames a second.
     pub frames: f64,
     /// Where it begins.
     pub first: FirstSide,
@@ -39,10 +46,12 @@ impl FromStr for Readout {
 }
 
 /// The shutter of velocities in OpenGL axes, per second, and a readout in seconds, from top to bottom: the keys of "Gaussian Splatting on the Move".
-pub(super) fn of_velocities(linear: [f64; 3], angular: [f64; 3], seconds: f64) -> Option<RollingShutter> {
-    let opencv = |[x, y, z]: [f64; 3]| (DVec3::new(x, -y, -z) * seconds).as_vec3();
-    let (translation, rotation) = (opencv(linear), opencv(angular));
-    let moves = translation.is_finite() && rotation.is_finite() && (translation, rotation) != Default::default();
+/// `None` for a camera at rest, and for one that turns by so much that velocity or time must be of another unit.
+pub(super) fn of_velocities(linear: Velocity, angular: Velocity, seconds: f64) -> Option<RollingShutter> {
+    let opencv = |[x, y, z]: Velocity| Some((DVec3::new(x?, -y?, -z?) * seconds).as_vec3());
+    let (translation, rotation) = (opencv(linear)?, opencv(angular)?);
+    let moves =
+        translation.is_finite() && rotation.length() <= MOST_TURNED && (translation, rotation) != Default::default();
     moves.then_some(RollingShutter {
         first: FirstSide::Top,
         translation,
@@ -50,8 +59,8 @@ pub(super) fn of_velocities(linear: [f64; 3], angular: [f64; 3], seconds: f64) -
     })
 }
 
-/// Gives the frames of films, which are numbered by time, shutters by the poses of their neighbours; those that have one keep it. Returns how many
-/// views have one.
+/// Gives the frames of films, which are numbered by time, shutters by the poses of their neighbours; those that have one keep it, and those
+/// that would turn too far get none. Returns how many views have one.
 pub(super) fn of_neighbours(views: &mut [DeclaredView], readout: &Readout) -> usize {
     let mut films: BTreeMap<String, BTreeMap<u64, usize>> = BTreeMap::new();
     for (index, view) in views.iter().enumerate().filter(|(_, view)| view.pose.is_some()) {
@@ -62,18 +71,23 @@ pub(super) fn of_neighbours(views: &mut [DeclaredView], readout: &Readout) -> us
     for frames in films.values() {
         for (number, index) in frames {
             let before = frames.range(..number).next_back().unwrap_or((number, index));
-            let after = frames.range(number + 1..).next().unwrap_or((number, index));
+            let after = frames.range((Excluded(number), Unbounded)).next();
+            let after = after.unwrap_or((number, index));
+            if before == after || readout.frames == 0.0 || views[*index].shutter.is_some() {
+                continue;
+            }
             let pose = |at: usize| views[at].pose.expect("those of films are posed");
             let moved = movement(&pose(*index), &pose(*before.1), &pose(*after.1));
             let per_readout = readout.frames / (after.0 - before.0) as f64;
             let [translation, rotation] = moved.map(|moved| (moved * per_readout).as_vec3());
-            if views[*index].shutter.is_none() && before.0 < after.0 && readout.frames > 0.0 {
-                views[*index].shutter = Some(RollingShutter {
-                    first: readout.first,
-                    translation,
-                    rotation,
-                });
+            if rotation.length() > MOST_TURNED {
+                continue;
             }
+            views[*index].shutter = Some(RollingShutter {
+                first: readout.first,
+                translation,
+                rotation,
+            });
         }
     }
     views.iter().filter(|view| view.shutter.is_some()).count()

@@ -45,9 +45,9 @@ pub struct Frame {
     /// Time of capture (D-NeRF: 0 to 1 over the capture).
     pub time: Option<f64>,
     /// Velocity of the camera along its own OpenGL axes, per second (this key and the next: "Gaussian Splatting on the Move").
-    pub camera_linear_velocity: Option<[f64; 3]>,
+    pub camera_linear_velocity: Option<[Option<f64>; 3]>,
     /// Angular velocity about its own OpenGL axes, radians per second.
-    pub camera_angular_velocity: Option<[f64; 3]>,
+    pub camera_angular_velocity: Option<[Option<f64>; 3]>,
     /// Intrinsics of this frame only.
     #[serde(flatten)]
     pub camera: CameraKeys,
@@ -232,6 +232,7 @@ impl Frame {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use glam::Vec3;
 
     #[test]
     fn a_frame_overrides_globals_and_axes_are_flipped() {
@@ -291,6 +292,26 @@ mod tests {
             .unwrap_err()
             .to_string();
         assert!(error.contains("file_path"), "{error}");
+    }
+
+    #[test]
+    fn velocities_become_a_movement_in_opencv_axes() {
+        let text = br#"{"rolling_shutter_time": 0.02, "fl_x": 50, "w": 100, "h": 100, "frames": [
+            {"file_path": "a", "transform_matrix": [], "camera_linear_velocity": [1, 2, 3], "camera_angular_velocity": [0, 0.5, 0]},
+            {"file_path": "b", "transform_matrix": [], "camera_linear_velocity": [0, 0, 0], "camera_angular_velocity": [0, 0, 0]},
+            {"file_path": "c", "transform_matrix": [], "camera_linear_velocity": [1, NaN, 0], "camera_angular_velocity": [0, 0, 0]},
+            {"file_path": "d", "transform_matrix": [], "camera_linear_velocity": [1, 0, 0], "camera_angular_velocity": [0, 1e9, 0]},
+            {"file_path": "e", "transform_matrix": []}]}"#;
+        let transforms = parse_transforms(text).unwrap();
+        let shutters: Vec<_> = transforms
+            .frames
+            .iter()
+            .map(|frame| frame.shutter(transforms.rolling_shutter_time))
+            .collect();
+        let moving = shutters[0].expect("it moves");
+        assert!(moving.translation.distance(Vec3::new(0.02, -0.04, -0.06)) < 1e-7);
+        assert!(moving.rotation.distance(Vec3::new(0.0, -0.01, 0.0)) < 1e-7);
+        assert!(shutters[1..].iter().all(Option::is_none), "{shutters:?}");
     }
 
     #[test]

@@ -214,8 +214,16 @@ fn photographs_by_a_rolling_shutter_train_a_sharp_scene() {
     assert!(moving > 26.0 && moving > at_rest + 3.0, "{moving} dB and {at_rest} dB");
 
     // A film's frames have numbers, which those of a rendered scene have, too.
-    let said = irradia(folder.path(), "train data --out numbered --steps 2 --readout 1:left").success();
+    let said = irradia(folder.path(), "train data --out numbered --steps 2 --readout 0.1:left").success();
     assert!(!said.stderr.contains("as if exposed at once"), "{}", said.stderr);
+    // The two held-out cameras are half a turn apart: more than a first-order model bears.
+    let said = irradia(folder.path(), "train data --out far --steps 2 --readout 1:left").success();
+    assert!(
+        said.stderr
+            .contains("3 of 18 photographs are taken as if exposed at once"),
+        "{}",
+        said.stderr
+    );
     irradia(folder.path(), "train data --out wrong --steps 2 --readout 2")
         .refused(2, &["--readout 2: expected 0 to 1 frames"]);
 }

@@ -154,8 +154,9 @@ impl Camera {
         let projected = match &self.shutter {
             None => k.project(point),
             Some(shutter) => {
-                let seen = shutter.seen([k.width, k.height], |time| k.project(shutter.at(point, time)));
-                seen.map(|(at, _)| (at, k.depth(point)))
+                let project = |time| Some(k.project(shutter.at(point, time))?.0);
+                let seen = shutter.seen([k.width, k.height], project);
+                seen.map(|at| (at, k.depth(point)))
             }
         };
         projected.filter(|(_, depth)| *depth > self.near)

@@ -4,16 +4,11 @@ use glam::{Vec2, Vec3};
 use std::fmt;
 use std::str::FromStr;
 
-/// Rounds in which the time at which a point is seen is found: it depends on the row, which depends on the time. Each round divides the error by the
-/// ratio of the readout's speed to the picture's, which is 10 and more.
-const ROUNDS: usize = 4;
-
 /// The side of a picture that is exposed first. Phones read their sensor along the short side of a picture: from the top of one in landscape format,
 /// from the left or the right of one in portrait format.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[allow(missing_docs)]
 pub enum FirstSide {
-    #[default]
     Top,
     Bottom,
     Left,
@@ -75,6 +70,12 @@ pub struct RollingShutter {
 }
 
 impl RollingShutter {
+    /// Rounds in which the time at which a point is seen is found: it depends on the row, which depends on the time. Each round divides the error by
+    /// the ratio of the readout's speed to the picture's, which is 10 and more.
+    pub const ROUNDS: usize = 4;
+    /// Radians by which a camera may turn during a readout: a first-order model is far off before.
+    pub const MOST_TURNED: f32 = 0.5;
+
     /// When a position in an image of `size` pixels is exposed.
     pub fn time(&self, pixel: Vec2, size: [u32; 2]) -> f32 {
         let axis = self.first.axis();
@@ -95,11 +96,11 @@ impl RollingShutter {
         (back(time * self.translation), back(ray))
     }
 
-    /// Finds the time at which a point is seen by evaluating `project`, the pixel of the point at a time.
-    pub(crate) fn seen<T>(&self, size: [u32; 2], project: impl Fn(f32) -> Option<(Vec2, T)>) -> Option<(Vec2, T)> {
+    /// Where a point is seen whose pixel at a time is `project`.
+    pub(crate) fn seen(&self, size: [u32; 2], project: impl Fn(f32) -> Option<Vec2>) -> Option<Vec2> {
         let mut found = project(0.0)?;
-        for _ in 0..ROUNDS {
-            found = project(self.time(found.0, size))?;
+        for _ in 0..Self::ROUNDS {
+            found = project(self.time(found, size))?;
         }
         Some(found)
     }

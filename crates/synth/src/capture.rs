@@ -71,7 +71,7 @@ pub enum SynthError {
     #[error("size {0}x{1}: each side must be 8 to 4096 pixels")]
     Size(u32, u32),
     /// Too fast, or not a number.
-    #[error("a turn of {0} radians during the readout: must be 0 to 0.5")]
+    #[error("a turn of {0} radians during the readout: must be 0 to {most}", most = RollingShutter::MOST_TURNED)]
     Turn(f32),
 }
 
@@ -125,7 +125,7 @@ impl Capture {
         if ![width, height].iter().all(|side| (8..=4096).contains(side)) {
             return Err(SynthError::Size(width, height));
         }
-        if !(0.0..=0.5).contains(&turn) {
+        if !(0.0..=RollingShutter::MOST_TURNED).contains(&turn) {
             return Err(SynthError::Turn(turn));
         }
         let (scene, rig) = scene.build(seed);

@@ -371,10 +371,10 @@ impl Painter {
                 ((depth > 0.0).then_some(depth), None)
             }
         };
-        let (_, direction) = shot.camera.ray(pixel);
+        let (from, direction) = shot.camera.ray(pixel);
         let along = direction.dot(shot.camera.pose.rotation * Vec3::Z);
         Picked {
-            point: depth.map(|depth| (shot.camera.pose.position + direction * (depth / along)).to_array()),
+            point: depth.map(|depth| (from + direction * (depth / along)).to_array()),
             depth,
             splat,
             ..nothing

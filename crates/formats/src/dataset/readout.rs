@@ -9,9 +9,6 @@ use std::ops::Bound::{Excluded, Unbounded};
 use std::path::Path;
 use std::str::FromStr;
 
-/// Radians by which a camera may turn during a readout: a first-order model is far off before.
-const MOST_TURNED: f32 = 0.5;
-
 /// Numbers that are not finite are `None`.
 pub(super) type Velocity = [Option<f64>; 3];
 
@@ -50,8 +47,9 @@ impl FromStr for Readout {
 pub(super) fn of_velocities(linear: Velocity, angular: Velocity, seconds: f64) -> Option<RollingShutter> {
     let opencv = |[x, y, z]: Velocity| Some((DVec3::new(x?, -y?, -z?) * seconds).as_vec3());
     let (translation, rotation) = (opencv(linear)?, opencv(angular)?);
-    let moves =
-        translation.is_finite() && rotation.length() <= MOST_TURNED && (translation, rotation) != Default::default();
+    let moves = translation.is_finite()
+        && rotation.length() <= RollingShutter::MOST_TURNED
+        && (translation, rotation) != Default::default();
     moves.then_some(RollingShutter {
         first: FirstSide::Top,
         translation,
@@ -80,7 +78,7 @@ pub(super) fn of_neighbours(views: &mut [DeclaredView], readout: &Readout) -> us
             let moved = movement(&pose(*index), &pose(*before.1), &pose(*after.1));
             let per_readout = readout.frames / (after.0 - before.0) as f64;
             let [translation, rotation] = moved.map(|moved| (moved * per_readout).as_vec3());
-            if rotation.length() > MOST_TURNED {
+            if rotation.length() > RollingShutter::MOST_TURNED {
                 continue;
             }
             views[*index].shutter = Some(RollingShutter {

@@ -16,8 +16,6 @@ use std::ops::{Add, Mul};
 const BEYOND_CORNERS: f64 = 1.3;
 /// What the camera of the middle row does not see may be seen by others: wide lenses that move are evaluated up to this multiple of their angle.
 const BEYOND_MOVED: f64 = 1.1;
-/// Rounds in which the time at which a rolling shutter sees a position is found, with its derivatives: see [`RollingShutter`].
-const ROUNDS: usize = 4;
 /// Positions along each side of an image at which its largest radius or angle is searched.
 const SAMPLES: u32 = 16;
 
@@ -25,38 +23,13 @@ const SAMPLES: u32 = 16;
 #[derive(Clone, Debug, PartialEq)]
 pub struct LensParams {
     lens: Lens,
-    shutter: Option<Shutter>,
+    shutter: Option<RollingShutter>,
+    /// Width and height of the image, pixels.
+    size: [u32; 2],
     /// The radius on the undistorted plane, or for wide lenses the cosine of the angle.
     limit: f64,
     /// Whether nothing is shown beyond the limit.
     ends: bool,
-}
-
-/// A [`RollingShutter`] of an image of known size.
-#[derive(Clone, Debug, PartialEq)]
-struct Shutter {
-    /// The image axis along which time passes.
-    axis: usize,
-    /// The pixel coordinate of time 0.
-    middle: f64,
-    /// Time per pixel.
-    rate: f64,
-    translation: [f64; 3],
-    rotation: [f64; 3],
-}
-
-impl Shutter {
-    fn new(shutter: &RollingShutter, size: [u32; 2]) -> Self {
-        let axis = shutter.first.axis();
-        let length = f64::from(size[axis]);
-        Self {
-            axis,
-            middle: 0.5 * length,
-            rate: if shutter.first.is_reversed() { -1.0 } else { 1.0 } / length,
-            translation: shutter.translation.to_array().map(f64::from),
-            rotation: shutter.rotation.to_array().map(f64::from),
-        }
-    }
 }
 
 impl LensParams {
@@ -83,12 +56,10 @@ impl LensParams {
             let reach = lens.reach_on_plane(limit);
             (limit.min(reach), reach < limit)
         };
-        let shutter = camera
-            .shutter
-            .map(|shutter| Shutter::new(&shutter, [k.width, k.height]));
         Some(Self {
             lens,
-            shutter,
+            shutter: camera.shutter,
+            size: [k.width, k.height],
             limit,
             ends,
         })
@@ -124,12 +95,18 @@ impl LensParams {
                 omega: simd.splat(omega),
             },
         };
-        let shutter = self.shutter.as_ref().map(|shutter| ShutterLanes {
-            axis: shutter.axis,
-            middle: simd.splat(shutter.middle),
-            rate: simd.splat(shutter.rate),
-            translation: unroll!(i in 3 => simd.splat(shutter.translation[i])),
-            rotation: unroll!(i in 3 => simd.splat(shutter.rotation[i])),
+        let shutter = self.shutter.as_ref().map(|shutter| {
+            let axis = shutter.first.axis();
+            let length = f64::from(self.size[axis]);
+            let forwards = if shutter.first.is_reversed() { -1.0 } else { 1.0 };
+            let [translation, rotation] = [shutter.translation, shutter.rotation].map(|v| v.as_dvec3().to_array());
+            ShutterLanes {
+                axis,
+                middle: simd.splat(0.5 * length),
+                rate: simd.splat(forwards / length),
+                translation: unroll!(i in 3 => simd.splat(translation[i])),
+                rotation: unroll!(i in 3 => simd.splat(rotation[i])),
+            }
         });
         LensLanes {
             bend,
@@ -148,10 +125,13 @@ pub(super) struct LensLanes<F> {
     ends: bool,
 }
 
-/// [`Shutter`] broadcast to all lanes.
+/// A [`RollingShutter`] broadcast to all lanes.
 struct ShutterLanes<F> {
+    /// The image axis along which time passes.
     axis: usize,
+    /// The pixel coordinate of time 0.
     middle: F,
+    /// Time per pixel.
     rate: F,
     translation: [F; 3],
     rotation: [F; 3],
@@ -267,7 +247,7 @@ impl<F: Lanes> LensLanes<F> {
         ];
         let back = unroll!(i in 3 => turned[i].plus(shutter.translation[i]).scale(-shutter.rate));
         let mut seen = position;
-        for _ in 0..ROUNDS {
+        for _ in 0..RollingShutter::ROUNDS {
             let pixel = self.plane(seen)[axis].scale(focal[axis]);
             let rows = pixel.plus(principal[axis] - shutter.middle);
             seen = unroll!(i in 3 => position[i] + back[i] * rows);

@@ -1,7 +1,7 @@
 //! Shared numerics: SIMD lanes with run-time dispatch, planar arrays, radix sort, nearest neighbours of byte vectors and Adam;
 //! and, with the feature `gpu`, the same on any GPU.
 //!
-//! All `unsafe` code is in `simd::x86` and `nearest::x86`.
+//! All `unsafe` code is in `simd` and `nearest`, and a call in `gpu::kernel`.
 
 pub mod adam;
 mod device;

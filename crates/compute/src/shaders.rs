@@ -79,11 +79,15 @@ pub const SORT_SIZES: Shader = Shader {
     parts: &[include_str!("gpu/shaders/sort_sizes.wgsl")],
 };
 
-/// A pass of the stable radix sort: digits of blocks, keys to their places.
-pub const SORT: [Shader; 2] = [
+/// A pass of the stable radix sort: digits of blocks, the sums before each block, keys to their places.
+pub const SORT: [Shader; 3] = [
     Shader {
         name: "sort_count",
         parts: &[GRID, include_str!("gpu/shaders/sort_count.wgsl")],
+    },
+    Shader {
+        name: "sort_starts",
+        parts: &[include_str!("gpu/shaders/sort_starts.wgsl")],
     },
     Shader {
         name: "sort_scatter",

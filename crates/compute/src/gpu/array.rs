@@ -2,6 +2,7 @@ use super::{Gpu, Readback, Work};
 use crate::DeviceError;
 use bytemuck::{NoUninit, Pod};
 use std::sync::PoisonError;
+use std::sync::atomic::Ordering;
 
 /// Words between the beginnings of parts that are bound: 256 bytes, which every implementation accepts.
 pub const PART: usize = 64;
@@ -149,6 +150,7 @@ fn buffer(gpu: &Gpu, label: &'static str, words: usize) -> wgpu::Buffer {
     if let Err(error) = Array::check(gpu, label, words) {
         gpu.note(error);
     }
+    gpu.memory_generation.fetch_add(1, Ordering::Relaxed);
     let scope = gpu.device.push_error_scope(wgpu::ErrorFilter::OutOfMemory);
     let buffer = gpu.device.create_buffer(&wgpu::BufferDescriptor {
         label: Some(label),

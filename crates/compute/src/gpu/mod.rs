@@ -22,6 +22,7 @@ use crate::DeviceError;
 use profile::Profile;
 use std::collections::BTreeMap;
 use std::fmt;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 
 /// Threads of a workgroup, where a kernel has no reason for another number: what every implementation offers at least.
@@ -90,6 +91,8 @@ pub struct Gpu {
     info: AdapterInfo,
     failure: Arc<Mutex<Option<DeviceError>>>,
     profile: OnceLock<Profile>,
+    /// See [`Gpu::memory_generation`].
+    memory_generation: AtomicU64,
     /// For [`Array::read`].
     staging: Mutex<Option<Readback>>,
 }
@@ -206,6 +209,7 @@ impl Gpu {
             info,
             failure,
             profile: OnceLock::new(),
+            memory_generation: AtomicU64::new(0),
             staging: Mutex::default(),
         }))
     }
@@ -233,6 +237,11 @@ impl Gpu {
 
     fn note(&self, error: DeviceError) {
         note(&self.failure, error);
+    }
+
+    /// Changes whenever memory is taken, since what had some before may be gone.
+    fn memory_generation(&self) -> u64 {
+        self.memory_generation.load(Ordering::Relaxed)
     }
 
     /// Bytes of memory in use, as far as the driver tells.

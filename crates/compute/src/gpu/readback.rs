@@ -58,7 +58,7 @@ impl Work<'_> {
         if to.sent.take().is_some() {
             to.staging.unmap();
         }
-        self.encoder
+        self.encoder()
             .copy_buffer_to_buffer(array.buffer(), array.offset(0), &to.staging, 0, bytes);
         let submission = self.hand_over();
         to.staging.map_async(wgpu::MapMode::Read, ..bytes, |_| {});

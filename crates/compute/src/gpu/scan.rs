@@ -27,23 +27,12 @@ impl Scan {
 
     /// `before[i]` becomes the sum of the words of `values` before `i`, for `i < count`. Each run of a submission has its own `params`.
     pub fn run(&mut self, work: &mut Work, params: &Array, values: &Array, before: &Array, count: usize) {
-        params.write(work.gpu(), 0, &[count as u32, count.div_ceil(BLOCK) as u32]);
-        self.run_sized(work, params, values, before, count);
-    }
-
-    /// As [`Scan::run`], of as many words as `params` holds by then, with their blocks: at most `most`.
-    pub fn run_sized(&mut self, work: &mut Work, params: &Array, values: &Array, before: &Array, most: usize) {
-        let (gpu, blocks) = (work.gpu(), most.div_ceil(BLOCK));
+        let (gpu, blocks) = (work.gpu(), count.div_ceil(BLOCK));
+        params.write(gpu, 0, &[count as u32, blocks as u32]);
         self.sums.reserve(gpu, blocks + 1);
         let [of_blocks, of_sums, apply] = &self.kernels;
         work.run(of_blocks, &[params, values, &self.sums], blocks);
         work.run(of_sums, &[params, &self.sums], usize::from(blocks > 0));
         work.run(apply, &[params, values, &self.sums, before], blocks);
-    }
-
-    /// As [`Scan::run_sized`], of a few thousand words in place, by one workgroup: a third of the dispatches. `params` holds their
-    /// number twice; the word behind them becomes the total.
-    pub fn run_in_place(&self, work: &mut Work, params: &Array, values: &Array) {
-        work.run(&self.kernels[1], &[params, values], 1);
     }
 }

@@ -1,25 +1,23 @@
-use super::{Array, Gpu, Kernel, PART, Scan, Work};
+use super::{Array, Gpu, Kernel, PART, Work};
 use crate::shaders::{SORT, SORT_SIZES};
 
 /// Keys of a block.
-const BLOCK: usize = 4096;
-/// Counts of digits that one workgroup sums up.
-const FEW: usize = 4096;
+const BLOCK: usize = 2048;
 /// Bits of a digit.
-const DIGIT: u32 = 4;
+const DIGIT: u32 = 8;
+const DIGITS: usize = 1 << DIGIT;
+/// Digits of a workgroup that sums counts up.
+const SUMMED: usize = 8;
 
 /// A stable radix sort of words with a word each, as many as the device knows.
 #[derive(Debug)]
 pub struct Sort {
-    kernels: [Kernel; 2],
+    kernels: [Kernel; 3],
     sizes: Kernel,
-    scan: Scan,
-    /// Parts of `params`: of each pass, then of the prefix sums of few counts of digits, and of many.
+    /// Parts of `params`, of each pass.
     passes: Vec<Array>,
-    scans: [Array; 2],
     params: Array,
     counts: Array,
-    starts: Array,
     other: [Array; 2],
 }
 
@@ -27,7 +25,7 @@ impl Sort {
     /// Compiles, for keys below `2^bits`.
     pub fn new(gpu: &Gpu, bits: u32) -> Self {
         let passes = passes(bits);
-        let params = Array::zeros(gpu, "sort parameters", (passes + 2) * PART);
+        let params = Array::zeros(gpu, "sort parameters", passes * PART);
         let part = |i| params.part(i * PART, 4);
         for pass in 0..passes {
             part(pass).write(gpu, 2, &[DIGIT * pass as u32]);
@@ -35,12 +33,9 @@ impl Sort {
         Self {
             kernels: SORT.each_ref().map(|shader| Kernel::new(gpu, shader)),
             sizes: Kernel::new(gpu, &SORT_SIZES),
-            scan: Scan::new(gpu),
             passes: (0..passes).map(part).collect(),
-            scans: [passes, passes + 1].map(part),
             params,
             counts: Array::zeros(gpu, "counts of digits", 0),
-            starts: Array::zeros(gpu, "starts of digits", 0),
             other: ["sorted keys", "sorted values"].map(|label| Array::zeros(gpu, label, 0)),
         }
     }
@@ -48,15 +43,13 @@ impl Sort {
     /// Sorts keys, and their values alike, by their lowest `bits` bits. Their number is the first word of `count` and at most `most`.
     pub fn run(&mut self, work: &mut Work, keys: &Array, values: &Array, count: &Array, most: usize, bits: u32) {
         let (gpu, blocks) = (work.gpu(), most.div_ceil(BLOCK));
-        let digits = 1 << DIGIT;
-        let counts = digits * blocks;
-        self.counts.reserve(gpu, counts + 1);
-        self.starts.reserve(gpu, counts);
+        // Behind the blocks, the totals.
+        self.counts.reserve(gpu, (blocks + 1) * DIGITS);
         for other in &mut self.other {
             other.reserve(gpu, most);
         }
         work.run(&self.sizes, &[count, &self.params], 1);
-        let [count_digits, scatter] = &self.kernels;
+        let [count_digits, starts, scatter] = &self.kernels;
         let [other_keys, other_values] = &self.other;
         for (i, params) in self.passes[..passes(bits)].iter().enumerate() {
             let (from, to) = match i % 2 {
@@ -64,18 +57,8 @@ impl Sort {
                 _ => ([other_keys, other_values], [keys, values]),
             };
             work.run(count_digits, &[params, from[0], &self.counts], blocks);
-            let starts = match counts <= FEW {
-                true => {
-                    self.scan.run_in_place(work, &self.scans[0], &self.counts);
-                    &self.counts
-                }
-                false => {
-                    self.scan
-                        .run_sized(work, &self.scans[1], &self.counts, &self.starts, counts);
-                    &self.starts
-                }
-            };
-            work.run(scatter, &[params, from[0], from[1], starts, to[0], to[1]], blocks);
+            work.run(starts, &[params, &self.counts], DIGITS / SUMMED);
+            work.run(scatter, &[params, from[0], from[1], &self.counts, to[0], to[1]], blocks);
         }
     }
 }

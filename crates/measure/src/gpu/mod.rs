@@ -2,6 +2,7 @@
 //! pixel. The twin of [`crate::PhotometricLoss`] and of the metric [`crate::DepthLoss`].
 
 use crate::loss::job::Gains;
+use crate::window::{RADIUS, TAPS, half_window};
 use crate::{DepthSample, LossValues, LossWeights, Target, Truth};
 use irradia_compute::DeviceError;
 use irradia_compute::gpu::{Array, GRID, Gpu, Kernel, Readback, Shader, Work, flags};
@@ -26,6 +27,8 @@ const SHADERS: [Shader; 3] = [
     },
 ];
 
+/// Words of `Target` in `target.wgsl` before the window's.
+const TARGET_WORDS: usize = 12;
 /// Width and height of a tile, pixels.
 const TILE: usize = 16;
 /// Planes of a frame's gradients: red, green, blue, alpha, depth, error.
@@ -95,7 +98,7 @@ impl GpuLoss {
         let array = |label| Array::zeros(&gpu, label, 0);
         let loss = Self {
             kernels: SHADERS.each_ref().map(|shader| Kernel::new(&gpu, shader)),
-            task: Array::zeros(&gpu, "target", 12),
+            task: Array::zeros(&gpu, "target", TARGET_WORDS + window_words().len()),
             photo: array("photograph"),
             mask: array("mask"),
             maps: array("maps of SSIM"),
@@ -106,6 +109,7 @@ impl GpuLoss {
             begun: (LossWeights::photometric(0.0), 0.0),
             gpu,
         };
+        loss.task.write(&loss.gpu, TARGET_WORDS, &window_words());
         loss.gpu.check()?;
         Ok(loss)
     }
@@ -232,6 +236,19 @@ impl GpuLoss {
             depth: if norm > 0.0 { depth / norm } else { 0.0 },
         }
     }
+}
+
+/// `Target.window` in `target.wgsl`: 14 values in a row serve the windows of four neighbours.
+fn window_words() -> [f32; 4 * (TAPS + 3)] {
+    let half = half_window();
+    std::array::from_fn(|i| {
+        let tap = (i / 4).wrapping_sub(i % 4);
+        if tap < TAPS {
+            half[tap.abs_diff(RADIUS)] as f32
+        } else {
+            0.0
+        }
+    })
 }
 
 /// Samples that may count, by pixel: pixel, depth and weight.

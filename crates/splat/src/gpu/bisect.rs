@@ -152,6 +152,11 @@ impl Twin {
                 r.found.write(&gpu, 0, &found);
             }
             "bin" => {
+                let mut places = vec![0u32; self.before.len()];
+                for (place, i) in (0..).zip(&self.order) {
+                    places[*i as usize] = place;
+                }
+                r.places.write(&gpu, 0, &places);
                 r.order.write(&gpu, 0, &self.order);
                 r.firsts.write(&gpu, 0, &self.firsts);
                 r.slots.write(&gpu, 0, &self.slots);
@@ -423,7 +428,7 @@ fn a_fault_is_found_at_its_stage() {
         ("project", "color = vec3f(0.5)", "color = vec3f(0.6)", "project"),
         ("emit", "row <= rows.y", "row < rows.y", "bin"),
         ("blend", "min(exp2(p)", "min(0.9 * exp2(p)", "blend"),
-        ("blend_vjp", "alpha * t", "alpha", "blend_vjp"),
+        ("blend_vjp", "alpha * before_it;", "alpha;", "blend_vjp"),
         ("project_vjp", "v_x.z += v_depth", "v_x.z -= 0.1 * v_x.x", "project_vjp"),
         ("update_harmonics", "b[k] * v_color[c]", "v_color[c]", "update"),
     ] {

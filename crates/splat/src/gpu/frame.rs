@@ -58,7 +58,8 @@ pub struct GpuRenderer {
     pub(super) reached: Array,
     pub(super) states: Array,
     pub(super) planes: Array,
-    places: Array,
+    /// Of visible splats, in their own order, then front to back.
+    pub(super) places: Array,
     depths: Array,
     counts: Array,
     tiles: Array,
@@ -316,7 +317,7 @@ impl GpuRenderer {
             .run(work, &self.depths, &self.order, visible, count, u32::BITS);
         work.run(
             &kernels.count,
-            &[&self.view, &self.order, &self.touched, &self.counts],
+            &[&self.view, &self.order, &self.touched, &self.counts, &self.places],
             groups(count),
         );
         // What lies beyond the visible splats is added to nothing.

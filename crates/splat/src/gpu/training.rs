@@ -259,7 +259,7 @@ impl GpuTraining {
             &renderer.kernels.project_vjp,
             &[
                 &renderer.view,
-                &renderer.order,
+                &renderer.places,
                 &renderer.firsts,
                 &renderer.touched,
                 &self.sums,

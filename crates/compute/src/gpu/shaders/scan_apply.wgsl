@@ -5,7 +5,8 @@ struct Params { count: u32, blocks: u32 }
 @group(0) @binding(2) var<storage, read> sums: array<u32>;
 @group(0) @binding(3) var<storage, read_write> before: array<u32>;
 
-var<workgroup> shared_sums: array<u32, 256>;
+const SCANNED: u32 = 256u;
+var<workgroup> shared_sums: array<u32, SCANNED>;
 
 @compute @workgroup_size(256)
 fn main(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups: vec3u, @builtin(local_invocation_index) at: u32) {

@@ -1,9 +1,9 @@
-// Sum of the values of a workgroup's threads up to this one. `shared_sums` is the kernel's.
+// Sum of the values of a workgroup's threads up to this one. `shared_sums` and `SCANNED`, the number of threads, are the kernel's.
 fn inclusive_scan(own: u32, at: u32) -> u32 {
     // What was read there before.
     workgroupBarrier();
     shared_sums[at] = own;
-    for (var reach = 1u; reach < 256u; reach *= 2u) {
+    for (var reach = 1u; reach < SCANNED; reach *= 2u) {
         workgroupBarrier();
         var left = 0u;
         if at >= reach {

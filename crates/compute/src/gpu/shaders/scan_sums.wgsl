@@ -3,7 +3,8 @@ struct Params { count: u32, blocks: u32 }
 @group(0) @binding(0) var<uniform> params: Params;
 @group(0) @binding(1) var<storage, read_write> sums: array<u32>;
 
-var<workgroup> shared_sums: array<u32, 256>;
+const SCANNED: u32 = 256u;
+var<workgroup> shared_sums: array<u32, SCANNED>;
 
 @compute @workgroup_size(256)
 fn main(@builtin(local_invocation_index) at: u32) {

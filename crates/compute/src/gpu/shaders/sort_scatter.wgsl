@@ -1,63 +1,107 @@
-// Moves keys and values to their places by one digit of four bits, keeping the order of equal ones: a thread holds 16 keys in a row,
-// and counts its digits in a column of counters; digits d and d + 8 share a word, so that the counters fit in 8 kB.
+// Moves keys and values to their places by one digit of eight bits, keeping the order of equal ones. A block of 2,048 is sorted in shared
+// memory first, by four bits at a time, so that what has the same digit is written side by side.
 struct Params { count: u32, blocks: u32, shift: u32 }
 @group(0) @binding(0) var<uniform> params: Params;
 @group(0) @binding(1) var<storage, read> keys: array<u32>;
 @group(0) @binding(2) var<storage, read> values: array<u32>;
-@group(0) @binding(3) var<storage, read> starts: array<u32>;
+// [block, digit]: keys with this digit in the blocks before; behind the last block, in all.
+@group(0) @binding(3) var<storage, read> counts: array<u32>;
 @group(0) @binding(4) var<storage, read_write> sorted_keys: array<u32>;
 @group(0) @binding(5) var<storage, read_write> sorted_values: array<u32>;
 
-var<workgroup> counters: array<u32, 2048>;
-var<workgroup> shared_sums: array<u32, 256>;
-var<workgroup> first_of_digit: array<u32, 16>;
+const SCANNED: u32 = 128u;
+// Digit and, from bit 8 on, place in the block; a word is left out behind every 16, so that threads that visit 16 in a row each meet in
+// no bank.
+var<workgroup> held: array<u32, 2176>;
+// How often each thread has each of 16 digits; digits d and d + 8 share a word.
+var<workgroup> counters: array<u32, 1024>;
+var<workgroup> shared_sums: array<u32, SCANNED>;
+// Of each digit, its first place in the sorted block, and what to add to a place.
+var<workgroup> firsts: array<u32, 256>;
+var<workgroup> starts: array<u32, 256>;
 
-@compute @workgroup_size(256)
+@compute @workgroup_size(128)
 fn main(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups: vec3u, @builtin(local_invocation_index) at: u32) {
     let block = group_index(group, groups);
-    let first = block * 4096u + at * 16u;
-    for (var row = 0u; row < 8u; row++) {
-        counters[row * 256u + at] = 0u;
-    }
-    var held: array<u32, 16>;
+    let first = block * 2048u;
     for (var i = 0u; i < 16u; i++) {
-        held[i] = 0u;
-        if first + i < params.count {
-            held[i] = keys[first + i];
-            let digit = (held[i] >> params.shift) & 15u;
-            counters[(digit & 7u) * 256u + at] += 1u << (2u * (digit & 8u));
+        let place = i * 128u + at;
+        // What is behind the last key stays behind it.
+        var digit = 255u;
+        if first + place < params.count {
+            digit = (keys[first + place] >> params.shift) & 255u;
         }
+        held[padded(place)] = digit | (place << 8u);
+    }
+    split(0u, at);
+    split(4u, at);
+
+    let digit = 2u * at;
+    let here = block * 256u + digit;
+    let behind = params.blocks * 256u + digit;
+    let totals = vec2u(counts[behind], counts[behind + 1u]);
+    let before = inclusive_scan(totals.x + totals.y, at) - totals.x - totals.y;
+    starts[digit] = before + counts[here];
+    starts[digit + 1u] = before + totals.x + counts[here + 1u];
+    for (var i = 0u; i < 16u; i++) {
+        let place = i * 128u + at;
+        let own = held[padded(place)] & 255u;
+        if place == 0u || (held[padded(max(place, 1u) - 1u)] & 255u) != own {
+            firsts[own] = place;
+        }
+    }
+    workgroupBarrier();
+    for (var i = 0u; i < 16u; i++) {
+        let place = i * 128u + at;
+        let own = held[padded(place)];
+        let source = first + (own >> 8u);
+        if source < params.count {
+            let to = starts[own & 255u] + place - firsts[own & 255u];
+            sorted_keys[to] = keys[source];
+            sorted_values[to] = values[source];
+        }
+    }
+}
+
+fn padded(place: u32) -> u32 {
+    return place + (place >> 4u);
+}
+
+// Sorts what is held by four bits from `shift` on.
+fn split(shift: u32, at: u32) {
+    for (var row = 0u; row < 8u; row++) {
+        counters[row * 128u + at] = 0u;
+    }
+    workgroupBarrier();
+    var own: array<u32, 16>;
+    for (var i = 0u; i < 16u; i++) {
+        own[i] = held[17u * at + i];
+        let digit = (own[i] >> shift) & 15u;
+        counters[(digit & 7u) * 128u + at] += 1u << (2u * (digit & 8u));
     }
     workgroupBarrier();
     // Counters to the counts before them, row by row; both halves of the words at once.
-    var own: array<u32, 8>;
+    var counted: array<u32, 8>;
     var sum = 0u;
     for (var i = 0u; i < 8u; i++) {
-        own[i] = counters[at * 8u + i];
-        sum += own[i];
+        counted[i] = counters[at * 8u + i];
+        sum += counted[i];
     }
     var total = inclusive_scan(sum, at) - sum;
     // What has a lower digit comes before all of the upper half.
-    total += (workgroupUniformLoad(&shared_sums[255]) & 0xffffu) << 16u;
+    total += (workgroupUniformLoad(&shared_sums[SCANNED - 1u]) & 0xffffu) << 16u;
     for (var i = 0u; i < 8u; i++) {
         counters[at * 8u + i] = total;
-        total += own[i];
-    }
-    workgroupBarrier();
-    if at < 16u {
-        first_of_digit[at] = (counters[(at & 7u) * 256u] >> (2u * (at & 8u))) & 0xffffu;
+        total += counted[i];
     }
     workgroupBarrier();
     for (var i = 0u; i < 16u; i++) {
-        if first + i < params.count {
-            let digit = (held[i] >> params.shift) & 15u;
-            let half = 2u * (digit & 8u);
-            let counter = (digit & 7u) * 256u + at;
-            let rank = (counters[counter] >> half) & 0xffffu;
-            counters[counter] += 1u << half;
-            let to = starts[digit * params.blocks + block] + rank - first_of_digit[digit];
-            sorted_keys[to] = held[i];
-            sorted_values[to] = values[first + i];
-        }
+        let digit = (own[i] >> shift) & 15u;
+        let half = 2u * (digit & 8u);
+        let counter = (digit & 7u) * 128u + at;
+        let rank = (counters[counter] >> half) & 0xffffu;
+        counters[counter] += 1u << half;
+        held[padded(rank)] = own[i];
     }
+    workgroupBarrier();
 }

@@ -8,8 +8,8 @@
 // Planes: red, green, blue, alpha, depth, error.
 @group(0) @binding(6) var<storage, read_write> v_frame: array<f32>;
 
-var<workgroup> derivatives: array<vec3f, 676>;
-var<workgroup> rows: array<vec3f, 416>;
+var<workgroup> derivatives: array<vec3f, 702>;
+var<workgroup> rows: array<vec3f, 442>;
 var<workgroup> shared_values: array<vec3f, 64>;
 
 @compute @workgroup_size(64)
@@ -21,36 +21,48 @@ fn main(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups: ve
     let row = 4u * (at / TILE);
     var adjoint = array<vec3f, 4>();
     if has_ssim {
-        for (var i = at; i < SEEN * SEEN; i += THREADS) {
+        // A known number of turns, so that the loads of several are under way at once.
+        for (var turn = 0u; turn < 11u; turn++) {
+            let i = turn * THREADS + at;
             let pixel = seen_pixel(tile, i);
-            derivatives[i] = vec3f(0.0);
+            var abc = vec3f(0.0);
             if pixel >= 0 {
                 let plane = 3u * tile.channel * pixels + u32(pixel);
-                derivatives[i] = vec3f(maps[plane], maps[plane + pixels], maps[plane + 2u * pixels]);
+                abc = vec3f(maps[plane], maps[plane + pixels], maps[plane + 2u * pixels]);
+            }
+            if i < SEEN * SEEN {
+                derivatives[(i / SEEN) * SEEN_STRIDE + i % SEEN] = abc;
             }
         }
         workgroupBarrier();
         // Four neighbours at a time: 14 values serve 4 windows.
         for (var i = at; i < SEEN * TILE / 4u; i += THREADS) {
-            let along = i / 4u;
-            let first = 4u * (i % 4u);
-            var sums_of_four = array<vec3f, 4>();
+            let along = i % SEEN;
+            let first = 4u * (i / SEEN);
+            var a = vec4f(0.0);
+            var b = vec4f(0.0);
+            var c = vec4f(0.0);
             for (var k = 0u; k < 14u; k++) {
-                let abc = derivatives[along * SEEN + first + k];
-                for (var q = 0u; q < 4u; q++) {
-                    sums_of_four[q] += window_weight(k, q) * abc;
-                }
+                let abc = derivatives[along * SEEN_STRIDE + first + k];
+                let weights = task.window[k];
+                a += weights * abc.x;
+                b += weights * abc.y;
+                c += weights * abc.z;
             }
-            for (var q = 0u; q < 4u; q++) {
-                rows[along * TILE + first + q] = sums_of_four[q];
-            }
+            let to = along * ROW_STRIDE + first;
+            rows[to] = vec3f(a.x, b.x, c.x);
+            rows[to + 1u] = vec3f(a.y, b.y, c.y);
+            rows[to + 2u] = vec3f(a.z, b.z, c.z);
+            rows[to + 3u] = vec3f(a.w, b.w, c.w);
         }
         workgroupBarrier();
         for (var k = 0u; k < 14u; k++) {
-            let abc = rows[(row + k) * TILE + column];
-            for (var q = 0u; q < 4u; q++) {
-                adjoint[q] += window_weight(k, q) * abc;
-            }
+            let abc = rows[(row + k) * ROW_STRIDE + column];
+            let weights = task.window[k];
+            adjoint[0] += weights.x * abc;
+            adjoint[1] += weights.y * abc;
+            adjoint[2] += weights.z * abc;
+            adjoint[3] += weights.w * abc;
         }
     }
     var differences = vec2f(0.0);

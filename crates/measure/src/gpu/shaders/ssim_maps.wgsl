@@ -12,47 +12,60 @@
 const C1: f32 = 0.0001;
 const C2: f32 = 0.0009;
 
-var<workgroup> pairs: array<vec2f, 676>;
+var<workgroup> pairs: array<vec2f, 702>;
 // After the window along x: render, truth, squares, products.
-var<workgroup> rows: array<vec4f, 416>;
+var<workgroup> rows: array<vec4f, 442>;
 var<workgroup> shared_values: array<vec3f, 64>;
 
 @compute @workgroup_size(64)
 fn main(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups: vec3u, @builtin(local_invocation_index) at: u32) {
     let tile = tile_of(group, groups);
-    for (var i = at; i < SEEN * SEEN; i += THREADS) {
+    // A known number of turns, so that the loads of several are under way at once.
+    for (var turn = 0u; turn < 11u; turn++) {
+        let i = turn * THREADS + at;
         let pixel = seen_pixel(tile, i);
-        pairs[i] = vec2f(0.0);
+        var pair = vec2f(0.0);
         if pixel >= 0 {
-            pairs[i] = pair_at(u32(pixel), tile.channel);
+            pair = pair_at(u32(pixel), tile.channel);
+        }
+        if i < SEEN * SEEN {
+            pairs[(i / SEEN) * SEEN_STRIDE + i % SEEN] = pair;
         }
     }
     workgroupBarrier();
     // Four neighbours at a time: 14 values serve 4 windows.
     for (var i = at; i < SEEN * TILE / 4u; i += THREADS) {
-        let row = i / 4u;
-        let column = 4u * (i % 4u);
-        var sums_of_four = array<vec4f, 4>();
+        let row = i % SEEN;
+        let column = 4u * (i / SEEN);
+        var x = vec4f(0.0);
+        var y = vec4f(0.0);
+        var squares = vec4f(0.0);
+        var products = vec4f(0.0);
         for (var k = 0u; k < 14u; k++) {
-            let xy = pairs[row * SEEN + column + k];
-            let moments = vec4f(xy, dot(xy, xy), xy.x * xy.y);
-            for (var q = 0u; q < 4u; q++) {
-                sums_of_four[q] += window_weight(k, q) * moments;
-            }
+            let xy = pairs[row * SEEN_STRIDE + column + k];
+            let weights = task.window[k];
+            x += weights * xy.x;
+            y += weights * xy.y;
+            squares += weights * dot(xy, xy);
+            products += weights * (xy.x * xy.y);
         }
-        for (var q = 0u; q < 4u; q++) {
-            rows[row * TILE + column + q] = sums_of_four[q];
-        }
+        let to = row * ROW_STRIDE + column;
+        rows[to] = vec4f(x.x, y.x, squares.x, products.x);
+        rows[to + 1u] = vec4f(x.y, y.y, squares.y, products.y);
+        rows[to + 2u] = vec4f(x.z, y.z, squares.z, products.z);
+        rows[to + 3u] = vec4f(x.w, y.w, squares.w, products.w);
     }
     workgroupBarrier();
     let column = at % TILE;
     let row = 4u * (at / TILE);
     var means = array<vec4f, 4>();
     for (var k = 0u; k < 14u; k++) {
-        let moments = rows[(row + k) * TILE + column];
-        for (var q = 0u; q < 4u; q++) {
-            means[q] += window_weight(k, q) * moments;
-        }
+        let moments = rows[(row + k) * ROW_STRIDE + column];
+        let weights = task.window[k];
+        means[0] += weights.x * moments;
+        means[1] += weights.y * moments;
+        means[2] += weights.z * moments;
+        means[3] += weights.w * moments;
     }
     var dissimilarity = 0.0;
     for (var q = 0u; q < 4u; q++) {

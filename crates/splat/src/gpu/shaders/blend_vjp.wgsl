@@ -1,8 +1,7 @@
-// The vector-Jacobian product of blending, a segment of a tile by each workgroup of 32 threads. A thread holds a splat and its sums, and
-// visits all pixels of the tile, four a turn, a turn after the thread before it: the state of a pixel, transmittance and light from behind,
-// passes from thread to thread through shared memory. A thread that is through takes the splat 32 behind its own at once, since the last
-// thread is by then ahead of the first. So there are no reductions over pixels and no atomics, and every sum has a fixed order
-// (the scheme of Taming 3DGS, Mallick et al. 2024, section 5, with shared memory for the shuffles of a warp, whose width differs).
+// The vector-Jacobian product of blending, a segment of a tile by each workgroup of 32 threads. A thread holds eight pixels of a column,
+// their transmittance and the light from behind, and visits the splats front to back; rows of pixels that a splat does not reach are
+// skipped. Its sums over a splat's pixels go to shared memory, where those of all threads are added for a batch of splats at a time: no
+// atomics, and every sum has a fixed order.
 @group(0) @binding(0) var<uniform> view: View;
 @group(0) @binding(1) var<storage, read> ranges: array<vec2u>;
 @group(0) @binding(2) var<storage, read> slots: array<u32>;
@@ -18,17 +17,32 @@
 // [slot, 12]: the moments 1, dx, dy, dx^2, dx dy, dy^2 of v_p / ln 2, gradients of red, green, blue and depth, two gathered sums.
 @group(0) @binding(11) var<storage, read_write> sums: array<f32>;
 
-// Turns of a thread with one splat: the pixels of a tile, four at a time.
-const TURNS: u32 = 64u;
+const THREADS: u32 = 32u;
+// Pixels of a thread: every other row of its column.
+const PIXELS: u32 = 8u;
+const SUMS: u32 = 12u;
+// Splats whose sums are added together.
+const BATCH: u32 = 4u;
+// Quads of a row of sums, one of each thread; one is left out, so that threads that read a row each meet in no bank.
+const QUADS: u32 = 9u;
+// Rows beyond a splat's extent that are visited all the same, pixels: its rounding.
+const ROW_SLACK: f32 = 1e-2;
 
-// Four neighbours in a row each.
-var<workgroup> transmittances: array<vec4f, 64>;
-var<workgroup> rests: array<vec4f, 64>;
-var<workgroup> v_red: array<vec4f, 64>;
-var<workgroup> v_green: array<vec4f, 64>;
-var<workgroup> v_blue: array<vec4f, 64>;
-var<workgroup> v_depth: array<vec4f, 64>;
-var<workgroup> errors: array<vec4f, 64>;
+struct Held {
+    // Centre relative to the tile's first pixel, a, b.
+    place: vec4f,
+    // c, log2 of the opacity, red, green.
+    shape: vec4f,
+    // Blue, depth, first and last row.
+    rest: vec4f,
+}
+
+var<workgroup> held: array<Held, THREADS>;
+var<workgroup> held_slots: array<u32, THREADS>;
+// Gradient of depth, error.
+var<workgroup> beside: array<vec2f, 256>;
+// [splat of the batch, sum], of each thread.
+var<workgroup> parts: array<vec4f, 432>;
 
 @compute @workgroup_size(32)
 fn main(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups: vec3u, @builtin(local_invocation_index) lane: u32) {
@@ -43,142 +57,150 @@ fn main(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups: ve
     let first = range.x + of_tile * 256u;
     let count = min(range.y - first, 256u);
     if of_tile >= reached[tile] {
-        for (var k = lane; k < count; k += 32u) {
-            for (var c = 0u; c < 12u; c++) {
-                sums[slots[first + k] * 12u + c] = 0.0;
+        for (var k = lane; k < count; k += THREADS) {
+            for (var c = 0u; c < SUMS; c++) {
+                sums[slots[first + k] * SUMS + c] = 0.0;
             }
         }
         return;
     }
 
     let flags = view.flags.x;
+    let has_depth = has(flags, FLAG_DEPTH);
     let pixels = view.size.x * view.size.y;
     let corner = vec2u(tile % view.size.z, tile / view.size.z) * TILE;
-    for (var at = lane; at < TILE_PIXELS; at += 32u) {
-        let pixel = corner + vec2u(at % TILE, at / TILE);
+    let column = lane % TILE;
+    let odd = lane / TILE;
+    var t: array<f32, PIXELS>;
+    var rest: array<f32, PIXELS>;
+    var v_color: array<vec3f, PIXELS>;
+    for (var q = 0u; q < PIXELS; q++) {
+        let at = (2u * q + odd) * TILE + column;
+        let pixel = corner + vec2u(column, 2u * q + odd);
         var state = vec4f(0.0);
-        var t = 1.0;
+        t[q] = 1.0;
         if of_tile > 0u {
             let s = segment * 5u * TILE_PIXELS + at;
             state = vec4f(states[s], states[s + TILE_PIXELS], states[s + 2u * TILE_PIXELS], states[s + 3u * TILE_PIXELS]);
-            t = states[s + 4u * TILE_PIXELS];
+            t[q] = states[s + 4u * TILE_PIXELS];
         }
-        var v = vec4f(0.0);
-        var rest = 0.0;
+        v_color[q] = vec3f(0.0);
+        rest[q] = 0.0;
         var error = 0.0;
+        var v_depth = 0.0;
         if all(pixel < view.size.xy) {
             let p = pixel.y * view.size.x + pixel.x;
-            v = vec4f(v_frame[p], v_frame[pixels + p], v_frame[2u * pixels + p], 0.0);
-            var total = vec4f(frame[p], frame[pixels + p], frame[2u * pixels + p], 0.0);
-            if has(flags, FLAG_DEPTH) {
-                v.w = v_frame[4u * pixels + p];
-                total.w = frame[4u * pixels + p];
+            v_color[q] = vec3f(v_frame[p], v_frame[pixels + p], v_frame[2u * pixels + p]);
+            let total = vec3f(frame[p], frame[pixels + p], frame[2u * pixels + p]);
+            rest[q] = dot(total - state.xyz, v_color[q]);
+            if has_depth {
+                v_depth = v_frame[4u * pixels + p];
+                rest[q] += (frame[4u * pixels + p] - state.w) * v_depth;
             }
-            rest = dot(total, v) - dot(state, v);
             if has(flags, FLAG_ALPHA) {
-                rest -= (1.0 - frame[3u * pixels + p]) * v_frame[3u * pixels + p];
+                rest[q] -= (1.0 - frame[3u * pixels + p]) * v_frame[3u * pixels + p];
             }
             if has(flags, FLAG_GATHER_ERROR) {
                 error = v_frame[5u * pixels + p];
             }
         }
-        transmittances[at / 4u][at % 4u] = t;
-        rests[at / 4u][at % 4u] = rest;
-        v_red[at / 4u][at % 4u] = v.x;
-        v_green[at / 4u][at % 4u] = v.y;
-        v_blue[at / 4u][at % 4u] = v.z;
-        v_depth[at / 4u][at % 4u] = v.w;
-        errors[at / 4u][at % 4u] = error;
+        // Only this thread reads it.
+        beside[at] = vec2f(v_depth, error);
     }
 
     let origin = vec2f(corner) + 0.5;
-    var slot = 0u;
-    var xy = vec2f(0.0);
-    var quadratic = vec3f(0.0);
-    var log2_opacity = 0.0;
-    var color = vec4f(0.0);
-    var moment0 = 0.0;
-    var moments1 = vec2f(0.0);
-    var moments2 = vec3f(0.0);
-    var v_color = vec4f(0.0);
-    var gathered = vec2f(0.0);
-    let turns = (count + 31u) / 32u * TURNS + 31u;
-    for (var turn = 0u; turn < turns; turn++) {
-        workgroupBarrier();
-        // Before its first turn, this has wrapped around.
-        let own = turn - lane;
-        let k = own / TURNS * 32u + lane;
-        if own >= turns || k >= count {
-            continue;
-        }
-        let group_of_four = own % TURNS;
-        if group_of_four == 0u {
-            slot = slots[first + k];
+    for (var before = 0u; before < count; before += THREADS) {
+        if before + lane < count {
+            let slot = slots[first + before + lane];
             let i = splat_of_slot[slot];
             let a = footprints[3u * i];
-            let b = footprints[3u * i + 1u];
             let c = footprints[3u * i + 2u];
-            xy = a.xy - origin;
-            quadratic = vec3f(a.zw, b.x);
-            log2_opacity = b.y;
-            color = vec4f(b.zw, c.x, c.y);
-            moment0 = 0.0;
-            moments1 = vec2f(0.0);
-            moments2 = vec3f(0.0);
-            v_color = vec4f(0.0);
-            gathered = vec2f(0.0);
+            let y = a.y - origin.y;
+            held[lane] = Held(vec4f(a.x - origin.x, y, a.zw), footprints[3u * i + 1u], vec4f(c.xy, y - c.w - ROW_SLACK, y + c.w + ROW_SLACK));
+            held_slots[lane] = slot;
         }
-        let t = transmittances[group_of_four];
-        let dx = vec4f(0.0, 1.0, 2.0, 3.0) + (f32(4u * (group_of_four % 4u)) - xy.x);
-        let dy = f32(group_of_four / 4u) - xy.y;
-        let p = fma(fma(vec4f(quadratic.z), vec4f(dy), quadratic.y * dx), vec4f(dy), fma(quadratic.x * dx, dx, vec4f(log2_opacity)));
-        let touched = (p >= vec4f(LOG2_ALPHA_MIN)) & (t > vec4f(0.0));
-        if any(touched) {
-            let raw = exp2(p);
-            let alpha = min(raw, vec4f(ALPHA_MAX));
-            let weight = alpha * t;
-            let behind = t - weight;
-            let is_visible = behind > vec4f(TRANSMITTANCE_MIN);
-            let drawn = touched & is_visible;
-            let w = select(vec4f(0.0), weight, drawn);
-            let vr = v_red[group_of_four];
-            let vg = v_green[group_of_four];
-            let vb = v_blue[group_of_four];
-            let vd = v_depth[group_of_four];
-            let g = color.x * vr + color.y * vg + color.z * vb + color.w * vd;
-            let rest = rests[group_of_four] - w * g;
-            v_color += vec4f(dot(w, vr), dot(w, vg), dot(w, vb), dot(w, vd));
-            let v_p = select(vec4f(0.0), (t * g - rest / (1.0 - alpha)) * alpha, drawn & (raw <= vec4f(ALPHA_MAX)));
-            let v_dx = v_p * dx;
-            let along = vec2f(dot(v_dx, vec4f(1.0)), dot(v_dx, dx));
-            let sum = dot(v_p, vec4f(1.0));
-            moment0 += sum;
-            moments1 += vec2f(along.x, sum * dy);
-            moments2 += vec3f(along.y, along.x * dy, sum * dy * dy);
-            if has(flags, FLAG_GATHER_ABSOLUTE) {
-                let slope_x = abs(2.0 * quadratic.x * dx + quadratic.y * dy);
-                let slope_y = abs(quadratic.y * dx + 2.0 * quadratic.z * dy);
-                gathered += vec2f(dot(abs(v_p), slope_x), dot(abs(v_p), slope_y));
-            } else if has(flags, FLAG_GATHER_ERROR) {
-                gathered += vec2f(dot(w, errors[group_of_four]), dot(w, vec4f(1.0)));
+        workgroupBarrier();
+        let here = min(count - before, THREADS);
+        for (var batch = 0u; batch < here; batch += BATCH) {
+            let in_batch = min(here - batch, BATCH);
+            for (var k = 0u; k < in_batch; k++) {
+                let place = held[batch + k].place;
+                let shape = held[batch + k].shape;
+                let other = held[batch + k].rest;
+                let color = vec3f(shape.zw, other.x);
+                let dx = f32(column) - place.x;
+                let linear = place.w * dx;
+                let constant = fma(place.z * dx, dx, shape.y);
+                // Of v_p: its sum, with dy, with dy^2.
+                var moments = vec3f(0.0);
+                var v_own = vec4f(0.0);
+                var gathered = vec2f(0.0);
+                for (var q = 0u; q < PIXELS; q++) {
+                    // The same for all threads.
+                    if f32(2u * q + 1u) < other.z || f32(2u * q) > other.w {
+                        continue;
+                    }
+                    let dy = f32(2u * q + odd) - place.y;
+                    let p = fma(fma(shape.x, dy, linear), dy, constant);
+                    let before_it = t[q];
+                    if !(p >= LOG2_ALPHA_MIN && before_it > 0.0) {
+                        continue;
+                    }
+                    let raw = exp2(p);
+                    let alpha = min(raw, ALPHA_MAX);
+                    let w = alpha * before_it;
+                    let behind = before_it - w;
+                    if !(behind > TRANSMITTANCE_MIN) {
+                        t[q] = -before_it;
+                        continue;
+                    }
+                    t[q] = behind;
+                    var g = dot(color, v_color[q]);
+                    if has_depth {
+                        let v_depth = beside[(2u * q + odd) * TILE + column].x;
+                        g = fma(other.y, v_depth, g);
+                        v_own.w += w * v_depth;
+                    }
+                    let left = rest[q] - w * g;
+                    rest[q] = left;
+                    v_own += vec4f(w * v_color[q], 0.0);
+                    var v_p = 0.0;
+                    if raw <= ALPHA_MAX {
+                        v_p = (before_it * g - left / (1.0 - alpha)) * alpha;
+                    }
+                    moments += v_p * vec3f(1.0, dy, dy * dy);
+                    if has(flags, FLAG_GATHER_ABSOLUTE) {
+                        gathered += abs(v_p) * abs(vec2f(fma(place.w, dy, 2.0 * place.z * dx), fma(2.0 * shape.x, dy, linear)));
+                    } else if has(flags, FLAG_GATHER_ERROR) {
+                        gathered += w * vec2f(beside[(2u * q + odd) * TILE + column].y, 1.0);
+                    }
+                }
+                keep(k, 0u, lane, moments.x);
+                keep(k, 1u, lane, moments.x * dx);
+                keep(k, 2u, lane, moments.y);
+                keep(k, 3u, lane, moments.x * dx * dx);
+                keep(k, 4u, lane, moments.y * dx);
+                keep(k, 5u, lane, moments.z);
+                keep(k, 6u, lane, v_own.x);
+                keep(k, 7u, lane, v_own.y);
+                keep(k, 8u, lane, v_own.z);
+                keep(k, 9u, lane, v_own.w);
+                keep(k, 10u, lane, gathered.x);
+                keep(k, 11u, lane, gathered.y);
             }
-            rests[group_of_four] = rest;
-            transmittances[group_of_four] = select(t, select(-t, behind, is_visible), touched);
-        }
-        if group_of_four == TURNS - 1u {
-            let to = slot * 12u;
-            sums[to] = moment0;
-            sums[to + 1u] = moments1.x;
-            sums[to + 2u] = moments1.y;
-            sums[to + 3u] = moments2.x;
-            sums[to + 4u] = moments2.y;
-            sums[to + 5u] = moments2.z;
-            sums[to + 6u] = v_color.x;
-            sums[to + 7u] = v_color.y;
-            sums[to + 8u] = v_color.z;
-            sums[to + 9u] = v_color.w;
-            sums[to + 10u] = gathered.x;
-            sums[to + 11u] = gathered.y;
+            workgroupBarrier();
+            for (var row = lane; row < in_batch * SUMS; row += THREADS) {
+                var sum = vec4f(0.0);
+                for (var quad = 0u; quad < THREADS / 4u; quad++) {
+                    sum += parts[row * QUADS + quad];
+                }
+                sums[held_slots[batch + row / SUMS] * SUMS + row % SUMS] = dot(sum, vec4f(1.0));
+            }
+            workgroupBarrier();
         }
     }
+}
+
+fn keep(k: u32, sum: u32, lane: u32, value: f32) {
+    parts[(k * SUMS + sum) * QUADS + lane / 4u][lane % 4u] = value;
 }

@@ -1,9 +1,10 @@
 // The vector-Jacobian product of projection, from the sums of blending: the twin of `project_vjp` in `render/project.rs`.
 @group(0) @binding(0) var<uniform> view: View;
-@group(0) @binding(1) var<storage, read> order: array<u32>;
+// Of each visible splat, its place front to back.
+@group(0) @binding(1) var<storage, read> places: array<u32>;
 @group(0) @binding(2) var<storage, read> firsts: array<u32>;
 @group(0) @binding(3) var<storage, read> touched: array<u32>;
-@group(0) @binding(4) var<storage, read> sums: array<f32>;
+@group(0) @binding(4) var<storage, read> sums: array<vec4f>;
 @group(0) @binding(5) var<storage, read> footprints: array<vec4f>;
 @group(0) @binding(6) var<storage, read> geometry: array<f32>;
 @group(0) @binding(7) var<storage, read> harmonics: array<f32>;
@@ -18,19 +19,21 @@
 
 @compute @workgroup_size(64)
 fn main(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups: vec3u, @builtin(local_invocation_index) thread: u32) {
-    let j = group_index(group, groups) * 64u + thread;
+    // In the order of the splats, not front to back: their planes are read and written side by side.
+    let i = group_index(group, groups) * 64u + thread;
+    if i >= view.splats.x || visible[i] == 0u {
+        return;
+    }
+    let j = places[i];
+    // Of a frame without room, nothing is known.
     if j >= view.found.x {
         return;
     }
-    let i = order[j];
-    var s: array<f32, 12>;
-    for (var c = 0u; c < 12u; c++) {
-        s[c] = 0.0;
-    }
+    var s = array<vec4f, 3>();
     let first = firsts[j];
     for (var slot = first; slot < first + touched[i]; slot++) {
-        for (var c = 0u; c < 12u; c++) {
-            s[c] += sums[slot * 12u + c];
+        for (var c = 0u; c < 3u; c++) {
+            s[c] += sums[3u * slot + c];
         }
     }
     let fa = footprints[3u * i];
@@ -40,13 +43,13 @@ fn main(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups: ve
     let qa = fa.z;
     let qb = fa.w;
     let qc = fb.x;
-    let sx = s[1] * LN_2;
-    let sy = s[2] * LN_2;
+    let sx = s[0].y * LN_2;
+    let sy = s[0].z * LN_2;
     let v_xy = vec2f(-(2.0 * qa * sx + qb * sy), -(qb * sx + 2.0 * qc * sy));
-    let v_conic = vec3f(-0.5 * s[3], -s[4], -0.5 * s[5]);
-    let v_opacity = s[0] * exp2(-fb.y);
-    let v_depth = s[9];
-    var gathered = vec2f(s[10], s[11]);
+    let v_conic = vec3f(-0.5 * s[0].w, -s[1].x, -0.5 * s[1].y);
+    let v_opacity = s[0].x * exp2(-fb.y);
+    let v_depth = s[2].y;
+    var gathered = vec2f(s[2].z, s[2].w);
     if has(view.flags.x, FLAG_GATHER_ABSOLUTE) {
         gathered *= LN_2;
     }
@@ -153,7 +156,7 @@ fn main(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups: ve
 
     // Colours not above 0 were clamped.
     let shown = vec3f(fb.z, fb.w, fc.x);
-    let v_color = select(vec3f(0.0), vec3f(s[6], s[7], s[8]), shown > vec3f(0.0));
+    let v_color = select(vec3f(0.0), vec3f(s[1].z, s[1].w, s[2].x), shown > vec3f(0.0));
     let stride = view.splats.y;
     let degree = view.splats.z;
     var v_center = vec3f(0.0);

@@ -109,7 +109,7 @@ export class Frame {
 
     const blend = new Work(gpu);
     this.sortDepths.run(blend, this.depths, this.order, visible, 32);
-    blend.run(kernels.count, [this.view, this.order, this.touched, this.counts], groups(visible));
+    blend.run(kernels.count, [this.view, this.order, this.touched, this.counts, this.places], groups(visible));
     this.scan.run(blend, this.scanParams[1], this.counts, this.firsts, visible);
     blend.run(kernels.emit, [this.view, this.order, this.firsts, this.touched, this.footprints, this.tiles, this.slots, this.splatOfSlot], groups(visible));
     this.sortTiles.run(blend, this.tiles, this.slots, entries, 32 - Math.clz32(tiles));

@@ -9,11 +9,12 @@ import { Words } from "./device.js";
 /** Words of a block of a prefix sum. */
 const SCAN_BLOCK = 2048;
 /** Keys of a block of the sort. */
-const SORT_BLOCK = 4096;
-/** Counts of digits that one workgroup sums up. */
-const FEW = 4096;
+const SORT_BLOCK = 2048;
 /** Bits of a digit. */
-const DIGIT = 4;
+const DIGIT = 8;
+const DIGITS = 1 << DIGIT;
+/** Digits of a workgroup that sums counts up. */
+const SUMMED = 8;
 
 /** Exclusive prefix sums of words. */
 export class Scan {
@@ -21,13 +22,6 @@ export class Scan {
   constructor(gpu, kernels) {
     this.kernels = kernels;
     this.sums = new Words(gpu, "sums of blocks");
-  }
-
-  /** As `run`, of a few thousand words in place, by one workgroup. Word `count` becomes the total.
-   * @param {Work} work @param {Words} params @param {Words} values @param {number} count */
-  runInPlace(work, params, values, count) {
-    params.write(0, Uint32Array.of(count, count));
-    work.run(this.kernels.scan_sums, [params, values], Math.min(count, 1));
   }
 
   /** `before[i]` becomes the sum of the words of `values` before `i`. Each run of a submission has its own `params`, of four words.
@@ -48,10 +42,8 @@ export class Sort {
   /** @param {Gpu} gpu @param {Record<string, Kernel>} kernels */
   constructor(gpu, kernels) {
     this.kernels = kernels;
-    this.scan = new Scan(gpu, kernels);
-    this.passes = Array.from({ length: 32 / DIGIT }, () => ({ params: new Words(gpu, "sort parameters", 4), scan: new Words(gpu, "scan parameters", 4) }));
+    this.passes = Array.from({ length: 32 / DIGIT }, () => new Words(gpu, "sort parameters", 4));
     this.counts = new Words(gpu, "counts of digits");
-    this.starts = new Words(gpu, "starts of digits");
     this.other = [new Words(gpu, "sorted keys"), new Words(gpu, "sorted values")];
   }
 
@@ -59,22 +51,18 @@ export class Sort {
    * @param {Work} work @param {Words} keys @param {Words} values @param {number} count @param {number} bits */
   run(work, keys, values, count, bits) {
     const blocks = Math.ceil(count / SORT_BLOCK);
-    const digits = 1 << DIGIT;
-    const counts = digits * blocks;
-    this.counts.reserve(counts + 1);
-    this.starts.reserve(counts);
+    // Behind the blocks, the totals.
+    this.counts.reserve((blocks + 1) * DIGITS);
     for (const array of this.other) array.reserve(count);
     // An even number, so that what is sorted ends where it was.
     const passes = 2 * Math.ceil(bits / DIGIT / 2);
-    const { sort_count, sort_scatter } = this.kernels;
+    const { sort_count, sort_starts, sort_scatter } = this.kernels;
     let [from, to] = [[keys, values], this.other];
-    this.passes.slice(0, passes).forEach(({ params, scan }, i) => {
+    this.passes.slice(0, passes).forEach((params, i) => {
       params.write(0, Uint32Array.of(count, blocks, DIGIT * i));
       work.run(sort_count, [params, from[0], this.counts], blocks);
-      const isFew = counts <= FEW;
-      if (isFew) this.scan.runInPlace(work, scan, this.counts, counts);
-      else this.scan.run(work, scan, this.counts, this.starts, counts);
-      work.run(sort_scatter, [params, from[0], from[1], isFew ? this.counts : this.starts, to[0], to[1]], blocks);
+      work.run(sort_starts, [params, this.counts], DIGITS / SUMMED);
+      work.run(sort_scatter, [params, from[0], from[1], this.counts, to[0], to[1]], blocks);
       [from, to] = [to, from];
     });
   }

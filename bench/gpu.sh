@@ -44,26 +44,11 @@ fi
 
 # gsplat on the same card, where PyTorch and gsplat are installed.
 if command -v python3 >/dev/null && python3 -c 'import torch, gsplat; assert torch.cuda.is_available()' 2>/dev/null; then
-    printf '\ngsplat, forward and backward with 1,000,000 random splats at 1920 x 1080, ms:\n\n```\n' >>"$rows"
-    timeout 90 python3 - >>"$rows" <<'PY' || true
-import time, torch, gsplat
-n, d = 1_000_000, "cuda"
-torch.manual_seed(1)
-means = torch.randn(n, 3, device=d) * 2 + torch.tensor([0.0, 0.0, 9.0], device=d)
-args = [means, torch.randn(n, 4, device=d), torch.full((n, 3), -4.5, device=d).exp(), torch.rand(n, device=d), torch.randn(n, 16, 3, device=d) * 0.1]
-args = [a.requires_grad_() for a in args]
-K = torch.tensor([[[1500.0, 0, 960], [0, 1500, 540], [0, 0, 1]]], device=d)
-view = torch.eye(4, device=d)[None]
-def frame():
-    return gsplat.rasterization(*args, view, K, 1920, 1080, sh_degree=3, packed=False)[0]
-def timed(work, count=50):
-    for _ in range(5): work()
-    torch.cuda.synchronize(); start = time.time()
-    for _ in range(count): work()
-    torch.cuda.synchronize(); return 1e3 * (time.time() - start) / count
-with torch.no_grad(): print(f"forward {timed(frame):.2f}")
-print(f"forward and backward {timed(lambda: frame().sum().backward()):.2f}")
-PY
+    printf '\ngsplat on the same splats, without a loss:\n\n```\n' >>"$rows"
+    for case in 1000000@1920x1080 3000000@1920x1080; do
+        target/release/examples/speed export "$scratch/splats" "$case"
+        timeout 60 python3 bench/peer_gsplat.py "$scratch/splats" >>"$rows" || true
+    done
     printf '```\n' >>"$rows"
 else
     printf '\ngsplat was not measured: it is not installed, or PyTorch finds no CUDA.\n' >>"$rows"

@@ -93,6 +93,7 @@ fn held_out_psnr(cloud: &GaussianCloud, scene: &Scene, dataset: &Dataset) -> Res
         metrics: Metrics::Psnr,
         half_fit: HalfFit::default(),
         vignette: None,
+        device: &irradia_compute::Device::Cpu,
     };
     let model = Model::of_splats(Splats::from_cloud(cloud));
     let mean = evaluate(&model, dataset, &dataset.test, &options, |_| {

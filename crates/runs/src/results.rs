@@ -62,6 +62,7 @@ impl Run {
                 metrics: Metrics::All(networks),
                 half_fit: trainer.half_fit(),
                 vignette: trainer.sockets.vignette.as_ref(),
+                device: &trainer.options.device,
             },
             |view| {
                 let stem = stems.next().expect("one per view");

@@ -2,11 +2,13 @@
 
 use crate::half_fit::{HalfFit, HeldOut, half_fit_psnr};
 use crate::model::{Model, RenderOptions};
+use crate::painter::Painter;
 use crate::photos::Prepared;
 use crate::socket::Vignette;
 use crate::trainer::TrainError;
+use irradia_compute::Device;
 use irradia_measure::{Evaluation, Networks, evaluate, psnr_masked};
-use irradia_scene::{Camera, Dataset, Image, Photo, View};
+use irradia_scene::{Camera, Dataset, Image, LoadError, Photo, View};
 use irradia_splat::Renderer;
 use irradia_splat::init::camera_extent;
 use rayon::prelude::*;
@@ -16,8 +18,10 @@ use std::ops::ControlFlow;
 /// 81 dB.
 pub const MAX_PSNR: f64 = 100.0;
 
-/// Photographs that are loaded at the same time, on as many threads.
-const LOADED_AT_ONCE: usize = 4;
+/// Bytes of the views that are evaluated at the same time.
+const AT_ONCE: usize = 256 << 20;
+/// Bytes of a pixel of such a view: photograph, and both images as floats.
+const PIXEL: usize = 3 + 2 * 12;
 
 /// The result of one view with its images, `[H, W, 3]`.
 pub struct EvaluatedView {
@@ -60,12 +64,14 @@ pub struct EvalOptions<'a> {
     pub half_fit: HalfFit,
     /// What the lenses do to every frame.
     pub vignette: Option<&'a Vignette>,
+    /// Where views are rendered, except those that fit parameters.
+    pub device: &'a Device,
 }
 
 /// Renders `model` from the views `indices` of `dataset` and compares; passes each result to `see`, which may end the evaluation.
 ///
 /// # Errors
-/// When a photograph cannot be read.
+/// When a photograph cannot be read, or the device fails.
 pub fn evaluate_views(
     model: &Model,
     dataset: &Dataset,
@@ -73,59 +79,83 @@ pub fn evaluate_views(
     options: &EvalOptions,
     mut see: impl FnMut(EvaluatedView) -> ControlFlow<()>,
 ) -> Result<(), TrainError> {
-    let mut renderer = Renderer::new();
+    let (mut painter, mut renderer) = (Painter::new(model, options.device)?, Renderer::new());
     let cameras: Vec<Camera> = dataset.train.iter().map(|i| dataset.views[*i].camera).collect();
     let extent = camera_extent(&cameras);
-    let load = |index: &usize| (*index, dataset.views[*index].photo.load());
-    let batches = indices.chunks(LOADED_AT_ONCE);
-    let loaded = batches.flat_map(|batch| batch.par_iter().map(load).collect::<Vec<_>>());
-    for (index, photo) in loaded {
-        let (view, photo) = (&dataset.views[index], photo?);
-        let truth = truth_image(&photo, view, options.render.background);
-        let render = model.render(&mut renderer, &view.camera, &options.render).color;
-        let render = vignetted(options.vignette, &view.camera, render);
-        let mask = photo.mask.as_deref();
-        let blank = mask.is_some_and(|mask| mask.iter().all(|m| *m == 0));
-        let mut metrics = match options.metrics {
-            _ if blank => NOT_MEASURED,
-            Metrics::All(networks) => evaluate(&render, &truth, mask, networks),
-            Metrics::Psnr => Evaluation {
-                psnr: psnr_masked(&render.rounded_to_8_bits(), &truth, mask),
-                psnr_corrected: f64::NAN,
-                ssim: f64::NAN,
-                lpips: None,
-                unseen_lpips: None,
-                half_fit_psnr: None,
-            },
+    let views = indices.iter().map(|index| &dataset.views[*index]);
+    let background = options.render.background;
+    for batch in indices.chunks(at_once(views)) {
+        // Photographs are decoded by a thread each; a frame is rendered by all threads, or the device.
+        let load = |index: &usize| {
+            let view = &dataset.views[*index];
+            let photo = view.photo.load()?;
+            Ok((truth_image(&photo, view, background), photo.mask))
         };
-        let held_out = HeldOut {
-            camera: &view.camera,
-            truth: &truth,
-            mask,
-            options: &options.render,
-            vignette: options.vignette,
-            extent,
-        };
-        let fit = options.half_fit;
-        if fit.any() && !blank {
-            metrics.half_fit_psnr = half_fit_psnr(model, &mut renderer, &held_out, fit);
+        let truths: Vec<Result<_, LoadError>> = batch.par_iter().map(load).collect();
+        let mut pairs = Vec::with_capacity(batch.len());
+        for (index, truth) in batch.iter().zip(truths) {
+            let (camera, (truth, mask)) = (&dataset.views[*index].camera, truth?);
+            let render = painter.render(camera, &options.render)?.color;
+            pairs.push((vignetted(options.vignette, camera, render), truth, mask));
         }
-        // Not `f64::min`, which returns the other operand for NaN.
-        metrics.psnr = metrics.psnr.clamp(f64::NEG_INFINITY, MAX_PSNR);
-        metrics.psnr_corrected = metrics.psnr_corrected.clamp(f64::NEG_INFINITY, MAX_PSNR);
-        metrics.half_fit_psnr = metrics.half_fit_psnr.map(|psnr| psnr.min(MAX_PSNR));
-        let seen = see(EvaluatedView {
-            name: view.name.clone(),
-            metrics,
-            truth,
-            render,
-            mask: photo.mask,
-        });
-        if seen.is_break() {
-            break;
+        let measure = |(render, truth, mask): &(Image, Image, Option<Vec<u8>>)| {
+            measure(render, truth, mask.as_deref(), options.metrics)
+        };
+        let measured: Vec<Evaluation> = match options.metrics {
+            Metrics::Psnr => pairs.par_iter().map(measure).collect(),
+            // LPIPS takes much memory, and all threads for one view.
+            Metrics::All(_) => pairs.iter().map(measure).collect(),
+        };
+        for ((index, (render, truth, mask)), mut metrics) in batch.iter().zip(pairs).zip(measured) {
+            let view = &dataset.views[*index];
+            let held_out = HeldOut {
+                camera: &view.camera,
+                truth: &truth,
+                mask: mask.as_deref(),
+                options: &options.render,
+                vignette: options.vignette,
+                extent,
+            };
+            let fit = options.half_fit;
+            if fit.any() && !metrics.psnr.is_nan() {
+                metrics.half_fit_psnr = half_fit_psnr(model, &mut renderer, &held_out, fit);
+            }
+            // Not `f64::min`, which returns the other operand for NaN.
+            metrics.psnr = metrics.psnr.clamp(f64::NEG_INFINITY, MAX_PSNR);
+            metrics.psnr_corrected = metrics.psnr_corrected.clamp(f64::NEG_INFINITY, MAX_PSNR);
+            metrics.half_fit_psnr = metrics.half_fit_psnr.map(|psnr| psnr.min(MAX_PSNR));
+            let seen = see(EvaluatedView {
+                name: view.name.clone(),
+                metrics,
+                truth,
+                render,
+                mask,
+            });
+            if seen.is_break() {
+                return Ok(());
+            }
         }
     }
     Ok(())
+}
+
+/// The metrics of a frame; those of a view whose mask excludes all pixels are not measured.
+fn measure(render: &Image, truth: &Image, mask: Option<&[u8]>, metrics: Metrics) -> Evaluation {
+    match metrics {
+        _ if mask.is_some_and(|mask| mask.iter().all(|m| *m == 0)) => NOT_MEASURED,
+        Metrics::All(networks) => evaluate(render, truth, mask, networks),
+        Metrics::Psnr => Evaluation {
+            psnr: psnr_masked(&render.rounded_to_8_bits(), truth, mask),
+            ..NOT_MEASURED
+        },
+    }
+}
+
+/// Views that are evaluated at the same time: one a thread, if they are small.
+fn at_once<'a>(views: impl Iterator<Item = &'a View>) -> usize {
+    let pixels = views.map(|view| view.camera.intrinsics.width as usize * view.camera.intrinsics.height as usize);
+    let largest = pixels.max().unwrap_or(0).max(1);
+    (AT_ONCE / (PIXEL * largest)).clamp(1, rayon::current_num_threads())
 }
 
 /// `render` `[H, W, 3]` as the lens of `camera` shows it.
@@ -231,6 +261,7 @@ mod tests {
                 metrics: Metrics::All(Networks::default()),
                 half_fit,
                 vignette: None,
+                device: &Device::Cpu,
             };
             let data = dataset();
             views.clear();

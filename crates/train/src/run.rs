@@ -246,6 +246,7 @@ fn held_out_psnr(trainer: &Trainer, observers: &[&mut dyn Observer]) -> Result<f
         metrics: Metrics::Psnr,
         half_fit: HalfFit::default(),
         vignette: trainer.sockets.vignette.as_ref(),
+        device: &trainer.options.device,
     };
     let (mut metrics, mut stopped) = (Vec::new(), false);
     evaluate_views(

@@ -38,14 +38,14 @@ const OURS: [Stage; 9] = [
         [13.0 * f.splats + 60.0 * f.visible, 250.0 * f.splats + 160.0 * f.visible]
     }),
     ("bin: prefix sums, lists", |f| {
-        let words = 7.0 * f.splats + 22.0 * f.visible + 4.0 * f.entries + 12.0 * f.tiles;
+        let words = 7.0 * f.splats + 23.0 * f.visible + 4.0 * f.entries + 12.0 * f.tiles;
         [words, 20.0 * f.splats + 60.0 * f.visible + 40.0 * f.entries]
     }),
-    // Passes of four bits, each of which reads keys twice, values once, and writes both.
-    ("bin: sort by depth, 8 passes", |f| {
-        [40.0 * f.visible, 160.0 * f.visible]
+    // Passes of eight bits, each of which reads keys three times, values once, and writes both; 256 counts for 2,048 keys, four times.
+    ("bin: sort by depth, 4 passes", |f| {
+        [26.0 * f.visible, 240.0 * f.visible]
     }),
-    ("bin: sort by tile, 4 passes", |f| [20.0 * f.entries, 80.0 * f.entries]),
+    ("bin: sort by tile, 2 passes", |f| [13.0 * f.entries, 120.0 * f.entries]),
     // Slot, splat, footprint; the state of 256 pixels for each 256 entries.
     ("blend", |f| {
         [19.0 * f.entries + 5.0 * f.pixels, 256.0 * 24.0 * f.entries]
@@ -56,7 +56,7 @@ const OURS: [Stage; 9] = [
     }),
     ("project_vjp", |f| {
         [
-            12.0 * f.entries + 93.0 * f.visible,
+            12.0 * f.entries + f.splats + 93.0 * f.visible,
             12.0 * f.entries + 900.0 * f.visible,
         ]
     }),

@@ -1,13 +1,13 @@
 //! A frame and a training step on the GPU, stage by stage, beside the CPU's.
 
 use crate::scale::{camera, scene, update};
-use anyhow::{Result, bail};
+use anyhow::{Context, Result, bail};
 use irradia_compute::Device;
 use irradia_compute::gpu::{Gpu, Wanted};
 use irradia_measure::gpu::{Beside, DeviceFrame, GpuLoss};
 use irradia_measure::{LossWeights, Target, Truth};
 use irradia_splat::regularize::Regularizers;
-use irradia_splat::{DeviceGradient, Engine, RenderOptions, SplatState, Statistics};
+use irradia_splat::{DeviceGradient, Engine, RenderOptions, SplatState, Statistics, ViewParams};
 use std::sync::Arc;
 use std::time::Instant;
 
@@ -40,9 +40,33 @@ fn parsed(case: &str) -> Result<(usize, [u32; 2])> {
     Ok((number.parse()?, [width.parse()?, height.parse()?]))
 }
 
-/// Seconds of a frame, and of a step with loss, backward pass and update.
+/// Frames that are submitted before the last one is waited for.
+const MANY: u32 = 200;
+
+/// Writes a case for other renderers, such as `bench/peer_gsplat.py`: little endian, the numbers of splats, columns and rows (u32); as f32 fx,
+/// fy, cx, cy, the 4 x 4 matrix from world to camera row by row, and the splats' means, quaternions (w first), ln of scales, logits of
+/// opacities and harmonics, 16 coefficients of three channels each.
+pub fn export(path: &str, case: &str) -> Result<()> {
+    let (number, [width, height]) = parsed(case)?;
+    let (splats, view) = (scene(number), ViewParams::new(&camera(width, height, 1.0)));
+    let mut floats: Vec<f32> = view.focal.iter().chain(&view.principal).map(|v| *v as f32).collect();
+    for (row, t) in view.rotation.iter().zip(view.translation) {
+        floats.extend(row.iter().chain([&t]).map(|v| *v as f32));
+    }
+    floats.extend([0.0, 0.0, 0.0, 1.0]);
+    for planes in splats.columns() {
+        floats.extend(planes.to_interleaved());
+    }
+    let sizes = [number as u32, width, height].map(u32::to_le_bytes);
+    let words = floats.iter().map(|v| v.to_le_bytes());
+    let bytes: Vec<u8> = sizes.into_iter().chain(words).flatten().collect();
+    std::fs::write(path, bytes).with_context(|| format!("{path}: cannot be written"))
+}
+
+/// Seconds of a frame that is waited for, of one of many that are not, and of a step with loss, backward pass and update.
 struct Spent {
     frame: f64,
+    frame_of_many: f64,
     step: f64,
 }
 
@@ -53,11 +77,12 @@ fn measure(number: usize, [width, height]: [u32; 2]) -> Result<()> {
     let [timed, profiled] = [Gpu::open(&Wanted::Any)?, Gpu::open(&Wanted::Any)?];
     let (spent, engine) = time(&timed, &state, [width, height], None)?;
     println!(
-        "  {} in view, {} entries; a frame {:.2} ms ({:.0} frames/s), a step {:.2} ms ({:.1} steps/s)",
+        "  {} in view, {} entries; a frame {:.2} ms, of many {:.2} ms ({:.0} frames/s), a step {:.2} ms ({:.1} steps/s)",
         engine.visible(),
         engine.intersections(),
         1e3 * spent.frame,
-        1.0 / spent.frame,
+        1e3 * spent.frame_of_many,
+        1.0 / spent.frame_of_many,
         1e3 * spent.step,
         1.0 / spent.step
     );
@@ -138,11 +163,23 @@ fn time(
         started.elapsed().as_secs_f64() / f64::from(done)
     };
     let step = each(&mut engine, &mut step);
-    let frame = match repeats {
-        None => each(&mut engine, &mut |engine| engine.render(camera.into(), &options)),
-        Some(_) => 0.0,
+    let (mut frame, mut frame_of_many) = (0.0, 0.0);
+    if repeats.is_none() {
+        frame = each(&mut engine, &mut |engine| engine.render(camera.into(), &options));
+        let started = Instant::now();
+        for _ in 0..MANY {
+            engine.render_ahead(&camera, &options);
+        }
+        gpu.wait();
+        frame_of_many = started.elapsed().as_secs_f64() / f64::from(MANY);
+        let _ = engine.settle();
+    }
+    let spent = Spent {
+        frame,
+        frame_of_many,
+        step,
     };
-    Ok((Spent { frame, step }, engine))
+    Ok((spent, engine))
 }
 
 /// Seconds of a step without its loss.

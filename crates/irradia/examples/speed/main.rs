@@ -6,6 +6,7 @@
 //! cargo run --release -p irradia --example speed -- frame SCENE.ply      a frame of a million splats, and how its cost scales
 //! cargo run --release -p irradia --example speed -- scale [SPLATS ..]    every stage at 0.1, 1 and 5 million splats
 //! cargo run --release -p irradia --example speed -- gpu [CASE ..]        frames, steps and kernels on a GPU
+//! cargo run --release -p irradia --example speed -- export FILE CASE      the splats of such a case, for other renderers
 //! cargo run --release -p irradia --example speed -- counts               bytes and operations of a step on a GPU, beside gsplat's
 //! ```
 //!
@@ -42,9 +43,11 @@ fn main() -> Result<()> {
         #[cfg(feature = "gpu")]
         ["gpu", ..] => gpu::run(&args[1..]),
         #[cfg(feature = "gpu")]
+        ["export", path, case] => gpu::export(path, case),
+        #[cfg(feature = "gpu")]
         ["counts"] => counts::run(),
         _ => bail!(
-            "usage: steps DATA [STEPS], blend, frame SCENE.ply, scale [SPLATS ..], gpu [SPLATS@WIDTHxHEIGHT ..], or counts"
+            "usage: steps DATA [STEPS], blend, frame SCENE.ply, scale [SPLATS ..], gpu [SPLATS@WIDTHxHEIGHT ..], export FILE SPLATS@WIDTHxHEIGHT, or counts"
         ),
     }
 }

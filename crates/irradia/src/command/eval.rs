@@ -1,7 +1,7 @@
 //! `irradia eval`
 
 use super::lpips::{lpips, unseen_lpips};
-use super::{DataArgs, Split, thread_count, use_threads, warn};
+use super::{DataArgs, Split, by_option, thread_count, use_threads, warn};
 use crate::Usage;
 use crate::terminal::{note, say};
 use anyhow::{Context, Result};
@@ -10,8 +10,8 @@ use irradia_runs::formats::write_atomic;
 use irradia_runs::train::eval::{EvalOptions, EvaluatedView, Metrics};
 use irradia_runs::train::half_fit::HalfFit;
 use irradia_runs::{
-    Background, HOW_TO_GET_LPIPS, RunFolder, Scene, evaluate, file_stems, read_vignette, scene_of, unmeasured,
-    write_image,
+    Background, HOW_TO_GET_LPIPS, RunFolder, Scene, evaluate, file_stems, open_device, read_vignette, scene_of,
+    unmeasured, write_image,
 };
 use serde_json::json;
 use std::path::PathBuf;
@@ -44,6 +44,9 @@ pub struct Args {
     /// Threads; all cores when absent
     #[arg(long, value_parser = thread_count())]
     pub threads: Option<usize>,
+    /// Where views are rendered: cpu, gpu, auto (a real GPU if there is one), or a part of a GPU's name; see irradia devices
+    #[arg(long, value_name = "DEVICE", default_value = "cpu")]
+    pub device: String,
     /// Background of the scene: white, black, grey or a colour such as '#c8c0b4'; when absent that of its run, or what training would choose
     #[arg(long, value_name = "COLOR")]
     pub background: Option<Background>,
@@ -106,6 +109,10 @@ pub fn run(args: &Args) -> Result<()> {
         (None, Some(first)) => unseen_lpips(args.lpips.as_ref(), first)?,
         _ => None,
     };
+    let device = open_device(&args.device).map_err(by_option)?;
+    if !device.is_cpu() {
+        note(format_args!("rendering on {device}"));
+    }
     let vignette = read_vignette(&scene_of(&args.scene))?;
     let nets = [&lpips, &unseen].map(|lpips| lpips.as_ref().map(Lpips::net));
     let options = EvalOptions {
@@ -116,6 +123,7 @@ pub fn run(args: &Args) -> Result<()> {
         }),
         half_fit: args.half_fit(),
         vignette: vignette.as_ref(),
+        device: &device,
     };
     let (mut rows, mut measured) = (Vec::new(), Vec::new());
     let stems = file_stems(dataset.views.iter().map(|view| view.name.as_str()));

@@ -3,6 +3,7 @@
 use super::{CompactEvent, CompactInput};
 use crate::convert::in_world;
 use crate::{Background, RunError, Scene, evaluate};
+use irradia_compute::Device;
 use irradia_formats::{SogDetail, SplatFormat, WriteOptions, through_format};
 use irradia_scene::{Camera, Dataset, GaussianCloud, Similarity};
 use irradia_splat::contribution::{Contributions, contributions};
@@ -116,6 +117,7 @@ impl Measure {
             metrics: Metrics::Psnr,
             half_fit: HalfFit::default(),
             vignette: self.vignette.as_ref(),
+            device: &Device::Cpu,
         };
         Ok(evaluate::<RunError>(model, &self.dataset, views, &options, |_| Ok(()))?.psnr)
     }

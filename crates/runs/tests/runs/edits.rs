@@ -233,6 +233,7 @@ fn floaters_planted_in_a_trained_scene_are_removed() {
             metrics: Metrics::Psnr,
             half_fit: HalfFit::default(),
             vignette: None,
+            device: &irradia_compute::Device::Cpu,
         };
         let mean = evaluate(&scene.model, &data, &data.test, &options, |_| Ok::<(), RunError>(()));
         mean.expect("photographs").psnr

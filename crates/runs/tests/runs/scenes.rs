@@ -61,6 +61,7 @@ fn the_mean_of_an_evaluation_is_that_of_its_views() {
         metrics: Metrics::All(Default::default()),
         half_fit: HalfFit::default(),
         vignette: None,
+        device: &irradia_compute::Device::Cpu,
     };
     let mean = evaluate(&scene.model, &dataset, &dataset.test, &options, |view| {
         psnr.push(view.metrics.psnr);

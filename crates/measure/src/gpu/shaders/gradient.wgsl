@@ -8,21 +8,24 @@
 // Planes: red, green, blue, alpha, depth, error.
 @group(0) @binding(6) var<storage, read_write> v_frame: array<f32>;
 
-var<workgroup> derivatives: array<vec3f, 702>;
-var<workgroup> rows: array<vec3f, 442>;
-var<workgroup> shared_values: array<vec3f, 64>;
+// Derivatives by mu_x and the squares, and by the products: vectors of three would take the room of four.
+var<workgroup> derivatives: array<vec2f, 702>;
+var<workgroup> third_derivatives: array<f32, 702>;
+var<workgroup> rows: array<vec2f, 442>;
+var<workgroup> third_rows: array<f32, 442>;
+var<workgroup> shared_values: array<vec3f, 128>;
 
-@compute @workgroup_size(64)
+@compute @workgroup_size(128)
 fn main(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups: vec3u, @builtin(local_invocation_index) at: u32) {
     let tile = tile_of(group, groups);
     let pixels = task.size.x * task.size.y;
     let has_ssim = (task.flags.x & FLAG_SSIM) != 0u;
     let column = at % TILE;
-    let row = 4u * (at / TILE);
-    var adjoint = array<vec3f, 4>();
+    let row = 2u * (at / TILE);
+    var adjoint = array<vec3f, 2>();
     if has_ssim {
         // A known number of turns, so that the loads of several are under way at once.
-        for (var turn = 0u; turn < 11u; turn++) {
+        for (var turn = 0u; turn < SEEN_TURNS; turn++) {
             let i = turn * THREADS + at;
             let pixel = seen_pixel(tile, i);
             var abc = vec3f(0.0);
@@ -31,7 +34,8 @@ fn main(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups: ve
                 abc = vec3f(maps[plane], maps[plane + pixels], maps[plane + 2u * pixels]);
             }
             if i < SEEN * SEEN {
-                derivatives[(i / SEEN) * SEEN_STRIDE + i % SEEN] = abc;
+                derivatives[(i / SEEN) * SEEN_STRIDE + i % SEEN] = abc.xy;
+                third_derivatives[(i / SEEN) * SEEN_STRIDE + i % SEEN] = abc.z;
             }
         }
         workgroupBarrier();
@@ -43,30 +47,33 @@ fn main(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups: ve
             var b = vec4f(0.0);
             var c = vec4f(0.0);
             for (var k = 0u; k < 14u; k++) {
-                let abc = derivatives[along * SEEN_STRIDE + first + k];
+                let ab = derivatives[along * SEEN_STRIDE + first + k];
                 let weights = task.window[k];
-                a += weights * abc.x;
-                b += weights * abc.y;
-                c += weights * abc.z;
+                a += weights * ab.x;
+                b += weights * ab.y;
+                c += weights * third_derivatives[along * SEEN_STRIDE + first + k];
             }
             let to = along * ROW_STRIDE + first;
-            rows[to] = vec3f(a.x, b.x, c.x);
-            rows[to + 1u] = vec3f(a.y, b.y, c.y);
-            rows[to + 2u] = vec3f(a.z, b.z, c.z);
-            rows[to + 3u] = vec3f(a.w, b.w, c.w);
+            rows[to] = vec2f(a.x, b.x);
+            rows[to + 1u] = vec2f(a.y, b.y);
+            rows[to + 2u] = vec2f(a.z, b.z);
+            rows[to + 3u] = vec2f(a.w, b.w);
+            third_rows[to] = c.x;
+            third_rows[to + 1u] = c.y;
+            third_rows[to + 2u] = c.z;
+            third_rows[to + 3u] = c.w;
         }
         workgroupBarrier();
-        for (var k = 0u; k < 14u; k++) {
-            let abc = rows[(row + k) * ROW_STRIDE + column];
+        for (var k = 0u; k < 12u; k++) {
+            let at = (row + k) * ROW_STRIDE + column;
+            let abc = vec3f(rows[at], third_rows[at]);
             let weights = task.window[k];
             adjoint[0] += weights.x * abc;
             adjoint[1] += weights.y * abc;
-            adjoint[2] += weights.z * abc;
-            adjoint[3] += weights.w * abc;
         }
     }
     var differences = vec2f(0.0);
-    for (var q = 0u; q < 4u; q++) {
+    for (var q = 0u; q < 2u; q++) {
         let pixel = own_pixel(tile, column, row + q);
         if pixel >= 0 {
             differences += finish(adjoint[q], u32(pixel), tile.channel);

@@ -15,13 +15,13 @@ const C2: f32 = 0.0009;
 var<workgroup> pairs: array<vec2f, 702>;
 // After the window along x: render, truth, squares, products.
 var<workgroup> rows: array<vec4f, 442>;
-var<workgroup> shared_values: array<vec3f, 64>;
+var<workgroup> shared_values: array<vec3f, 128>;
 
-@compute @workgroup_size(64)
+@compute @workgroup_size(128)
 fn main(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups: vec3u, @builtin(local_invocation_index) at: u32) {
     let tile = tile_of(group, groups);
     // A known number of turns, so that the loads of several are under way at once.
-    for (var turn = 0u; turn < 11u; turn++) {
+    for (var turn = 0u; turn < SEEN_TURNS; turn++) {
         let i = turn * THREADS + at;
         let pixel = seen_pixel(tile, i);
         var pair = vec2f(0.0);
@@ -57,18 +57,16 @@ fn main(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups: ve
     }
     workgroupBarrier();
     let column = at % TILE;
-    let row = 4u * (at / TILE);
-    var means = array<vec4f, 4>();
-    for (var k = 0u; k < 14u; k++) {
+    let row = 2u * (at / TILE);
+    var means = array<vec4f, 2>();
+    for (var k = 0u; k < 12u; k++) {
         let moments = rows[(row + k) * ROW_STRIDE + column];
         let weights = task.window[k];
         means[0] += weights.x * moments;
         means[1] += weights.y * moments;
-        means[2] += weights.z * moments;
-        means[3] += weights.w * moments;
     }
     var dissimilarity = 0.0;
-    for (var q = 0u; q < 4u; q++) {
+    for (var q = 0u; q < 2u; q++) {
         let pixel = own_pixel(tile, column, row + q);
         if pixel >= 0 {
             dissimilarity += differentiate(means[q], u32(pixel), tile.channel);

@@ -6,7 +6,7 @@ struct Target {
     gains: vec4f,
     // Bits of FLAG_*; samples of depth; gain of coverage (bits of a float); unused.
     flags: vec4u,
-    // Weights of value k of a run of 14 in the windows of four neighbours. Not a constant: where a compiler does not unroll the loop over
+    // Weights of value k of a run of 14 in the windows of four neighbours, of 12 in those of two. Not a constant: where a compiler does not unroll the loop over
     // k, each access would make a copy of the whole.
     window: array<vec4f, 14>,
 }

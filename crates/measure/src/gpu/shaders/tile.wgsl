@@ -1,5 +1,7 @@
-// A tile of 16 x 16 pixels in one channel, by a workgroup of 64 threads with four pixels in a column each.
-const THREADS: u32 = 64u;
+// A tile of 16 x 16 pixels in one channel, by a workgroup of 128 threads with two pixels in a column each.
+const THREADS: u32 = 128u;
+// Turns in which all threads visit what the windows of a tile see.
+const SEEN_TURNS: u32 = 6u;
 
 struct Tile {
     // Among all tiles of all channels.

@@ -47,13 +47,13 @@ pub enum Event {
         /// Current number of splats.
         splats: usize,
     },
-    /// The held-out views were evaluated.
+    /// The held-out views were evaluated, or 32 of them where there are more.
     Evaluated {
         /// Steps made so far.
         step: u64,
         /// Seconds of training so far.
         seconds: f64,
-        /// Mean over the held-out views, dB.
+        /// Their mean, dB.
         psnr: f64,
         /// Current number of splats.
         splats: usize,

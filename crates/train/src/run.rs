@@ -25,6 +25,9 @@ pub struct RunLimits {
 /// Steps between evaluations of the held-out views for `until_psnr`.
 const UNTIL_PSNR_EVERY: u64 = 50;
 
+/// Held-out views that an evaluation during training has at most: all 200 of a Blender scene took longer than the steps between them.
+const MOST_EVALUATED: usize = 32;
+
 /// Interval at which observers of a paused run are polled: imperceptible to a person, and a negligible load.
 const PAUSE_INTERVAL: Duration = Duration::from_millis(20);
 
@@ -109,7 +112,12 @@ pub fn run(
         if evaluates && !trainer.dataset.test.is_empty() {
             let (step, seconds, splats) = (trainer.clock.step, trainer.seconds, trainer.engine.len());
             let started = Instant::now();
-            let psnr = held_out_psnr(trainer, observers)?;
+            let views = match limits.until_psnr {
+                None => some_of(&trainer.dataset.test),
+                // Which is that of all views.
+                Some(_) => trainer.dataset.test.clone(),
+            };
+            let psnr = held_out_psnr(trainer, &views, observers)?;
             trainer.times.evaluating += started.elapsed().as_secs_f64();
             if !psnr.is_nan() {
                 events.push(Event::Evaluated {
@@ -238,9 +246,15 @@ fn wait_while_paused(
     requests.stop |= tell(trainer, events, observers).stop;
 }
 
-/// Mean PSNR over the held-out views, with the SH bands currently in use; NaN if none could be measured or an observer
+/// [`MOST_EVALUATED`] of `views` at most, evenly chosen.
+fn some_of(views: &[usize]) -> Vec<usize> {
+    let count = views.len().min(MOST_EVALUATED);
+    (0..count).map(|i| views[i * views.len() / count]).collect()
+}
+
+/// Mean PSNR over the held-out `views`, with the SH bands currently in use; NaN if none could be measured or an observer
 /// requests a stop meanwhile.
-fn held_out_psnr(trainer: &Trainer, observers: &[&mut dyn Observer]) -> Result<f64, TrainError> {
+fn held_out_psnr(trainer: &Trainer, views: &[usize], observers: &[&mut dyn Observer]) -> Result<f64, TrainError> {
     let options = EvalOptions {
         render: trainer.render_options(plan(&trainer.recipe, &trainer.clock).sh_degree),
         metrics: Metrics::Psnr,
@@ -249,20 +263,27 @@ fn held_out_psnr(trainer: &Trainer, observers: &[&mut dyn Observer]) -> Result<f
         device: &trainer.options.device,
     };
     let (mut metrics, mut stopped) = (Vec::new(), false);
-    evaluate_views(
-        &trainer.scene(),
-        &trainer.dataset,
-        &trainer.dataset.test,
-        &options,
-        |view| {
-            metrics.push(view.metrics);
-            stopped = observers.iter().any(|observer| observer.wants_stop());
-            if stopped {
-                ControlFlow::Break(())
-            } else {
-                ControlFlow::Continue(())
-            }
-        },
-    )?;
+    evaluate_views(&trainer.scene(), &trainer.dataset, views, &options, |view| {
+        metrics.push(view.metrics);
+        stopped = observers.iter().any(|observer| observer.wants_stop());
+        if stopped {
+            ControlFlow::Break(())
+        } else {
+            ControlFlow::Continue(())
+        }
+    })?;
     Ok(if stopped { f64::NAN } else { mean(&metrics).psnr })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_evaluation_during_training_has_few_views_from_all_over() {
+        assert_eq!(some_of(&[7, 8, 9]), [7, 8, 9]);
+        let views = some_of(&(100..300).collect::<Vec<_>>());
+        assert_eq!(views.len(), MOST_EVALUATED);
+        assert!(views[0] == 100 && views[31] > 290 && views.is_sorted_by(|a, b| (6..=7).contains(&(b - a))));
+    }
 }

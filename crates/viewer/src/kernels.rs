@@ -75,7 +75,7 @@ mod tests {
     fn parts_make_the_kernels_again() {
         let value: serde_json::Value = serde_json::from_str(kernels()).expect("JSON");
         let shaders: Vec<_> = of_a_frame().collect();
-        assert_eq!(shaders.len(), 12);
+        assert_eq!(shaders.len(), 13);
         for shader in shaders {
             let numbers = value["kernels"][shader.name].as_array().expect("numbers");
             let parts = numbers.iter().map(|number| {

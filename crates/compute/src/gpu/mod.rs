@@ -23,7 +23,7 @@ use profile::Profile;
 use std::collections::BTreeMap;
 use std::fmt;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::{Arc, Mutex, OnceLock, PoisonError};
+use std::sync::{Arc, LazyLock, Mutex, OnceLock, PoisonError};
 
 /// Threads of a workgroup, where a kernel has no reason for another number: what every implementation offers at least.
 pub const GROUP: u32 = 256;
@@ -108,16 +108,17 @@ const SHARED: u32 = 22 << 10;
 /// Storage arrays that a kernel binds at most.
 const BINDINGS: u32 = 12;
 
-fn instance() -> wgpu::Instance {
+/// The drivers of this machine: loaded once, and never while another thread uses them.
+static INSTANCE: LazyLock<wgpu::Instance> = LazyLock::new(|| {
     wgpu::Instance::new(wgpu::InstanceDescriptor {
         backends: wgpu::Backends::PRIMARY,
         ..wgpu::InstanceDescriptor::new_without_display_handle()
     })
-}
+});
 
 /// The adapters of this machine, graphics cards first.
 fn list() -> Vec<(wgpu::Adapter, AdapterInfo)> {
-    let adapters = pollster::block_on(instance().enumerate_adapters(wgpu::Backends::PRIMARY));
+    let adapters = pollster::block_on(INSTANCE.enumerate_adapters(wgpu::Backends::PRIMARY));
     let mut list: Vec<_> = adapters
         .into_iter()
         .map(|adapter| {

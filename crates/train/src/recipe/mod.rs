@@ -102,7 +102,7 @@ documented! {
         /// What is set otherwise takes precedence.
         #[serde(default, skip_serializing_if = "Vec::is_empty")]
         pub unhurried: Vec<String>,
-        /// Steps between evaluations of held-out views while training; at least 1.
+        /// Steps between evaluations of the held-out views while training, of 32 where there are more; at least 1.
         pub eval_every: u64,
         /// Steps between checkpoints; at least 1.
         pub checkpoint_every: u64,

@@ -14,6 +14,7 @@ use irradia_train::report::{
     Beside, Breakdown, Inside, Report, ViewReport, machine, peak_rss_bytes, schedule, to_html,
 };
 use irradia_train::socket::Vignette;
+use rayon::prelude::*;
 use std::path::Path;
 use std::time::Instant;
 
@@ -163,11 +164,16 @@ pub fn write_image(path: impl AsRef<Path>, image: &Image) -> Result<(), RunError
 
 /// Writes truth, render and error of a held-out view under `eval/`.
 fn write_view(folder: &RunFolder, stem: &str, view: &EvaluatedView) -> Result<ViewReport, RunError> {
-    let path = |what: &str| format!("eval/{stem}.{what}.png");
-    let write = |what: &str, image: &Image| -> Result<String, RunError> {
-        write_image(folder.file(&path(what)), image)?;
-        Ok(path(what))
-    };
+    let error = error_image(view);
+    let images = [("truth", &view.truth), ("render", &view.render), ("error", &error)];
+    // Encoding takes longer than measuring.
+    let written = images.par_iter().map(|(what, image)| {
+        let path = format!("eval/{stem}.{what}.png");
+        write_image(folder.file(&path), image)?;
+        Ok(path)
+    });
+    let written: Result<Vec<String>, RunError> = written.collect();
+    let [truth, render, error] = written?.try_into().expect("a path for each image");
     Ok(ViewReport {
         name: view.name.clone(),
         psnr: view.metrics.psnr,
@@ -176,9 +182,9 @@ fn write_view(folder: &RunFolder, stem: &str, view: &EvaluatedView) -> Result<Vi
         unseen_lpips: view.metrics.unseen_lpips,
         psnr_corrected: view.metrics.psnr_corrected,
         half_fit_psnr: view.metrics.half_fit_psnr,
-        truth: write("truth", &view.truth)?,
-        render: write("render", &view.render)?,
-        error: write("error", &error_image(view))?,
+        truth,
+        render,
+        error,
     })
 }
 

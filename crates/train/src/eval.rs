@@ -102,9 +102,9 @@ pub fn evaluate_views(
             measure(render, truth, mask.as_deref(), options.metrics)
         };
         let measured: Vec<Evaluation> = match options.metrics {
-            Metrics::Psnr => pairs.par_iter().map(measure).collect(),
             // LPIPS takes much memory, and all threads for one view.
-            Metrics::All(_) => pairs.iter().map(measure).collect(),
+            Metrics::All(networks) if networks.any() => pairs.iter().map(measure).collect(),
+            _ => pairs.par_iter().map(measure).collect(),
         };
         for ((index, (render, truth, mask)), mut metrics) in batch.iter().zip(pairs).zip(measured) {
             let view = &dataset.views[*index];

@@ -37,24 +37,7 @@ impl Kernel {
             label: Some(shader.name),
             source: wgpu::ShaderSource::Wgsl(Cow::Owned(format!("{constants}{}", shader.source()))),
         };
-        let mut checks = wgpu::ShaderRuntimeChecks::checked();
-        // A counter in every loop, which also keeps drivers from unrolling it: without, an H100 takes 8.0 ms a step in place of 10.9
-        // (`speed -- gpu 1000000@1920x1080`). Bounds are still checked.
-        checks.force_loop_bounding = false;
-        // SAFETY: shaders are this project's own, and their loops end: each counts up to a bound.
-        let module = unsafe { gpu.device.create_shader_module_trusted(descriptor, checks) };
-        let pipeline = gpu.device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
-            label: Some(shader.name),
-            layout: None,
-            module: &module,
-            entry_point: Some("main"),
-            compilation_options: wgpu::PipelineCompilationOptions {
-                // Kernels write before they read.
-                zero_initialize_workgroup_memory: false,
-                ..Default::default()
-            },
-            cache: None,
-        });
+        let pipeline = with_stack(|| compile(gpu, shader.name, descriptor));
         Self {
             name: shader.name,
             layout: pipeline.get_bind_group_layout(0),
@@ -101,6 +84,39 @@ impl Kernel {
         bound.groups.push((places.collect(), group.clone()));
         group
     }
+}
+
+fn compile(gpu: &Gpu, name: &str, descriptor: wgpu::ShaderModuleDescriptor) -> wgpu::ComputePipeline {
+    let mut checks = wgpu::ShaderRuntimeChecks::checked();
+    // A counter in every loop, which also keeps drivers from unrolling it: without, an H100 takes 8.0 ms a step in place of 10.9
+    // (`speed -- gpu 1000000@1920x1080`). Bounds are still checked.
+    checks.force_loop_bounding = false;
+    // SAFETY: shaders are this project's own, and their loops end: each counts up to a bound.
+    let module = unsafe { gpu.device.create_shader_module_trusted(descriptor, checks) };
+    gpu.device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
+        label: Some(name),
+        layout: None,
+        module: &module,
+        entry_point: Some("main"),
+        compilation_options: wgpu::PipelineCompilationOptions {
+            // Kernels write before they read.
+            zero_initialize_workgroup_memory: false,
+            ..Default::default()
+        },
+        cache: None,
+    })
+}
+
+/// Bytes of stack for a driver's compiler, which may recurse as deep as a shader is large: threads of servers and tests have 2 MB.
+const STACK: usize = 32 << 20;
+
+/// What `work` returns, on a thread with [`STACK`].
+fn with_stack<T: Send>(work: impl FnOnce() -> T + Send) -> T {
+    std::thread::scope(|scope| {
+        let builder = std::thread::Builder::new().stack_size(STACK);
+        let thread = builder.spawn_scoped(scope, work).expect("a thread can be started");
+        thread.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))
+    })
 }
 
 /// Workgroups along one axis at most (WebGPU's limit).

@@ -41,6 +41,13 @@ pub struct Networks<'a> {
     pub unseen: Option<&'a Lpips>,
 }
 
+impl Networks<'_> {
+    /// Whether there is one.
+    pub fn any(&self) -> bool {
+        self.first.is_some() || self.unseen.is_some()
+    }
+}
+
 /// All metrics of `render` against `truth`, both `[H, W, 3]` and first rounded to 8 bits, as for published figures.
 ///
 /// Pixels where `mask [H, W]` is 0 are excluded: PSNR and SSIM do not count them, and the render takes the truth's colours

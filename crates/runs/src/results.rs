@@ -3,10 +3,11 @@
 use crate::folder::{FIELD, SCENE, to_json};
 use crate::request::has_perceptual_loss;
 use crate::{Run, RunError, RunFolder, evaluate, file_stems, unmeasured};
-use irradia_compute::Level;
+use irradia_compute::{Device, Level};
 use irradia_formats::{write_png, write_splats};
 use irradia_measure::{Lpips, Networks};
 use irradia_scene::{Image, sh};
+use irradia_train::Trainer;
 use irradia_train::eval::{EvalOptions, EvaluatedView, Metrics};
 use irradia_train::field_file;
 use irradia_train::model::Model;
@@ -84,11 +85,7 @@ impl Run {
         }
         Ok(Report {
             version: env!("CARGO_PKG_VERSION").to_owned(),
-            device: format!(
-                "CPU, {} threads, {}",
-                rayon::current_num_threads(),
-                Level::detect().name()
-            ),
+            device: device(trainer),
             dataset: input.data.display().to_string(),
             recipe: trainer.recipe.name.clone(),
             recipe_hash: trainer.recipe.hash(),
@@ -160,6 +157,19 @@ pub fn write_image(path: impl AsRef<Path>, image: &Image) -> Result<(), RunError
         image.channels,
         &image.to_u8(),
     )?)
+}
+
+/// What trained and measured: the GPU, if one was asked for, and the CPU.
+fn device(trainer: &Trainer) -> String {
+    let cpu = format!(
+        "CPU, {} threads, {}",
+        rayon::current_num_threads(),
+        Level::detect().name()
+    );
+    match &trainer.options.device {
+        Device::Cpu => cpu,
+        gpu => format!("{gpu}; {cpu}"),
+    }
 }
 
 /// Writes truth, render and error of a held-out view under `eval/`.

@@ -35,6 +35,32 @@ fn prefix_sums_of_few_and_many_words_are_those_of_a_loop() {
 }
 
 #[test]
+fn a_kernel_serves_more_arrays_than_it_remembers_and_those_that_have_moved() {
+    let Some(gpu) = gpu() else { return };
+    let (mut scan, params) = (Scan::new(&gpu), Scan::params(&gpu));
+    let array = || Array::zeros(&gpu, "few words", 4);
+    let mut pairs: Vec<[Array; 2]> = (0..20).map(|_| [array(), array()]).collect();
+    for round in 0..3u32 {
+        for (i, [from, to]) in (0u32..).zip(&mut pairs) {
+            if round == 2 {
+                // To other memory.
+                from.reserve(&gpu, 1000);
+                to.reserve(&gpu, 1000);
+            }
+            from.write(&gpu, 0, &[100 * round + i, 1, 1]);
+            let mut work = Work::new(&gpu);
+            scan.run(&mut work, &params, from, to, 3);
+            work.submit();
+        }
+        for (i, [_, to]) in (0u32..).zip(&pairs) {
+            let first = 100 * round + i;
+            assert_eq!(to.to_vec::<u32>(&gpu, 3), [0, first, first + 1], "{i} in round {round}");
+        }
+    }
+    gpu.check().unwrap();
+}
+
+#[test]
 fn sorting_keeps_the_order_of_equal_keys() {
     let Some(gpu) = gpu() else { return };
     let mut sort = Sort::new(&gpu, 32);

@@ -18,7 +18,7 @@ use irradia_runs::train::compare::{
 };
 use irradia_runs::train::report::{Report, ViewReport, machine};
 use irradia_runs::{
-    Background, Protocol, Reading, RunFolder, data_fingerprint, distinct, file_stem, logged_errors,
+    Background, Protocol, Reading, RunFolder, data_fingerprint, distinct, file_stem, logged_errors, open_device,
     program_fingerprint, read_recipe,
 };
 use serde::{Deserialize, Serialize};
@@ -62,6 +62,9 @@ pub struct Args {
     /// Threads of each run; all cores when absent
     #[arg(long, value_name = "N", value_parser = thread_count())]
     pub threads: Option<usize>,
+    /// Where recipes are trained: cpu, gpu, auto (a real GPU if there is one), or a part of a GPU's name; see irradia devices. cpu when absent
+    #[arg(long, value_name = "DEVICE")]
+    pub device: Option<String>,
     /// LPIPS weights: a file, or a folder of them; see irradia lpips
     #[arg(long, value_name = "PATH")]
     pub lpips: Option<PathBuf>,
@@ -158,6 +161,9 @@ pub fn run(args: &Args) -> Result<()> {
     let variants = variants(args)?;
     if let Some(data) = args.data.iter().find(|data| !data.exists()) {
         return Err(Usage(format!("{} does not exist; name a dataset folder", data.display())).into());
+    }
+    if let Some(device) = &args.device {
+        open_device(device).map_err(by_option)?;
     }
     let sources = sources(args)?;
     let program = program_fingerprint().context("cannot read this program's file")?;
@@ -264,11 +270,11 @@ fn sources(args: &Args) -> Result<Vec<Source>> {
             Some(protocol) => Reading {
                 format: args.reading.format.clone(),
                 images: args.reading.images.clone(),
-                lenses: args.reading.training(None).lenses,
+                lenses: args.reading.training(args.device.as_deref()).lenses,
                 readout: args.reading.readout.clone(),
                 ..protocol.reading(&scene)
             },
-            None => args.reading.training(None),
+            None => args.reading.training(args.device.as_deref()),
         };
         reading.check().map_err(by_option)?;
         let dataset = reading.read(data).ok();
@@ -360,6 +366,7 @@ fn request(args: &Args, program: &str, source: &Source, variant: &Variant, seed:
     option("--budget", args.budget.map(|s| format!("{s}s")));
     option("--max-splats", args.max_splats.map(|n| n.to_string()));
     option("--threads", args.threads.map(|n| n.to_string()));
+    option("--device", args.device.clone());
     option("--lpips", args.lpips.as_ref().map(|path| path.display().to_string()));
     option("--format", args.reading.format.clone());
     let reading = &source.reading;

@@ -149,6 +149,7 @@ fn mistakes_are_found_before_any_training() {
         ("compare data --recipes classic,classic:no.such=1 --out both", "no"),
         ("compare nowhere --recipes classic --out both", "nowhere"),
         ("compare data --recipes absent.toml --out both", "absent.toml"),
+        ("compare data --recipes classic --out both --device abacus", "abacus"),
     ];
     for (line, word) in cases {
         irradia(folder.path(), line).refused(2, &[word]);

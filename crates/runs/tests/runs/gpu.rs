@@ -34,6 +34,7 @@ fn a_run_on_the_gpu_ends_as_on_the_cpu() {
                 .iter()
                 .any(|line| line.contains("read back from the GPU"));
             assert_eq!(told, device == "gpu" && recipe == "curriculum", "{:?}", report.warnings);
+            assert_eq!(report.device.contains("GPU"), device == "gpu", "{}", report.device);
             report.psnr
         });
         // mcmc draws other random numbers on the GPU; 30 steps amplify little.

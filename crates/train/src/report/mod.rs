@@ -19,7 +19,7 @@ use serde::{Deserialize, Deserializer, Serialize};
 pub struct Report {
     /// Version of the program.
     pub version: String,
-    /// The device, such as `cpu, 2 threads, avx512`.
+    /// The device, such as `CPU, 2 threads, avx512`, after the GPU that was asked for, if any.
     pub device: String,
     /// The dataset, as the user named it.
     pub dataset: String,

@@ -91,7 +91,7 @@ fn compile(gpu: &Gpu, name: &str, descriptor: wgpu::ShaderModuleDescriptor) -> w
     // A counter in every loop, which also keeps drivers from unrolling it: without, an H100 takes 8.0 ms a step in place of 10.9
     // (`speed -- gpu 1000000@1920x1080`). Bounds are still checked.
     checks.force_loop_bounding = false;
-    // SAFETY: shaders are this project's own, and their loops end: each counts up to a bound.
+    // SAFETY: shaders are this project's own, and their loops end: each counts up to a bound, or follows a ray to its end.
     let module = unsafe { gpu.device.create_shader_module_trusted(descriptor, checks) };
     gpu.device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
         label: Some(name),

@@ -1,7 +1,7 @@
 //! `irradia eval`
 
 use super::lpips::{lpips, unseen_lpips};
-use super::{DataArgs, Split, by_option, thread_count, use_threads, warn};
+use super::{DataArgs, Split, rendering_device, thread_count, use_threads, warn};
 use crate::Usage;
 use crate::terminal::{note, say};
 use anyhow::{Context, Result};
@@ -10,8 +10,8 @@ use irradia_runs::formats::write_atomic;
 use irradia_runs::train::eval::{EvalOptions, EvaluatedView, Metrics};
 use irradia_runs::train::half_fit::HalfFit;
 use irradia_runs::{
-    Background, HOW_TO_GET_LPIPS, RunFolder, Scene, evaluate, file_stems, open_device, read_vignette, scene_of,
-    unmeasured, write_image,
+    Background, HOW_TO_GET_LPIPS, RunFolder, Scene, evaluate, file_stems, read_vignette, scene_of, unmeasured,
+    write_image,
 };
 use serde_json::json;
 use std::path::PathBuf;
@@ -109,10 +109,7 @@ pub fn run(args: &Args) -> Result<()> {
         (None, Some(first)) => unseen_lpips(args.lpips.as_ref(), first)?,
         _ => None,
     };
-    let device = open_device(&args.device).map_err(by_option)?;
-    if !device.is_cpu() {
-        note(format_args!("rendering on {device}"));
-    }
+    let device = rendering_device(&args.device)?;
     let vignette = read_vignette(&scene_of(&args.scene))?;
     let nets = [&lpips, &unseen].map(|lpips| lpips.as_ref().map(Lpips::net));
     let options = EvalOptions {

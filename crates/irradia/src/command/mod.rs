@@ -24,10 +24,10 @@ use crate::Usage;
 use crate::terminal::note;
 use anyhow::{Context, Result};
 use clap::builder::RangedU64ValueParser;
-use irradia_compute::DeviceChoice;
+use irradia_compute::{Device, DeviceChoice};
 use irradia_runs::formats::{Lenses, SplatFormat};
 use irradia_runs::scene::Dataset;
-use irradia_runs::{Reading, RunError};
+use irradia_runs::{Reading, RunError, open_device};
 use std::path::{Path, PathBuf};
 
 /// A part of a dataset.
@@ -117,6 +117,15 @@ impl DataArgs {
         warn(&dataset.warnings);
         Ok(dataset)
     }
+}
+
+/// The device that `--device` names for rendering; said, if it is a GPU.
+pub fn rendering_device(name: &str) -> Result<Device> {
+    let device = open_device(name).map_err(by_option)?;
+    if !device.is_cpu() {
+        note(format_args!("rendering on {device}"));
+    }
+    Ok(device)
 }
 
 /// Converts an error of a request to the names of the command line.

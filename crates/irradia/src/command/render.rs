@@ -1,13 +1,13 @@
 //! `irradia render`
 
 use super::film::{self, FilmWriter};
-use super::{DataArgs, Split, by_option, thread_count, use_threads};
+use super::{DataArgs, Split, rendering_device, thread_count, use_threads};
 use crate::Usage;
-use crate::terminal::{note, say};
+use crate::terminal::say;
 use anyhow::{Context, Result};
 use irradia_runs::scene::{Camera, Image};
 use irradia_runs::train::painter::Painter;
-use irradia_runs::{Film, Scene, file_stems, open_device, write_image};
+use irradia_runs::{Film, Scene, file_stems, write_image};
 use std::path::{Path, PathBuf};
 
 #[derive(clap::Args)]
@@ -117,11 +117,7 @@ pub(super) fn film_of(path: &Path, scene: &Scene, frames: u32, size: Option<(u32
 
 /// Renders the scene on the device of the arguments.
 fn painter<'m>(args: &Args, scene: &'m Scene) -> Result<Painter<'m>> {
-    let device = open_device(&args.device).map_err(by_option)?;
-    if !device.is_cpu() {
-        note(format_args!("rendering on {device}"));
-    }
-    Ok(Painter::new(&scene.model, &device)?)
+    Ok(Painter::new(&scene.model, &rendering_device(&args.device)?)?)
 }
 
 fn write_film(args: &Args, scene: &Scene, film: &Film) -> Result<()> {

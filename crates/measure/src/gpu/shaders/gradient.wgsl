@@ -65,8 +65,8 @@ fn main(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups: ve
         }
         workgroupBarrier();
         for (var k = 0u; k < 12u; k++) {
-            let at = (row + k) * ROW_STRIDE + column;
-            let abc = vec3f(rows[at], third_rows[at]);
+            let place = (row + k) * ROW_STRIDE + column;
+            let abc = vec3f(rows[place], third_rows[place]);
             let weights = task.window[k];
             adjoint[0] += weights.x * abc;
             adjoint[1] += weights.y * abc;

@@ -61,6 +61,8 @@ pub fn program(folder: &Path) -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_irradia"));
     command.current_dir(folder).env_remove("IRRADIA_LPIPS");
     command.env("XDG_DATA_HOME", folder.join("share"));
+    // As on a desktop: without it, Mesa's Vulkan layer prints error lines of its own.
+    command.env("XDG_RUNTIME_DIR", folder);
     command
         .stdin(Stdio::null())
         .stdout(Stdio::piped())

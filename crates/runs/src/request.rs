@@ -1,5 +1,6 @@
 //! Training requests: raw input, and the validated request.
 
+use crate::pose::{are_missing, find_points};
 use crate::{Background, RunError, RunFolder, scene_of};
 use irradia_compute::DeviceChoice;
 use irradia_formats::{
@@ -199,6 +200,9 @@ pub struct TrainInput {
     /// A scene whose splats the training begins with, a file or a run's folder, in the coordinates of the dataset.
     #[serde(default)]
     pub from: Option<PathBuf>,
+    /// Whether points are found by matching the photographs where the dataset has poses and no points; splats begin at random positions otherwise.
+    #[serde(default)]
+    pub match_points: bool,
     /// Where the scene is trained: `cpu`, `gpu`, `auto` (a real GPU if there is one), or a part of a GPU's name.
     #[serde(default = "default_device")]
     pub device: String,
@@ -235,6 +239,7 @@ impl TrainInput {
             reading: Reading::default(),
             background: None,
             from: None,
+            match_points: true,
             device: default_device(),
             overwrite: false,
         }
@@ -374,6 +379,32 @@ impl TrainRequest {
     /// When the folder contains no dataset that can be trained on.
     pub fn read_dataset(&self) -> Result<Dataset, RunError> {
         Ok(read_dataset(&self.input.data, &self.reading)?)
+    }
+
+    /// Whether a run on `dataset` finds points by matching its photographs, which takes a moment for each: it has poses and no points, and the splats to begin
+    /// with are not given. Rendered scenes need none, since their alpha tells what is empty.
+    pub fn matches_points(&self, dataset: &Dataset) -> bool {
+        self.input.match_points && self.input.from.is_none() && are_missing(dataset)
+    }
+
+    /// `dataset` with points where [`Self::matches_points`], the same for any number of threads, and what was found.
+    pub(crate) fn with_points(&self, mut dataset: Dataset) -> (Dataset, Option<String>) {
+        if !self.matches_points(&dataset) {
+            return (dataset, None);
+        }
+        // Small images show fewer features, and matching needs pinholes.
+        let mut larger = self.reading.clone();
+        (larger.downscale, larger.max_side, larger.lenses) = (1.0, Some(DEFAULT_MAX_SIDE), Lenses::Undistorted);
+        let same_views = |larger: &Dataset| {
+            let names = |dataset: &Dataset| dataset.views.iter().map(|view| view.name.clone()).collect::<Vec<_>>();
+            names(larger) == names(&dataset)
+        };
+        let larger = read_dataset(&self.input.data, &larger).ok().filter(same_views);
+        let message = match find_points(&mut dataset, larger.as_ref()) {
+            Some(points) => format!("the dataset has no points: {points} were found by matching its photographs"),
+            None => "the dataset has no points, and matching its photographs found too few".to_owned(),
+        };
+        (dataset, Some(message))
     }
 
     /// Parts of the request that cannot be satisfied, one line each.

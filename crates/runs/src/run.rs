@@ -92,7 +92,9 @@ impl Run {
         let held = FolderLock::take_existing(out)?;
         let paces = request.paces()?;
         let options = train_options(&request)?;
-        let trainer = first_trainer(&request, Arc::new(dataset), options)?;
+        let (dataset, found) = request.with_points(dataset);
+        let mut trainer = first_trainer(&request, Arc::new(dataset), options)?;
+        found.into_iter().for_each(|message| trainer.tell(message));
         let (folder, lock) = RunFolder::create(out, overwrite, held)?;
         folder.write("recipe.toml", trainer.recipe.to_toml().as_bytes())?;
         folder.write_cameras(&trainer)?;
@@ -128,7 +130,8 @@ impl Run {
         let options = train_options(&request)?;
         let paces = request.paces()?;
         // The world of the steps made, which an earlier version may have chosen otherwise.
-        let dataset = Arc::new(dataset.in_world(folder.world_from_dataset()?));
+        let (dataset, _) = request.with_points(dataset.in_world(folder.world_from_dataset()?));
+        let dataset = Arc::new(dataset);
         let trainer = match folder.newest_checkpoint()? {
             Some(path) => {
                 let differences = folder.changed_views(&dataset)?;

@@ -6,6 +6,7 @@
 //!   nothing beside the object, and what floats there stands before it in other photographs.
 //! - **Skies.** Photographs of many days have skies that no scene can show at once; splats explain them by fog around all that is in
 //!   front.
+//! - **Large photographs.** A step takes as long as they have pixels: what their halves and quarters show is learned from those.
 //! - **Wide lenses.** Pixels of a photograph by a fisheye that keeps its distortion show angles other than those of the views that are rendered later: splats
 //!   must look alike at each.
 //! - **Maps of depth and normals.** They are read, and weighed only where some can be used.
@@ -42,6 +43,9 @@ const SKY_STEP: u8 = 8;
 /// photograph needs its own. Measured: a statue by 135 cameras 0.19 and 0.19; eleven captures of one camera, with walls and ceilings for skies, at
 /// most 0.11 and 0.08; fox with random exposures and white balances 0.19 and 0.10.
 const SKY_SPREAD: f64 = 0.14;
+
+/// Pixels of a training photograph, in the mean, above which photographs are large.
+const LARGE: f64 = 0.8e6;
 
 /// Degrees between adjacent photographs from which they are sparse. Held-out PSNR of `fast` at 240 pixels with the usual 3,000 steps and with 1,200 and
 /// `depth_weight` 0.5: fox, 12 photographs 13 degrees apart, 28.2 and 28.7; 6, 29 degrees apart, 24.1 and 24.9; cup, 12, 27 degrees apart, 26.4 and 26.6. With 750
@@ -113,9 +117,15 @@ fn skies_differ(colors: &[[f64; 3]], photographs: usize) -> bool {
 }
 
 impl Trainer {
+    /// Adds to what is told of the data at the start of the run, one line: [`Event::Decided`](crate::event::Event::Decided).
+    pub fn tell(&mut self, decision: String) {
+        self.decisions.push(decision);
+    }
+
     /// Puts the recipe's parameters for conditions into effect that the data meet. In the recipe, so that a resumed run has the same.
     pub(crate) fn settle_conditions(&mut self) -> Result<(), TrainError> {
-        let [skies, known_space, cut_out] = [
+        let [large, skies, known_space, cut_out] = [
+            std::mem::take(&mut self.recipe.large),
             std::mem::take(&mut self.recipe.skies),
             std::mem::take(&mut self.recipe.known_space),
             std::mem::take(&mut self.recipe.cut_out),
@@ -161,6 +171,10 @@ impl Trainer {
         }
         if are_cut_out {
             self.put_into_effect("masks leave out all but an object", "cut_out", cut_out);
+        }
+        // Of wide lenses even large photographs have few pixels an angle.
+        if self.pixels > LARGE && !self.has_wide_lenses() {
+            self.put_into_effect("photographs are large", "large", large);
         }
         self.settle_lenses();
         self.tell_shutters();
@@ -314,6 +328,33 @@ mod tests {
         }
         let (value, ..) = trained(3, true, &["known_space.opacity_reg=0.3"]);
         assert_eq!(value, Knob::Const(0.3));
+    }
+
+    #[test]
+    fn large_photographs_are_learned_from_smaller_ones_first() {
+        let scales = |[width, height]: [u32; 2], lens: Lens, set: &[String]| {
+            let mut data = (*dataset(3, true)).clone();
+            let intrinsics = &mut data.views[0].camera.intrinsics;
+            *intrinsics = Intrinsics {
+                lens,
+                ..Intrinsics::from_fov_x(width, height, 1.0)
+            };
+            let recipe = Recipe::parse("fast", Recipe::built_in("fast").unwrap(), set).unwrap();
+            let large = recipe.large.get(&Param::ImageScale).cloned();
+            let trainer = Trainer::new(Arc::new(data), recipe, TrainOptions::default()).unwrap();
+            let is_told = trainer.decisions.iter().any(|line| line.contains("[large]"));
+            let scales = trainer.recipe.params[&Param::ImageScale].clone();
+            assert_eq!(is_told, Some(&scales) == large.as_ref());
+            (is_told, scales)
+        };
+        assert!(scales([1200, 900], Lens::Pinhole, &[]).0);
+        assert!(!scales([800, 800], Lens::Pinhole, &[]).0);
+        assert!(
+            !scales([1600, 1600], Lens::fisheye([0.0; 4]), &[]).0,
+            "few pixels an angle"
+        );
+        let set = ["params.image_scale=0.75".to_owned()];
+        assert_eq!(scales([1200, 900], Lens::Pinhole, &set), (false, Knob::Const(0.75)));
     }
 
     #[test]

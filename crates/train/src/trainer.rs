@@ -159,7 +159,7 @@ pub struct Trainer {
     /// Maximum number of splats: the recipe's limits for this dataset, and those of the memory and the device.
     pub cap: usize,
     /// Pixels of a training image, averaged over views.
-    pixels: f64,
+    pub(crate) pixels: f64,
     /// What was decided from the data before the first step, one line each.
     pub(crate) decisions: Vec<String>,
     /// The distribution of the memory.

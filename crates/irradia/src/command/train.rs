@@ -39,6 +39,10 @@ pub struct Args {
     /// given, unless the photographs contradict them, else irradia's
     #[arg(long, value_name = "WHO", value_enum, conflicts_with_all = ["resume", "replay"])]
     pub poses: Option<PosesOf>,
+    /// What splats begin from where the dataset has poses and no points: points that matching its photographs finds, or, with what is given alone, random
+    /// positions
+    #[arg(long, value_name = "WHICH", value_enum, default_value_t = PointsOf::Matched, conflicts_with_all = ["resume", "replay"])]
+    pub points: PointsOf,
     /// Train although fewer than 80 % of the photographs could be posed, or some that would be held out could not
     #[arg(long)]
     pub anyway: bool,
@@ -103,6 +107,13 @@ pub enum PosesOf {
     Given,
     Irradia,
     Colmap,
+}
+
+/// Whose points are used.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+pub enum PointsOf {
+    Matched,
+    Given,
 }
 
 impl PosesOf {
@@ -223,6 +234,7 @@ fn input(args: &Args) -> Result<TrainInput> {
         reading: args.reading.training(args.device.as_deref()),
         background: args.background,
         from: args.from.clone(),
+        match_points: args.points == PointsOf::Matched,
         device: args
             .device
             .clone()
@@ -321,6 +333,9 @@ pub fn begin(input: TrainInput, viewer: Option<&ListenArgs>) -> Result<()> {
 fn begin_on(request: TrainRequest, dataset: Dataset, viewer: Option<&ListenArgs>) -> Result<()> {
     warn(&dataset.warnings);
     warn(&request.warnings());
+    if request.matches_points(&dataset) {
+        note("the dataset has no points: its photographs are matched");
+    }
     let run = Run::begin_on(request, dataset).map_err(by_option)?;
     note(format_args!("background: {}", run.background()));
     finish(run, viewer)

@@ -4,10 +4,8 @@
 //! own reprojection errors do not show it, since they dropped the matches that contradict them; matching the photographs again does. Where nothing else matches,
 //! nothing contradicts: there the points tell, which photographs from nearly the same place do not share.
 
-use super::stages::in_grey;
-use irradia_scene::{Camera, Dataset, Photo, View};
-use irradia_sfm::Features;
-use irradia_sfm::features::{Extractor, GreyPhoto, Sift};
+use super::look::{Look, pose};
+use irradia_scene::{Dataset, View};
 use irradia_sfm::geometry::camera::DCamera;
 use irradia_sfm::geometry::pose::DPose;
 use irradia_sfm::map::{
@@ -60,12 +58,13 @@ impl PoseCheck {
 /// Matches the photographs of `dataset` and compares what they say with its poses. Photographs that cannot be read are left out.
 pub fn check_poses(dataset: &Dataset) -> PoseCheck {
     let step = dataset.views.len().div_ceil(PHOTOGRAPHS).max(1);
-    let seen: Vec<(&View, PhotoInfo, Features)> = dataset.views.par_iter().step_by(step).filter_map(look).collect();
+    let look = |view| Some((view, Look::at(view, SIDE, FEATURES)?));
+    let seen: Vec<(&View, Look)> = dataset.views.par_iter().step_by(step).filter_map(look).collect();
     let (mut views, mut photos, mut features) = (Vec::new(), Vec::new(), Vec::new());
-    for (group, (view, info, found)) in seen.into_iter().enumerate() {
+    for (group, (view, look)) in seen.into_iter().enumerate() {
         views.push(view);
-        photos.push(PhotoInfo { group, ..info });
-        features.push(found);
+        photos.push(PhotoInfo { group, ..look.info });
+        features.push(look.features);
     }
     let matching = MatchOptions::default();
     let mut candidates = candidate_pairs(&features, &PairOptions::default(), &matching);
@@ -150,39 +149,6 @@ fn in_place(photos: usize, pairs: &[VerifiedPair], strengths: &[f64], agreement:
     agreeing.into_iter().map(|agreeing| agreeing >= SEVERAL).collect()
 }
 
-/// A photograph and its features at the size at which it is compared.
-fn look(view: &View) -> Option<(&View, PhotoInfo, Features)> {
-    let full = view.camera.intrinsics;
-    let k = full.scaled((SIDE as f32 / full.width.max(full.height) as f32).min(1.0));
-    let photo = view.photo.load_at(k.width, k.height).ok()?;
-    let features = features(&photo);
-    let info = PhotoInfo {
-        name: view.name.clone(),
-        width: k.width,
-        height: k.height,
-        group: 0,
-        focal_prior_px: Some(f64::from(k.fx)),
-        up: None,
-        camera: Some(DCamera::pinhole(&k)),
-        mount: None,
-    };
-    Some((view, info, features))
-}
-
-fn features(photo: &Photo) -> Features {
-    let grey = in_grey(&photo.data, photo.channels);
-    let sift = Sift {
-        max_features: FEATURES,
-        ..Sift::default()
-    };
-    sift.extract(&GreyPhoto {
-        width: photo.width,
-        height: photo.height,
-        data: &grey,
-        mask: photo.alpha().as_deref().or(photo.mask.as_deref()),
-    })
-}
-
 /// The poses in a world in which the cameras' median distance from their middle is 1.
 fn poses(views: &[&View]) -> Vec<Option<DPose>> {
     let mut poses: Vec<DPose> = views.iter().map(|view| pose(&view.camera)).collect();
@@ -196,11 +162,4 @@ fn poses(views: &[&View]) -> Vec<Option<DPose>> {
         .iter_mut()
         .for_each(|pose| pose.position = (pose.position - middle) / scale);
     poses.into_iter().map(Some).collect()
-}
-
-fn pose(camera: &Camera) -> DPose {
-    DPose {
-        rotation: camera.pose.rotation.as_dquat(),
-        position: camera.pose.position.as_dvec3(),
-    }
 }

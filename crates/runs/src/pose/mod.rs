@@ -16,8 +16,10 @@ mod colmap;
 mod doctor;
 mod film;
 mod known;
+mod look;
 mod output;
 mod place;
+mod points;
 mod stages;
 mod store;
 
@@ -38,6 +40,7 @@ pub use capture::is_capture;
 pub use check::{PoseCheck, check_poses};
 pub use doctor::{DoctorInput, DoctorReport, Finding, doctor};
 use film::is_film;
+pub(crate) use points::{are_missing, find_points};
 
 /// The fraction of the photographs that should have a pose: below it, more features are tried, and no training begins unasked.
 pub const ENOUGH_POSED: f64 = 0.8;

@@ -5,6 +5,7 @@ mod edits;
 mod every_recipe;
 #[cfg(feature = "gpu")]
 mod gpu;
+mod points;
 mod pose;
 mod requests;
 mod scenes;

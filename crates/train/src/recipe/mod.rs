@@ -160,6 +160,9 @@ documented! {
         /// The same, if the sky differs from photograph to photograph; `known_space` prevails.
         #[serde(default, skip_serializing_if = "Params::is_empty")]
         pub skies: Params,
+        /// The same, if training photographs have more than 0.8 million pixels, in the mean.
+        #[serde(default, skip_serializing_if = "Params::is_empty")]
+        pub large: Params,
         /// The stages, in order.
         pub stage: Vec<Stage>,
     }
@@ -401,7 +404,14 @@ impl Recipe {
             let mut paths = overrides.iter().filter_map(|given| given.split_once('='));
             paths.any(|(path, _)| path.trim().strip_prefix("params.") == Some(param.name()))
         };
-        for params in [&mut recipe.known_space, &mut recipe.cut_out, &mut recipe.skies] {
+        let Self {
+            known_space,
+            cut_out,
+            skies,
+            large,
+            ..
+        } = &mut recipe;
+        for params in [known_space, cut_out, skies, large] {
             params.retain(|param, _| !is_set(param));
         }
         recipe.complete_sockets();
@@ -541,6 +551,7 @@ impl Recipe {
             ("known_space".to_owned(), &self.known_space),
             ("cut_out".to_owned(), &self.cut_out),
             ("skies".to_owned(), &self.skies),
+            ("large".to_owned(), &self.large),
         ];
         let stages = self
             .stage

@@ -1,0 +1,68 @@
+//! Views of a dataset as the mapper takes them: with their features, cameras and poses.
+
+use super::stages::in_grey;
+use irradia_scene::{Camera, Photo, View};
+use irradia_sfm::Features;
+use irradia_sfm::features::{Extractor, GreyPhoto, Sift};
+use irradia_sfm::geometry::camera::DCamera;
+use irradia_sfm::geometry::pose::DPose;
+use irradia_sfm::map::PhotoInfo;
+
+/// A view at the size at which its features were found.
+pub(super) struct Look {
+    /// With a camera of its own, in group 0.
+    pub info: PhotoInfo,
+    pub features: Features,
+    /// The photograph's colour at each feature.
+    pub colors: Vec<[u8; 3]>,
+}
+
+impl Look {
+    /// Looks at `view`, whose longer side has at most `side` pixels then; `None` if its photograph cannot be read.
+    pub fn at(view: &View, side: u32, max_features: usize) -> Option<Self> {
+        let full = view.camera.intrinsics;
+        let k = full.scaled((side as f32 / full.width.max(full.height) as f32).min(1.0));
+        let photo = view.photo.load_at(k.width, k.height).ok()?;
+        let sift = Sift {
+            max_features,
+            ..Sift::default()
+        };
+        let features = sift.extract(&GreyPhoto {
+            width: photo.width,
+            height: photo.height,
+            data: &in_grey(&photo.data, photo.channels),
+            mask: photo.alpha().as_deref().or(photo.mask.as_deref()),
+        });
+        let info = PhotoInfo {
+            name: view.name.clone(),
+            width: k.width,
+            height: k.height,
+            group: 0,
+            focal_prior_px: Some(f64::from(k.fx)),
+            up: None,
+            camera: Some(DCamera::pinhole(&k)),
+            mount: None,
+        };
+        let colors = features
+            .keypoints
+            .iter()
+            .map(|at| color_at(&photo, at.x, at.y))
+            .collect();
+        Some(Self { info, features, colors })
+    }
+}
+
+/// The pose of `camera` in double precision.
+pub(super) fn pose(camera: &Camera) -> DPose {
+    DPose {
+        rotation: camera.pose.rotation.as_dquat(),
+        position: camera.pose.position.as_dvec3(),
+    }
+}
+
+fn color_at(photo: &Photo, x: f32, y: f32) -> [u8; 3] {
+    let at = |v: f32, side: u32| (v as usize).min(side as usize - 1);
+    let pixel = at(y, photo.height) * photo.width as usize + at(x, photo.width);
+    let from = pixel * photo.channels as usize;
+    [0, 1, 2].map(|c| photo.data[from + c])
+}

@@ -1,0 +1,165 @@
+//! Points of datasets that have poses and none.
+
+use crate::{folder, input};
+use glam::Vec3;
+use irradia_runs::prelude::*;
+use irradia_runs::scene::{Photo, PointCloud, View};
+use irradia_runs::synth::{Capture, Part, SceneName, Shot};
+use std::sync::{Arc, OnceLock};
+
+const OPTIONS: SynthOptions = SynthOptions {
+    scene: SceneName::Demo,
+    views: 40,
+    width: 320,
+    height: 240,
+    seed: 2,
+    lens: irradia_runs::synth::SynthLens::Pinhole,
+    turn: 0.0,
+};
+
+/// Ray-traced photographs without points.
+fn without_points() -> Dataset {
+    static TRACED: OnceLock<Vec<View>> = OnceLock::new();
+    let views = TRACED.get_or_init(|| {
+        let scene = OPTIONS.scene.build(OPTIONS.seed).0;
+        let view = |shot: &Shot| {
+            // Fewer samples than usual: features do not mind the noise.
+            let photo = Photo {
+                width: OPTIONS.width,
+                height: OPTIONS.height,
+                channels: 4,
+                data: scene.trace(&shot.camera, 4, 1).rgba(),
+                mask: None,
+            };
+            View::new(shot.name(), shot.camera, Arc::new(photo))
+        };
+        let capture = Capture::new(&OPTIONS).expect("options");
+        let shots = capture.shots().iter().filter(|shot| shot.part == Part::Train);
+        shots.map(view).collect()
+    });
+    let is_held_out = |view: &usize| view.is_multiple_of(8);
+    Dataset {
+        views: views.clone(),
+        train: (0..views.len()).filter(|view| !is_held_out(view)).collect(),
+        test: (0..views.len()).filter(is_held_out).collect(),
+        ..Dataset::default()
+    }
+}
+
+/// The largest relative error of depth of a sound point; the scene has a mirror, whose points lie behind it.
+const SOUND: f32 = 0.05;
+
+/// `[points seen]` the relative error of depth of each point in each view that is said to show it.
+fn errors_of_depth(dataset: &Dataset, points: &PointCloud) -> Vec<f32> {
+    let scene = OPTIONS.scene.build(OPTIONS.seed).0;
+    let mut errors = Vec::new();
+    for view in &dataset.views {
+        let depth = scene.trace(&view.camera, 1, 1).depth;
+        for point in &view.points_seen {
+            let seen = view.camera.sees(points.positions[*point as usize]);
+            let (at, z) = seen.expect("within the image");
+            // A corner may be on the other side of an edge by a pixel.
+            let near = |v: f32, side: u32| (v as usize).saturating_sub(1)..(v as usize + 2).min(side as usize);
+            let pixels = near(at.y, depth.height).flat_map(|y| near(at.x, depth.width).map(move |x| (x, y)));
+            let error = |(x, y): (usize, usize)| (z / depth.data[y * depth.width as usize + x] - 1.0).abs();
+            errors.push(pixels.map(error).fold(f32::INFINITY, f32::min));
+        }
+    }
+    errors
+}
+
+/// A run of `steps` steps that began, and what was told of the points.
+fn begun(input: TrainInput, dataset: Dataset) -> (Run, Vec<String>) {
+    struct Told(Vec<String>);
+    impl Observer for Told {
+        fn on_event(&mut self, event: &Event, _trainer: &Trainer) -> Signal {
+            if let Event::Decided { message } = event {
+                self.0.extend(message.contains("no points").then(|| message.clone()));
+            }
+            match event {
+                Event::Step(step) if step.step == 2 => Signal::Stop,
+                _ => Signal::Continue,
+            }
+        }
+    }
+    let mut run = Run::begin_on(input.check().expect("a request"), dataset).expect("a run");
+    let mut told = Told(Vec::new());
+    run.train(&mut [&mut told]).expect("trains");
+    (run, told.0)
+}
+
+#[test]
+fn points_are_found_on_surfaces_by_training_photographs_alone_and_again_on_resuming() {
+    let folder = folder();
+    let dataset = without_points();
+    let (run, told) = begun(input(folder.path(), "run", 6), dataset.clone());
+    let found = run.trainer().dataset.clone();
+    let points = found.points.clone().expect("found");
+    assert!(points.len() > 400, "{}", points.len());
+    assert!(
+        told.len() == 1 && told[0].contains(&format!("{} were found", points.len())),
+        "{told:?}"
+    );
+    assert!(found.test.iter().all(|view| found.views[*view].points_seen.is_empty()));
+    let seeing = found
+        .train
+        .iter()
+        .filter(|view| !found.views[**view].points_seen.is_empty());
+    assert!(
+        4 * seeing.count() > 3 * found.train.len(),
+        "most photographs show points"
+    );
+    let errors = errors_of_depth(&found, &points);
+    let sound = errors.iter().filter(|error| **error < SOUND).count();
+    assert!(sound as f64 > 0.85 * errors.len() as f64, "{sound} of {}", errors.len());
+
+    run.finish().expect("finishes");
+    let again = TrainInput::of_run(folder.path().join("run")).expect("a run");
+    let resumed = Run::resume_on(again.check().expect("a request"), dataset).expect("resumes");
+    let again = &resumed.trainer().dataset;
+    assert_eq!(again.points, Some(points));
+    assert!(
+        again
+            .views
+            .iter()
+            .zip(&found.views)
+            .all(|(a, b)| a.points_seen == b.points_seen)
+    );
+}
+
+#[test]
+fn points_are_not_found_where_they_are_given_not_wanted_or_nothing_matches() {
+    let folder = folder();
+    let points_of = |name: &str, dataset: &Dataset, match_points: bool| {
+        let input = TrainInput {
+            match_points,
+            ..input(folder.path(), name, 2)
+        };
+        let (run, told) = begun(input, dataset.clone());
+        (run.trainer().dataset.points.clone(), told)
+    };
+    let mut bare = without_points();
+    let points = Some(PointCloud {
+        positions: vec![Vec3::ZERO; 20],
+        colors: vec![[128; 3]; 20],
+    });
+    let given = Dataset {
+        points: points.clone(),
+        ..bare.clone()
+    };
+    assert_eq!(points_of("given", &given, true), (points, vec![]));
+    assert_eq!(points_of("unwanted", &bare, false), (None, vec![]));
+    for view in &mut bare.views {
+        view.photo = Arc::new(Photo {
+            width: OPTIONS.width,
+            height: OPTIONS.height,
+            channels: 3,
+            data: vec![90; 3 * (OPTIONS.width * OPTIONS.height) as usize],
+            mask: None,
+        });
+    }
+    let (points, told) = points_of("grey", &bare, true);
+    assert!(points.is_none() && told[0].contains("too few"), "{told:?}");
+    bare.kind = "Blender".into();
+    assert_eq!(points_of("rendered", &bare, true), (None, vec![]));
+}

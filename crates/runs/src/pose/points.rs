@@ -13,8 +13,6 @@ use rayon::prelude::*;
 
 /// Training photographs that are matched; of more, evenly spaced ones.
 const PHOTOGRAPHS: usize = 400;
-/// Photographs that show a point, at least: of two, one wrong match in some is an accidental intersection of rays.
-const SHORTEST: usize = 3;
 /// Fewer points than these say little of where surfaces are.
 const FEWEST: usize = 200;
 
@@ -61,13 +59,7 @@ pub(crate) fn find_points(dataset: &mut Dataset, larger: Option<&Dataset>) -> Op
         &MapOptions::default(),
         &mut |_| (),
     );
-    let points: Vec<ModelPoint> = found
-        .models
-        .pop()
-        .map_or_else(Vec::new, |model| model.points)
-        .into_iter()
-        .filter(|point| point.track.len() >= SHORTEST)
-        .collect();
+    let points = found.models.pop().map_or_else(Vec::new, |model| model.points);
     if points.len() < FEWEST {
         return None;
     }

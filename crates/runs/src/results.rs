@@ -3,7 +3,7 @@
 use crate::folder::{FIELD, SCENE, to_json};
 use crate::request::has_perceptual_loss;
 use crate::{Run, RunError, RunFolder, evaluate, file_stems, unmeasured};
-use irradia_compute::{Device, Level};
+use irradia_compute::Level;
 use irradia_formats::{write_png, write_splats};
 use irradia_measure::{Lpips, Networks};
 use irradia_scene::{Image, sh};
@@ -166,9 +166,10 @@ fn device(trainer: &Trainer) -> String {
         rayon::current_num_threads(),
         Level::detect().name()
     );
-    match &trainer.options.device {
-        Device::Cpu => cpu,
-        gpu => format!("{gpu}; {cpu}"),
+    let device = &trainer.options.device;
+    match device.is_cpu() {
+        true => cpu,
+        false => format!("{device}; {cpu}"),
     }
 }
 

@@ -160,7 +160,7 @@ documented! {
         /// The same, if the sky differs from photograph to photograph; `known_space` prevails.
         #[serde(default, skip_serializing_if = "Params::is_empty")]
         pub skies: Params,
-        /// The same, if training photographs have more than 0.8 million pixels, in the mean.
+        /// The same, if at least 50 training photographs have more than 0.8 million pixels, in the mean.
         #[serde(default, skip_serializing_if = "Params::is_empty")]
         pub large: Params,
         /// The stages, in order.

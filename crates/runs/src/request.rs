@@ -396,10 +396,13 @@ impl TrainRequest {
         let mut larger = self.reading.clone();
         (larger.downscale, larger.max_side, larger.lenses) = (1.0, Some(DEFAULT_MAX_SIDE), Lenses::Undistorted);
         let same_views = |larger: &Dataset| {
-            let names = |dataset: &Dataset| dataset.views.iter().map(|view| view.name.clone()).collect::<Vec<_>>();
-            names(larger) == names(&dataset)
+            let names = larger.views.iter().map(|view| &view.name);
+            names.eq(dataset.views.iter().map(|view| &view.name))
         };
-        let larger = read_dataset(&self.input.data, &larger).ok().filter(same_views);
+        let larger = match larger == self.reading {
+            true => None,
+            false => read_dataset(&self.input.data, &larger).ok().filter(same_views),
+        };
         let message = match find_points(&mut dataset, larger.as_ref()) {
             Some(points) => format!("the dataset has no points: {points} were found by matching its photographs"),
             None => "the dataset has no points, and matching its photographs found too few".to_owned(),

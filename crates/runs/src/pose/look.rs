@@ -1,7 +1,7 @@
 //! Views of a dataset as the mapper takes them: with their features, cameras and poses.
 
-use super::stages::in_grey;
-use irradia_scene::{Camera, Photo, View};
+use super::stages::{color_at, in_grey};
+use irradia_scene::{Camera, View};
 use irradia_sfm::Features;
 use irradia_sfm::features::{Extractor, GreyPhoto, Sift};
 use irradia_sfm::geometry::camera::DCamera;
@@ -43,11 +43,8 @@ impl Look {
             camera: Some(DCamera::pinhole(&k)),
             mount: None,
         };
-        let colors = features
-            .keypoints
-            .iter()
-            .map(|at| color_at(&photo, at.x, at.y))
-            .collect();
+        let color = |x, y| color_at(&photo.data, [photo.width, photo.height], photo.channels, x, y);
+        let colors = features.keypoints.iter().map(|k| color(k.x, k.y)).collect();
         Some(Self { info, features, colors })
     }
 }
@@ -58,11 +55,4 @@ pub(super) fn pose(camera: &Camera) -> DPose {
         rotation: camera.pose.rotation.as_dquat(),
         position: camera.pose.position.as_dvec3(),
     }
-}
-
-fn color_at(photo: &Photo, x: f32, y: f32) -> [u8; 3] {
-    let at = |v: f32, side: u32| (v as usize).min(side as usize - 1);
-    let pixel = at(y, photo.height) * photo.width as usize + at(x, photo.width);
-    let from = pixel * photo.channels as usize;
-    [0, 1, 2].map(|c| photo.data[from + c])
 }

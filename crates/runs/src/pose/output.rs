@@ -8,7 +8,7 @@ use irradia_formats::{
     PosedImage, TrackedPoint, write_colmap,
 };
 use irradia_sfm::geometry::camera::DCamera;
-use irradia_sfm::map::{Model, PhotoInfo, Reconstruction};
+use irradia_sfm::map::{Model, ModelPoint, PhotoInfo, Reconstruction};
 use std::fs;
 use std::path::{Path, PathBuf};
 
@@ -134,21 +134,17 @@ fn colmap_model(work: &Work, infos: &[PhotoInfo], model: &Model) -> ColmapModel 
     }
     let mut points = Vec::with_capacity(model.points.len());
     for (id, point) in (1u64..).zip(&model.points) {
-        let mut sum = [0u32; 3];
         let mut track = Vec::with_capacity(point.track.len());
         for &(photo, keypoint) in &point.track {
             let image = image_of[photo as usize];
             images[image as usize].keypoints[keypoint as usize].1 = Some(id);
-            let color = work.colors()[photo as usize][keypoint as usize];
-            sum = [0, 1, 2].map(|c| sum[c] + u32::from(color[c]));
             track.push([image, keypoint]);
         }
-        let count = track.len().max(1) as u32;
         points.push(TrackedPoint {
             point: ColmapPoint {
                 id,
                 position: point.position.to_array(),
-                color: sum.map(|sum| ((sum + count / 2) / count) as u8),
+                color: mean_color(point, work.colors()),
             },
             error: point.error,
             track,
@@ -159,6 +155,17 @@ fn colmap_model(work: &Work, infos: &[PhotoInfo], model: &Model) -> ColmapModel 
         images,
         points,
     }
+}
+
+/// The mean colour of the features of `point`, of `[photos][features]` colours.
+pub(super) fn mean_color(point: &ModelPoint, colors: &[Vec<[u8; 3]>]) -> [u8; 3] {
+    let mut sum = [0u32; 3];
+    for &(photo, keypoint) in &point.track {
+        let color = colors[photo as usize][keypoint as usize];
+        sum = [0, 1, 2].map(|c| sum[c] + u32::from(color[c]));
+    }
+    let count = point.track.len().max(1) as u32;
+    sum.map(|sum| ((sum + count / 2) / count) as u8)
 }
 
 /// The simplest of COLMAP's models that the camera fits in.

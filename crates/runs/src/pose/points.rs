@@ -4,10 +4,11 @@
 //! photographs of fox at 540x960, by the same recipe in the same time, are 2 dB worse (RESULTS.md).
 
 use super::look::{Look, pose};
+use super::output::mean_color;
 use super::stages::max_features;
 use irradia_scene::{Dataset, Lens, PointCloud};
 use irradia_sfm::features::Sift;
-use irradia_sfm::map::{Known, MapOptions, ModelPoint, PhotoInfo, extend};
+use irradia_sfm::map::{Known, MapOptions, PhotoInfo, extend};
 use irradia_sfm::matching::{MatchOptions, PairOptions, candidate_pairs, match_pairs};
 use rayon::prelude::*;
 
@@ -63,14 +64,6 @@ pub(crate) fn find_points(dataset: &mut Dataset, larger: Option<&Dataset>) -> Op
     if points.len() < FEWEST {
         return None;
     }
-    let color = |point: &ModelPoint| {
-        let seen = point
-            .track
-            .iter()
-            .map(|(photo, at)| colors[*photo as usize][*at as usize]);
-        let sum = seen.fold([0u32; 3], |sum, color| [0, 1, 2].map(|c| sum[c] + u32::from(color[c])));
-        sum.map(|sum| (sum / point.track.len() as u32) as u8)
-    };
     for (i, point) in (0u32..).zip(&points) {
         for (photo, _) in &point.track {
             dataset.views[views[*photo as usize]].points_seen.push(i);
@@ -78,7 +71,7 @@ pub(crate) fn find_points(dataset: &mut Dataset, larger: Option<&Dataset>) -> Op
     }
     dataset.points = Some(PointCloud {
         positions: points.iter().map(|point| point.position.as_vec3()).collect(),
-        colors: points.iter().map(color).collect(),
+        colors: points.iter().map(|point| mean_color(point, &colors)).collect(),
     });
     Some(points.len())
 }

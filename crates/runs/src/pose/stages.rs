@@ -264,7 +264,9 @@ fn extract(sift: &Sift, photo: &PhotoEntry) -> Result<Looks, String> {
         data: &grey,
         mask: mask.as_deref(),
     });
-    let colors = features.keypoints.iter().map(|k| color_at(&pixels, k.x, k.y)).collect();
+    let size = [pixels.width, pixels.height];
+    let color = |x, y| color_at(&pixels.data, size, pixels.channels, x, y);
+    let colors = features.keypoints.iter().map(|k| color(k.x, k.y)).collect();
     let enlarge = [
         photo.width as f32 / pixels.width as f32,
         photo.height as f32 / pixels.height as f32,
@@ -301,9 +303,10 @@ fn luma(pixel: &[u8]) -> u8 {
     ((54 * r + 183 * g + 19 * b + 128) >> 8) as u8
 }
 
-fn color_at(pixels: &Pixels, x: f32, y: f32) -> [u8; 3] {
+/// The colour at `(x, y)` of `[H, W, channels]`.
+pub(super) fn color_at(data: &[u8], [width, height]: [u32; 2], channels: u32, x: f32, y: f32) -> [u8; 3] {
     let at = |v: f32, side: u32| (v as usize).min(side as usize - 1);
-    let pixel = at(y, pixels.height) * pixels.width as usize + at(x, pixels.width);
-    let from = pixel * pixels.channels as usize;
-    [0, 1, 2].map(|c| pixels.data[from + c])
+    let pixel = at(y, height) * width as usize + at(x, width);
+    let from = pixel * channels as usize;
+    [0, 1, 2].map(|c| data[from + c])
 }

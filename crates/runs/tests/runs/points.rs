@@ -1,42 +1,16 @@
 //! Points of datasets that have poses and none.
 
+use crate::pose::{OPTIONS, views_of};
 use crate::{folder, input};
 use glam::Vec3;
 use irradia_runs::prelude::*;
 use irradia_runs::scene::{Photo, PointCloud, View};
-use irradia_runs::synth::{Capture, Part, SceneName, Shot};
 use std::sync::{Arc, OnceLock};
-
-const OPTIONS: SynthOptions = SynthOptions {
-    scene: SceneName::Demo,
-    views: 40,
-    width: 320,
-    height: 240,
-    seed: 2,
-    lens: irradia_runs::synth::SynthLens::Pinhole,
-    turn: 0.0,
-};
 
 /// Ray-traced photographs without points.
 fn without_points() -> Dataset {
     static TRACED: OnceLock<Vec<View>> = OnceLock::new();
-    let views = TRACED.get_or_init(|| {
-        let scene = OPTIONS.scene.build(OPTIONS.seed).0;
-        let view = |shot: &Shot| {
-            // Fewer samples than usual: features do not mind the noise.
-            let photo = Photo {
-                width: OPTIONS.width,
-                height: OPTIONS.height,
-                channels: 4,
-                data: scene.trace(&shot.camera, 4, 1).rgba(),
-                mask: None,
-            };
-            View::new(shot.name(), shot.camera, Arc::new(photo))
-        };
-        let capture = Capture::new(&OPTIONS).expect("options");
-        let shots = capture.shots().iter().filter(|shot| shot.part == Part::Train);
-        shots.map(view).collect()
-    });
+    let views = TRACED.get_or_init(|| views_of(OPTIONS.scene));
     let is_held_out = |view: &usize| view.is_multiple_of(8);
     Dataset {
         views: views.clone(),

@@ -16,7 +16,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;
 
-const OPTIONS: SynthOptions = SynthOptions {
+pub(crate) const OPTIONS: SynthOptions = SynthOptions {
     scene: SceneName::Demo,
     views: 40,
     width: 320,
@@ -48,7 +48,7 @@ fn quietly(input: &PoseInput) -> Result<PoseReport, RunError> {
 }
 
 /// The training views of the cameras of [`OPTIONS`], of another `scene`.
-fn views_of(scene: SceneName) -> Vec<View> {
+pub(crate) fn views_of(scene: SceneName) -> Vec<View> {
     let capture = Capture::new(&OPTIONS).unwrap();
     let scene = scene.build(OPTIONS.seed).0;
     let view = |shot: &Shot| {

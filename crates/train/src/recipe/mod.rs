@@ -404,14 +404,12 @@ impl Recipe {
             let mut paths = overrides.iter().filter_map(|given| given.split_once('='));
             paths.any(|(path, _)| path.trim().strip_prefix("params.") == Some(param.name()))
         };
-        let Self {
-            known_space,
-            cut_out,
-            skies,
-            large,
-            ..
-        } = &mut recipe;
-        for params in [known_space, cut_out, skies, large] {
+        for params in [
+            &mut recipe.known_space,
+            &mut recipe.cut_out,
+            &mut recipe.skies,
+            &mut recipe.large,
+        ] {
             params.retain(|param, _| !is_set(param));
         }
         recipe.complete_sockets();

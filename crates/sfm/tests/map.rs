@@ -4,13 +4,13 @@ mod world;
 
 use glam::{DQuat, DVec3};
 use irradia_scene::Rng;
-use irradia_sfm::Features;
 use irradia_sfm::geometry::camera::DCamera;
 use irradia_sfm::geometry::pose::DPose;
 use irradia_sfm::map::{
-    Distance, Known, MapOptions, Model, Mount, PairKind, Reason, Reconstruction, agreement, extend, reconstruct,
-    to_distances,
+    Distance, Known, MapOptions, Model, ModelPoint, Mount, PairKind, PhotoInfo, Reason, Reconstruction,
+    add_guided_points, agreement, extend, reconstruct, to_distances,
 };
+use irradia_sfm::{DESCRIPTOR_BYTES, Features, Keypoint};
 use std::f64::consts::{FRAC_PI_2, PI};
 use world::{CAMERA, World, around, look};
 
@@ -115,6 +115,100 @@ fn photographs_are_registered_into_a_known_model_that_stays_as_it_is() {
     }
     let focal = model.cameras[1].expect("registered").focal();
     assert!((focal / 870.0 - 1.0).abs() < 0.02, "{focal}");
+}
+
+/// A wavy wall before `photos` cameras 9 degrees apart, every look of which four points far from each other share: its points, its photographs with their
+/// features, and the point of each keypoint.
+fn wall_of_look_alikes(photos: usize) -> (Vec<DVec3>, Vec<PhotoInfo>, Vec<Features>, Vec<Vec<usize>>) {
+    let mut rng = Rng::new(5, 0);
+    let wall: Vec<DVec3> = (0..400)
+        .map(|_| {
+            let [y, z] = [0, 1].map(|_| f64::from(rng.range(-2.0, 2.0)));
+            DVec3::new(0.2 * (2.0 * y).sin(), y, z)
+        })
+        .collect();
+    let looks: Vec<[u8; DESCRIPTOR_BYTES]> = (0..100)
+        .map(|_| {
+            let values: Vec<f32> = (0..DESCRIPTOR_BYTES).map(|_| rng.uniform().powi(3)).collect();
+            let length = values.iter().map(|v| v * v).sum::<f32>().sqrt();
+            std::array::from_fn(|i| (512.0 * values[i] / length).round().min(255.0) as u8)
+        })
+        .collect();
+    let camera = PhotoInfo {
+        name: String::new(),
+        width: CAMERA.width,
+        height: CAMERA.height,
+        group: 0,
+        focal_prior_px: None,
+        up: None,
+        camera: Some(CAMERA),
+        mount: None,
+    };
+    let (mut features, mut shown) = (Vec::new(), Vec::new());
+    for pose in &around(40, 1.0)[..photos] {
+        let here: Vec<usize> = (0..wall.len()).filter(|_| rng.uniform() < 0.8).collect();
+        let place = |point: &usize| {
+            let at = CAMERA.pixel(pose.camera_from_world(wall[*point]));
+            let mut noise = || 0.3 * rng.normal();
+            Keypoint {
+                x: at.x as f32 + noise(),
+                y: at.y as f32 + noise(),
+                scale: 2.0,
+                angle: 0.0,
+            }
+        };
+        features.push(Features {
+            keypoints: here.iter().map(place).collect(),
+            descriptors: here.iter().map(|point| looks[point % looks.len()]).collect(),
+        });
+        shown.push(here);
+    }
+    (wall, vec![camera; photos], features, shown)
+}
+
+#[test]
+fn look_alikes_match_along_the_lines_of_known_poses() {
+    let (wall, photos, features, shown) = wall_of_look_alikes(6);
+    let known = ModelPoint {
+        position: DVec3::new(9.0, 9.0, 9.0),
+        error: 0.5,
+        track: vec![(0, 3), (1, 7)],
+    };
+    let before = Model {
+        cameras: vec![Some(CAMERA)],
+        poses: around(40, 1.0)[..6].iter().copied().map(Some).collect(),
+        points: vec![known],
+        focal_held: vec![true],
+    };
+    let mut model = before.clone();
+    add_guided_points(&photos, &features, &[], &mut model, &MapOptions::default());
+    assert!(model.poses == before.poses && model.cameras == before.cameras);
+    let truth = |(photo, keypoint): &(u32, u32)| shown[*photo as usize][*keypoint as usize];
+    let right = |point: &&ModelPoint| {
+        let of = truth(&point.track[0]);
+        point.track.iter().all(|seen| truth(seen) == of) && point.position.distance(wall[of]) < 0.05
+    };
+    let right = model.points.iter().filter(right).count();
+    assert!(
+        right > 300 && right + 8 > model.points.len(),
+        "{right} of {}",
+        model.points.len()
+    );
+    let of_two = model.points.iter().filter(|point| point.track.len() == 2).count();
+    assert!(of_two > 5, "{of_two}");
+    let mut observations: Vec<(u32, u32)> = model.points.iter().flat_map(|point| point.track.clone()).collect();
+    let all = observations.len();
+    observations.sort_unstable();
+    observations.dedup();
+    assert_eq!(observations.len(), all, "an observation is of one point");
+
+    // Without a third photograph nothing tells look-alikes on a line apart.
+    let mut two = Model {
+        poses: before.poses[..2].to_vec(),
+        ..before.clone()
+    };
+    add_guided_points(&photos[..2], &features[..2], &[], &mut two, &MapOptions::default());
+    assert_eq!(two.points, before.points);
 }
 
 /// Panoramas on a walk through a room, each as the six faces of a cube, with a known camera.

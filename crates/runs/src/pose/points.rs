@@ -8,7 +8,7 @@ use super::output::mean_color;
 use super::stages::max_features;
 use irradia_scene::{Dataset, Lens, PointCloud};
 use irradia_sfm::features::Sift;
-use irradia_sfm::map::{Known, MapOptions, PhotoInfo, extend};
+use irradia_sfm::map::{Known, MapOptions, PhotoInfo, add_guided_points, extend};
 use irradia_sfm::matching::{MatchOptions, PairOptions, candidate_pairs, match_pairs};
 use rayon::prelude::*;
 
@@ -16,6 +16,9 @@ use rayon::prelude::*;
 const PHOTOGRAPHS: usize = 400;
 /// Fewer points than these say little of where surfaces are.
 const FEWEST: usize = 200;
+/// Photographs up to which features are matched along epipolar lines as well. Held-out PSNR of the default run on 12 photographs with known poses, three seeds,
+/// without and with: fox 28.30, 28.70 dB; cup 24.36, 24.80; can 29.12, 28.96; plush bear 26.50, 26.78; plush toy 24.85, 25.16. Of 24 no more than 0.1.
+const GUIDED: usize = 25;
 
 /// Whether points of `dataset` can be found: it has none, nor is it rendered, where what is empty is known and poses may be any.
 pub(crate) fn are_missing(dataset: &Dataset) -> bool {
@@ -52,15 +55,13 @@ pub(crate) fn find_points(dataset: &mut Dataset, larger: Option<&Dataset>) -> Op
     let matching = MatchOptions::default();
     let candidates = candidate_pairs(&features, &PairOptions::default(), &matching);
     let matches = match_pairs(&features, &candidates, &matching, || ());
-    let mut found = extend(
-        &photos,
-        &features,
-        &matches,
-        &known,
-        &MapOptions::default(),
-        &mut |_| (),
-    );
-    let points = found.models.pop().map_or_else(Vec::new, |model| model.points);
+    let options = MapOptions::default();
+    let mut found = extend(&photos, &features, &matches, &known, &options, &mut |_| ());
+    let mut model = found.models.pop()?;
+    if photos.len() <= GUIDED {
+        add_guided_points(&photos, &features, &found.pairs, &mut model, &options);
+    }
+    let points = model.points;
     if points.len() < FEWEST {
         return None;
     }

@@ -12,6 +12,7 @@ mod finish;
 mod fisheye;
 mod focal;
 mod grow;
+mod guide;
 mod metric;
 mod model;
 mod readjust;
@@ -29,6 +30,7 @@ pub use agree::{agreement, contradictions, strengths, telling};
 pub use distance::{Distance, DistanceFit, to_distances};
 pub(crate) use finish::up;
 pub use focal::Source;
+pub use guide::add_guided_points;
 pub use metric::{Metric, to_metres};
 pub(crate) use types::rigs;
 pub use types::{

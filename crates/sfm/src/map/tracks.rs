@@ -34,82 +34,29 @@ pub struct Tracks {
 impl Tracks {
     /// Joins matches, those of pairs with most matches first; a match that would bring two places of one photograph into
     /// a track is dropped: it, or one before, is wrong.
+    ///
+    /// Tracks of two photographs say least and are wrong most often: only photographs with few others have them.
     pub fn new(features: &[Features], pairs: &[VerifiedPair]) -> Self {
-        // Keypoints at one place (a blob with two orientations) are one.
-        let mut first_node = vec![0u32];
-        let mut node_of: Vec<Vec<u32>> = Vec::new();
-        for features in features {
-            let mut order: Vec<u32> = (0..features.keypoints.len() as u32).collect();
-            let place = |i: u32| {
-                let k = &features.keypoints[i as usize];
-                (k.x.to_bits(), k.y.to_bits())
-            };
-            order.sort_by_key(|i| (place(*i), *i));
-            let mut canonical: Vec<u32> = (0..features.keypoints.len() as u32).collect();
-            for pair in order.windows(2) {
-                if place(pair[0]) == place(pair[1]) {
-                    canonical[pair[1] as usize] = canonical[pair[0] as usize];
-                }
-            }
-            let base = *first_node.last().expect("starts with zero");
-            first_node.push(base + canonical.len() as u32);
-            node_of.push(canonical.into_iter().map(|c| base + c).collect());
+        let mut tracks = joined(features, pairs);
+        let mut longer = vec![0usize; features.len()];
+        for member in tracks.iter().filter(|m| m.len() > 2).flatten() {
+            longer[member.photo as usize] += 1;
         }
-        let nodes = *first_node.last().expect("starts with zero") as usize;
-        let mut sets = Sets::new(nodes);
-        let mut order: Vec<usize> = (0..pairs.len()).collect();
-        // Rotation-only pairs last: their wrong matches are the hardest to notice.
-        order.sort_by_key(|i| {
-            let pair = &pairs[*i];
-            (
-                pair.kind == PairKind::Rotation,
-                std::cmp::Reverse(pair.matches.len()),
-                pair.photos,
-            )
-        });
-        for pair in order.into_iter().map(|i| &pairs[i]) {
-            let [a, b] = pair.photos;
-            for [i, j] in &pair.matches {
-                let (i, j) = (node_of[a as usize][*i as usize], node_of[b as usize][*j as usize]);
-                sets.join((i, a), (j, b));
-            }
-        }
-        Self::from_sets(features, &first_node, sets)
+        tracks.retain(|m| m.len() > 2 || m.iter().any(|member| longer[member.photo as usize] < ENOUGH));
+        Self::of(features, tracks)
     }
 
-    fn from_sets(features: &[Features], first_node: &[u32], mut sets: Sets) -> Self {
+    /// As [`Self::new`], with all tracks of two photographs.
+    pub fn complete(features: &[Features], pairs: &[VerifiedPair]) -> Self {
+        Self::of(features, joined(features, pairs))
+    }
+
+    fn of(features: &[Features], members: Vec<Vec<Observation>>) -> Self {
         let mut tracks = Self {
             starts: vec![0],
             of_photo: vec![Vec::new(); features.len()],
             ..Self::default()
         };
-        // Tracks in the order of their first node: members are visited by photograph.
-        let nodes = *first_node.last().expect("starts with zero");
-        let mut track_of_root = vec![u32::MAX; nodes as usize];
-        let mut members: Vec<Vec<Observation>> = Vec::new();
-        for (photo, bounds) in first_node.windows(2).enumerate() {
-            for node in bounds[0]..bounds[1] {
-                let root = sets.find(node);
-                if sets.photos[root as usize].len() < 2 {
-                    continue;
-                }
-                let track = &mut track_of_root[root as usize];
-                if *track == u32::MAX {
-                    *track = members.len() as u32;
-                    members.push(Vec::new());
-                }
-                members[*track as usize].push(Observation {
-                    photo: photo as u32,
-                    keypoint: node - bounds[0],
-                });
-            }
-        }
-        // Tracks of two photographs say least and are wrong most often: only photographs with few others need them.
-        let mut longer = vec![0usize; features.len()];
-        for member in members.iter().filter(|m| m.len() > 2).flatten() {
-            longer[member.photo as usize] += 1;
-        }
-        members.retain(|m| m.len() > 2 || m.iter().any(|member| longer[member.photo as usize] < ENOUGH));
         for (track, members) in members.into_iter().enumerate() {
             for member in members {
                 let keypoint = &features[member.photo as usize].keypoints[member.keypoint as usize];
@@ -134,6 +81,71 @@ impl Tracks {
     pub fn range(&self, track: usize) -> std::ops::Range<usize> {
         self.starts[track] as usize..self.starts[track + 1] as usize
     }
+}
+
+/// The observations of each track, by photograph; tracks in the order of their first.
+fn joined(features: &[Features], pairs: &[VerifiedPair]) -> Vec<Vec<Observation>> {
+    // Keypoints at one place (a blob with two orientations) are one.
+    let mut first_node = vec![0u32];
+    let mut node_of: Vec<Vec<u32>> = Vec::new();
+    for features in features {
+        let mut order: Vec<u32> = (0..features.keypoints.len() as u32).collect();
+        let place = |i: u32| {
+            let k = &features.keypoints[i as usize];
+            (k.x.to_bits(), k.y.to_bits())
+        };
+        order.sort_by_key(|i| (place(*i), *i));
+        let mut canonical: Vec<u32> = (0..features.keypoints.len() as u32).collect();
+        for pair in order.windows(2) {
+            if place(pair[0]) == place(pair[1]) {
+                canonical[pair[1] as usize] = canonical[pair[0] as usize];
+            }
+        }
+        let base = *first_node.last().expect("starts with zero");
+        first_node.push(base + canonical.len() as u32);
+        node_of.push(canonical.into_iter().map(|c| base + c).collect());
+    }
+    let nodes = *first_node.last().expect("starts with zero") as usize;
+    let mut sets = Sets::new(nodes);
+    let mut order: Vec<usize> = (0..pairs.len()).collect();
+    // Rotation-only pairs last: their wrong matches are the hardest to notice.
+    order.sort_by_key(|i| {
+        let pair = &pairs[*i];
+        (
+            pair.kind == PairKind::Rotation,
+            std::cmp::Reverse(pair.matches.len()),
+            pair.photos,
+        )
+    });
+    for pair in order.into_iter().map(|i| &pairs[i]) {
+        let [a, b] = pair.photos;
+        for [i, j] in &pair.matches {
+            let (i, j) = (node_of[a as usize][*i as usize], node_of[b as usize][*j as usize]);
+            sets.join((i, a), (j, b));
+        }
+    }
+    // Tracks in the order of their first node: members are visited by photograph.
+    let nodes = *first_node.last().expect("starts with zero");
+    let mut track_of_root = vec![u32::MAX; nodes as usize];
+    let mut members: Vec<Vec<Observation>> = Vec::new();
+    for (photo, bounds) in first_node.windows(2).enumerate() {
+        for node in bounds[0]..bounds[1] {
+            let root = sets.find(node);
+            if sets.photos[root as usize].len() < 2 {
+                continue;
+            }
+            let track = &mut track_of_root[root as usize];
+            if *track == u32::MAX {
+                *track = members.len() as u32;
+                members.push(Vec::new());
+            }
+            members[*track as usize].push(Observation {
+                photo: photo as u32,
+                keypoint: node - bounds[0],
+            });
+        }
+    }
+    members
 }
 
 /// Disjoint sets of nodes that know their photographs.

@@ -1,0 +1,224 @@
+//! More points of a model whose poses are known, from matches along epipolar lines.
+//!
+//! A feature has few neighbours along a line, so that more of them match than among all features of a photograph, and more of these matches are
+//! wrong. A point on which three photographs agree is right; a point of two counts where points beside it, in both, have its depth.
+
+use super::focal::Source;
+use super::model::Working;
+use super::tracks::Tracks;
+use super::types::{Known, MapOptions, Model, ModelPoint, PairKind, PhotoInfo, VerifiedPair};
+use super::{finish, verify};
+use crate::geometry::camera::DCamera;
+use crate::geometry::essential::Motion;
+use crate::geometry::pose::DPose;
+use crate::matching::{MatchOptions, TwoView, match_guided};
+use crate::{Features, Keypoint};
+use glam::{DMat3, DVec2, DVec3};
+use rayon::prelude::*;
+use std::collections::HashSet;
+
+/// Largest distance of a match from its epipolar line, px: the poses are known.
+const OFF_LINE: f64 = 1.0;
+/// As [`MatchOptions::ratio`], along lines.
+const RATIO: f32 = 0.75;
+/// Photographs whose axes are farther apart than this are not matched, degrees.
+const WIDEST: f64 = 70.0;
+/// Photographs that see a point which needs no others beside it.
+const CERTAIN: usize = 3;
+/// Points beside another are within this distance of it, by the photograph's longer side; the nearest of them, and the fewest that tell its depth.
+const BESIDE: f64 = 0.1;
+const NEAREST: usize = 5;
+const FEWEST: usize = 3;
+/// The fraction by which a depth may be outside the range of those beside it.
+const SLACK: f64 = 0.1;
+
+/// Adds points to `model`, and observations to those that it has; its cameras and poses stay as they are. It was made of `photos`, `features` and
+/// `pairs`.
+///
+/// # Panics
+/// When `features` and `photos` differ in length, or are not those of `model`.
+pub fn add_guided_points(
+    photos: &[PhotoInfo],
+    features: &[Features],
+    pairs: &[VerifiedPair],
+    model: &mut Model,
+    options: &MapOptions,
+) {
+    assert_eq!(photos.len(), features.len(), "one set of features a photograph");
+    let guided = guided_pairs(photos, features, model);
+    let tracks = Tracks::complete(features, &[&guided, pairs].concat());
+    // Groups without a camera have no photograph in the model.
+    let camera = |camera: &Option<DCamera>| (camera.unwrap_or(DCamera::centered(1, 1, 1.0)), Source::Prior);
+    let cameras: verify::Cameras = model.cameras.iter().map(camera).collect();
+    let mut working = Working::new(photos, &cameras, &tracks, options);
+    working.hold(&Known {
+        poses: model.poses.clone(),
+        cameras: model.cameras.clone(),
+    });
+    let found = finish::collected(&working, photos).points;
+    let (certain, of_two): (Vec<_>, Vec<_>) = found.into_iter().partition(|point| point.track.len() >= CERTAIN);
+    let before = std::mem::replace(&mut model.points, certain);
+    let new = unseen(&model.points, before);
+    model.points.extend(new);
+    let depths = known_depths(photos, features, model);
+    let agrees = |point: &ModelPoint| agrees(point, photos, features, model, &depths);
+    let new: Vec<ModelPoint> = unseen(&model.points, of_two).into_iter().filter(agrees).collect();
+    model.points.extend(new);
+}
+
+/// Those of `more` whose observations are none of those of `points`.
+fn unseen(points: &[ModelPoint], more: Vec<ModelPoint>) -> Vec<ModelPoint> {
+    let seen: HashSet<&(u32, u32)> = points.iter().flat_map(|point| &point.track).collect();
+    more.into_iter()
+        .filter(|point| !point.track.iter().any(|observation| seen.contains(observation)))
+        .collect()
+}
+
+/// A photograph of the model as a pinhole shows it.
+struct Ideal {
+    photo: u32,
+    pose: DPose,
+    /// From pixels to the plane z = 1.
+    inverse: DMat3,
+    features: Features,
+}
+
+impl Ideal {
+    fn new(photo: usize, features: &Features, camera: &DCamera, pose: DPose) -> Self {
+        let [fx, fy, cx, cy, ..] = camera.parameters;
+        let place = |keypoint: &Keypoint| {
+            // What no pinhole shows is far from all lines.
+            let at = camera.unproject(pixel(keypoint)).unwrap_or(DVec2::splat(1e6));
+            Keypoint {
+                x: (at.x * fx + cx) as f32,
+                y: (at.y * fy + cy) as f32,
+                ..*keypoint
+            }
+        };
+        Self {
+            photo: photo as u32,
+            pose,
+            inverse: DMat3::from_cols(
+                DVec3::new(1.0 / fx, 0.0, 0.0),
+                DVec3::new(0.0, 1.0 / fy, 0.0),
+                DVec3::new(-cx / fx, -cy / fy, 1.0),
+            ),
+            features: Features {
+                keypoints: features.keypoints.iter().map(place).collect(),
+                descriptors: features.descriptors.clone(),
+            },
+        }
+    }
+
+    /// A keypoint on the plane z = 1.
+    fn on_plane(&self, keypoint: u32) -> DVec2 {
+        let at = pixel(&self.features.keypoints[keypoint as usize]);
+        (self.inverse * at.extend(1.0)).truncate()
+    }
+}
+
+fn pixel(keypoint: &Keypoint) -> DVec2 {
+    DVec2::new(keypoint.x.into(), keypoint.y.into())
+}
+
+/// The matches along epipolar lines of all pairs of the model's photographs that look in similar directions, in front of both.
+fn guided_pairs(photos: &[PhotoInfo], features: &[Features], model: &Model) -> Vec<VerifiedPair> {
+    let ideal = |photo: usize| {
+        let camera = model.cameras[photos[photo].group].as_ref()?;
+        Some(Ideal::new(photo, &features[photo], camera, model.poses[photo]?))
+    };
+    let posed: Vec<Ideal> = (0..photos.len()).into_par_iter().filter_map(ideal).collect();
+    let options = MatchOptions {
+        ratio: RATIO,
+        ..MatchOptions::default()
+    };
+    let all: Vec<[&Ideal; 2]> = posed
+        .iter()
+        .enumerate()
+        .flat_map(|(i, a)| posed[i + 1..].iter().map(move |b| [a, b]))
+        .collect();
+    all.into_par_iter()
+        .filter_map(|pair| guided_pair(pair, &options))
+        .collect()
+}
+
+/// `None` for photographs taken from one place, or in directions that differ too much.
+fn guided_pair([a, b]: [&Ideal; 2], options: &MatchOptions) -> Option<VerifiedPair> {
+    let [toward_a, toward_b] = [a, b].map(|photo| photo.pose.rotation * DVec3::Z);
+    if toward_a.dot(toward_b) < WIDEST.to_radians().cos() {
+        return None;
+    }
+    let to_b = b.pose.rotation.inverse();
+    let motion = Motion {
+        rotation: (to_b * a.pose.rotation).normalize(),
+        translation: (to_b * (a.pose.position - b.pose.position)).try_normalize()?,
+    };
+    let lines = TwoView::Fundamental(b.inverse.transpose() * motion.essential() * a.inverse);
+    let mut matches = match_guided(&a.features, &b.features, &lines, OFF_LINE, options);
+    matches.retain(|[i, j]| {
+        motion
+            .depths([a.on_plane(*i), b.on_plane(*j)])
+            .iter()
+            .all(|depth| *depth > 0.0)
+    });
+    Some(VerifiedPair {
+        photos: [a.photo, b.photo],
+        matches,
+        kind: PairKind::General,
+        motion,
+        angle: toward_a.angle_between(toward_b),
+    })
+}
+
+/// `[photos]` where each shows points of the model, px, and their depths.
+fn known_depths(photos: &[PhotoInfo], features: &[Features], model: &Model) -> Vec<Vec<(DVec2, f64)>> {
+    let mut depths = vec![Vec::new(); photos.len()];
+    for point in &model.points {
+        for observation in &point.track {
+            let known = seen_at(point, *observation, features, model);
+            depths[observation.0 as usize].extend(known);
+        }
+    }
+    depths
+}
+
+/// Where a photograph shows `point`, px, and its depth.
+fn seen_at(
+    point: &ModelPoint,
+    (photo, keypoint): (u32, u32),
+    features: &[Features],
+    model: &Model,
+) -> Option<(DVec2, f64)> {
+    let at = pixel(&features[photo as usize].keypoints[keypoint as usize]);
+    let pose = model.poses[photo as usize].as_ref()?;
+    Some((at, pose.camera_from_world(point.position).z))
+}
+
+/// Whether the depth of `point` is that of what is beside it in each photograph.
+fn agrees(
+    point: &ModelPoint,
+    photos: &[PhotoInfo],
+    features: &[Features],
+    model: &Model,
+    depths: &[Vec<(DVec2, f64)>],
+) -> bool {
+    point.track.iter().all(|observation| {
+        let photo = &photos[observation.0 as usize];
+        let Some((at, depth)) = seen_at(point, *observation, features, model) else {
+            return false;
+        };
+        let reach = BESIDE * f64::from(photo.width.max(photo.height));
+        let mut beside: Vec<(f64, f64)> = depths[observation.0 as usize]
+            .iter()
+            .map(|(other, depth)| (other.distance_squared(at), *depth))
+            .filter(|(distance2, _)| *distance2 < reach * reach)
+            .collect();
+        beside.sort_by(|a, b| a.0.total_cmp(&b.0));
+        beside.truncate(NEAREST);
+        let range = beside.iter().fold([f64::INFINITY, 0.0], |[low, high], (_, depth)| {
+            [depth.min(low), depth.max(high)]
+        });
+        let within = range[0] * (1.0 - SLACK)..range[1] * (1.0 + SLACK);
+        beside.len() >= FEWEST && within.contains(&depth)
+    })
+}

@@ -32,8 +32,8 @@ const FEWEST: usize = 3;
 /// The fraction by which a depth may be outside the range of those beside it.
 const SLACK: f64 = 0.1;
 
-/// Adds points to `model`, and observations to those that it has; its cameras and poses stay as they are. It was made of `photos`, `features` and
-/// `pairs`.
+/// Adds points to `model`, which was made of `photos`, `features` and `pairs`. Points that it has give way to those of three photographs or more that share
+/// an observation with them; its cameras and poses stay as they are.
 ///
 /// # Panics
 /// When `features` and `photos` differ in length, or are not those of `model`.
@@ -166,6 +166,7 @@ fn guided_pair([a, b]: [&Ideal; 2], options: &MatchOptions) -> Option<VerifiedPa
         matches,
         kind: PairKind::General,
         motion,
+        // Of the axes: tracks ask for matches only.
         angle: toward_a.angle_between(toward_b),
     })
 }

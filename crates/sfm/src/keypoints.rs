@@ -1,3 +1,5 @@
+use glam::DVec2;
+
 /// Bytes of a descriptor: 4 x 4 cells of 8 orientations.
 pub const DESCRIPTOR_BYTES: usize = 128;
 
@@ -12,6 +14,13 @@ pub struct Keypoint {
     pub scale: f32,
     /// Direction of the dominant gradient, radians from +x towards +y.
     pub angle: f32,
+}
+
+impl Keypoint {
+    /// Its place, pixels.
+    pub fn at(&self) -> DVec2 {
+        DVec2::new(self.x.into(), self.y.into())
+    }
 }
 
 /// Keypoints of one photograph and their descriptors.

@@ -97,8 +97,7 @@ fn on_plane<'a>(pair: &VerifiedPair, features: &[Features], camera: &dyn Fn(usiz
     let thin = pair.matches.len().div_ceil(MATCHES).max(1);
     let place = |side: usize, keypoint: u32| {
         let photo = pair.photos[side] as usize;
-        let k = features[photo].keypoints[keypoint as usize];
-        camera(photo).unproject(DVec2::new(k.x.into(), k.y.into()))
+        camera(photo).unproject(features[photo].keypoints[keypoint as usize].at())
     };
     let matches = pair.matches.iter().step_by(thin);
     matches

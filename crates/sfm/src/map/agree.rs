@@ -67,8 +67,8 @@ pub fn agreement(
 fn on_planes(pair: &VerifiedPair, features: &[Features], cameras: [&DCamera; 2]) -> Vec<[DVec2; 2]> {
     let thin = pair.matches.len().div_ceil(MATCHES).max(1);
     let place = |side: usize, keypoint: u32| {
-        let k = features[pair.photos[side] as usize].keypoints[keypoint as usize];
-        cameras[side].unproject(DVec2::new(k.x.into(), k.y.into()))
+        let features = &features[pair.photos[side] as usize];
+        cameras[side].unproject(features.keypoints[keypoint as usize].at())
     };
     let matches = pair.matches.iter().step_by(thin);
     matches

@@ -88,7 +88,7 @@ impl Ideal {
         let [fx, fy, cx, cy, ..] = camera.parameters;
         let place = |keypoint: &Keypoint| {
             // What no pinhole shows is far from all lines.
-            let at = camera.unproject(pixel(keypoint)).unwrap_or(DVec2::splat(1e6));
+            let at = camera.unproject(keypoint.at()).unwrap_or(DVec2::splat(1e6));
             Keypoint {
                 x: (at.x * fx + cx) as f32,
                 y: (at.y * fy + cy) as f32,
@@ -112,13 +112,9 @@ impl Ideal {
 
     /// A keypoint on the plane z = 1.
     fn on_plane(&self, keypoint: u32) -> DVec2 {
-        let at = pixel(&self.features.keypoints[keypoint as usize]);
+        let at = self.features.keypoints[keypoint as usize].at();
         (self.inverse * at.extend(1.0)).truncate()
     }
-}
-
-fn pixel(keypoint: &Keypoint) -> DVec2 {
-    DVec2::new(keypoint.x.into(), keypoint.y.into())
 }
 
 /// The matches along epipolar lines of all pairs of the model's photographs that look in similar directions, in front of both.
@@ -148,10 +144,9 @@ fn guided_pair([a, b]: [&Ideal; 2], options: &MatchOptions) -> Option<VerifiedPa
     if toward_a.dot(toward_b) < WIDEST.to_radians().cos() {
         return None;
     }
-    let to_b = b.pose.rotation.inverse();
     let motion = Motion {
-        rotation: (to_b * a.pose.rotation).normalize(),
-        translation: (to_b * (a.pose.position - b.pose.position)).try_normalize()?,
+        rotation: (b.pose.rotation.inverse() * a.pose.rotation).normalize(),
+        translation: b.pose.camera_from_world(a.pose.position).try_normalize()?,
     };
     let lines = TwoView::Fundamental(b.inverse.transpose() * motion.essential() * a.inverse);
     let mut matches = match_guided(&a.features, &b.features, &lines, OFF_LINE, options);
@@ -190,7 +185,7 @@ fn seen_at(
     features: &[Features],
     model: &Model,
 ) -> Option<(DVec2, f64)> {
-    let at = pixel(&features[photo as usize].keypoints[keypoint as usize]);
+    let at = features[photo as usize].keypoints[keypoint as usize].at();
     let pose = model.poses[photo as usize].as_ref()?;
     Some((at, pose.camera_from_world(point.position).z))
 }

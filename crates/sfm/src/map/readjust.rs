@@ -3,7 +3,6 @@
 use super::types::{Model, PhotoInfo};
 use crate::Features;
 use crate::adjust::{AdjustOptions, AdjustedCamera, Loss, Observation, Problem, View};
-use glam::DVec2;
 
 /// Observations of a photograph, from long tracks, that are adjusted.
 const ENOUGH: usize = 200;
@@ -36,10 +35,9 @@ pub(super) fn problem(
     for point in covering(model, photos.len()) {
         let point = &model.points[point];
         for (photo, keypoint) in &point.track {
-            let k = &features[*photo as usize].keypoints[*keypoint as usize];
             problem.observations.push(Observation {
                 view: number[*photo as usize],
-                at: DVec2::new(k.x.into(), k.y.into()),
+                at: features[*photo as usize].keypoints[*keypoint as usize].at(),
             });
         }
         problem.points.push(point.position);

@@ -63,9 +63,7 @@ impl Tracks {
                 tracks.of_photo[member.photo as usize].push(tracks.observations.len() as u32);
                 tracks.observations.push(member);
                 tracks.track_of.push(track as u32);
-                tracks
-                    .pixels
-                    .push(DVec2::new(f64::from(keypoint.x), f64::from(keypoint.y)));
+                tracks.pixels.push(keypoint.at());
             }
             tracks.starts.push(tracks.observations.len() as u32);
         }

@@ -98,9 +98,8 @@ pub(super) fn seed_of(pair: &PairMatches) -> u64 {
     u64::from(pair.photos[0]) << 32 | u64::from(pair.photos[1])
 }
 
-pub(super) fn pixel(features: &Features, keypoint: u32) -> DVec2 {
-    let k = &features.keypoints[keypoint as usize];
-    DVec2::new(f64::from(k.x), f64::from(k.y))
+fn pixel(features: &Features, keypoint: u32) -> DVec2 {
+    features.keypoints[keypoint as usize].at()
 }
 
 fn long_side(photo: &PhotoInfo) -> f64 {

@@ -54,7 +54,7 @@ fn main() {
             .collect();
         features.push(Features {
             keypoints,
-            descriptors: Vec::new(),
+            ..Features::default()
         });
     }
     for _ in 0..file.u32() {

@@ -30,7 +30,13 @@ pub struct Features {
     pub keypoints: Vec<Keypoint>,
     /// `[N, 128]` RootSIFT, bytes: 512 times the square root of the L1-normalised histogram, at most 255.
     pub descriptors: Vec<[u8; DESCRIPTOR_BYTES]>,
+    /// `[N, 128]` of the same kind, of each feature's surroundings as they look from the front, whatever the tilt; empty unless the extractor was asked for
+    /// them.
+    pub frontal: Vec<[u8; DESCRIPTOR_BYTES]>,
 }
+
+/// The descriptor of what has none: it matches nothing.
+pub(crate) const NO_DESCRIPTOR: [u8; DESCRIPTOR_BYTES] = [0; DESCRIPTOR_BYTES];
 
 /// Corresponding features of two photographs.
 #[derive(Clone, Debug, Default, PartialEq)]

@@ -115,6 +115,42 @@ fn a_photograph_turned_by_90_degrees_has_the_same_features() {
 }
 
 #[test]
+fn a_tilted_view_matches_as_it_looks_from_the_front() {
+    let shade = texture(300.0);
+    let frontal = Sift {
+        frontal: true,
+        ..Sift::default()
+    };
+    let [upright, tilted] = [
+        Picture::new(300, 300, &shade),
+        // Seen at 70 degrees from the front: a third of the width remains.
+        Picture::new(100, 300, |x, y| shade(3.0 * x, y)),
+    ]
+    .map(|picture| frontal.extract(&picture.photo()));
+    let right = |matches: Vec<[u32; 2]>| {
+        let is_right = |m: &&[u32; 2]| {
+            let (a, b) = (&upright.keypoints[m[0] as usize], &tilted.keypoints[m[1] as usize]);
+            (a.x - 3.0 * b.x).abs() < 9.0 && (a.y - b.y).abs() < 3.0
+        };
+        (matches.iter().filter(is_right).count(), matches.len())
+    };
+    let options = MatchOptions::default();
+    let usual = |features: &Features| Features {
+        frontal: Vec::new(),
+        ..features.clone()
+    };
+    let (without, _) = right(match_features(&usual(&upright), &usual(&tilted), &options));
+    let (with, all) = right(match_features(&upright, &tilted, &options));
+    assert!(with >= 20 + 3 * without, "{with} right matches, without {without}");
+    assert!(10 * with >= 9 * all, "{with} of {all} are right");
+    // What has no second view keeps its matches.
+    assert!(
+        !usual(&upright).keypoints.is_empty()
+            && right(match_features(&upright, &usual(&tilted), &options)).0 == without
+    );
+}
+
+#[test]
 fn a_turned_and_enlarged_photograph_has_its_features_at_the_mapped_places() {
     let shade = texture(300.0);
     let upright = Picture::new(300, 300, &shade).features();

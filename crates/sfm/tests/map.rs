@@ -8,9 +8,9 @@ use irradia_sfm::geometry::camera::DCamera;
 use irradia_sfm::geometry::pose::DPose;
 use irradia_sfm::map::{
     Distance, Known, MapOptions, Model, ModelPoint, Mount, PairKind, PhotoInfo, Reason, Reconstruction,
-    add_guided_points, agreement, extend, reconstruct, to_distances,
+    add_guided_points, agreement, extend, reconstruct, to_distances, verify,
 };
-use irradia_sfm::{DESCRIPTOR_BYTES, Features, Keypoint};
+use irradia_sfm::{DESCRIPTOR_BYTES, Features, Keypoint, PairMatches};
 use std::f64::consts::{FRAC_PI_2, PI};
 use world::{CAMERA, World, around, look};
 
@@ -160,10 +160,42 @@ fn wall_of_look_alikes(photos: usize) -> (Vec<DVec3>, Vec<PhotoInfo>, Vec<Featur
         features.push(Features {
             keypoints: here.iter().map(place).collect(),
             descriptors: here.iter().map(|point| looks[point % looks.len()]).collect(),
+            frontal: Vec::new(),
         });
         shown.push(here);
     }
     (wall, vec![camera; photos], features, shown)
+}
+
+#[test]
+fn a_verified_pair_gains_the_look_alikes_along_its_lines() {
+    let (_, photos, features, shown) = wall_of_look_alikes(2);
+    let right = |[i, j]: &[u32; 2]| shown[0][*i as usize] == shown[1][*j as usize];
+    let all: Vec<[u32; 2]> = (0..shown[0].len() as u32)
+        .flat_map(|i| (0..shown[1].len() as u32).map(move |j| [i, j]))
+        .filter(right)
+        .collect();
+    let pairs = [PairMatches {
+        photos: [0, 1],
+        matches: all.iter().step_by(8).copied().collect(),
+    }];
+    let matches = |guided: bool| {
+        let options = MapOptions {
+            guided,
+            ..MapOptions::default()
+        };
+        let (_, mut verified) = verify(&photos, &features, &pairs, &options, &mut |_| ());
+        verified.remove(0).matches
+    };
+    let (given, guided) = (matches(false), matches(true));
+    assert!(given.len() <= pairs[0].matches.len());
+    let right = guided.iter().filter(|pair| right(pair)).count();
+    assert!(
+        right > 5 * given.len() && 20 * right > 19 * guided.len(),
+        "{right} of {} are right, {} without lines",
+        guided.len(),
+        given.len()
+    );
 }
 
 #[test]

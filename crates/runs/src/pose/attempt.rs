@@ -1,4 +1,4 @@
-//! From photographs to models, once with so many features.
+//! From photographs to models, once with such features.
 
 use super::capture::Capture;
 use super::known::KnownPoses;
@@ -6,12 +6,14 @@ use super::stages::Work;
 use super::{AttemptReport, Clock, ENOUGH_POSED, PoseInput, PoseProgress};
 use crate::RunError;
 use irradia_sfm::PairMatches;
-use irradia_sfm::map::{PhotoInfo, Progress, Reconstruction, extend, reconstruct};
+use irradia_sfm::map::{MapOptions, PhotoInfo, Progress, Reconstruction, extend, reconstruct};
 use irradia_sfm::matching::PairOptions;
 use std::path::Path;
 
 /// Frames after each frame of a film that it is matched with in any case.
 const FILM_SUCCESSORS: usize = 10;
+/// Up to so many photographs each should have a pose: every one is missed, and a second attempt takes seconds.
+const FEW: usize = 25;
 
 /// What was found.
 pub(super) struct Attempt<'a> {
@@ -54,7 +56,7 @@ impl<'a> Attempt<'a> {
         let options = &input.mapping;
         let is_new = known.is_none();
         let mut reconstruction = match known {
-            None => reconstruct(&infos, work.features(), &pairs, options, &mut tell),
+            None => models(&work, &infos, &pairs, options, &mut tell),
             Some(known) => {
                 let known = known.of(&mut infos)?;
                 extend(&infos, work.features(), &pairs, &known, options, &mut tell)
@@ -66,7 +68,7 @@ impl<'a> Attempt<'a> {
             let mut all: Vec<[u32; 2]> = pairs.iter().map(|pair| pair.photos).chain(unmatched).collect();
             all.sort_unstable();
             pairs = work.matches_of(all)?;
-            reconstruction = reconstruct(&infos, work.features(), &pairs, options, &mut tell);
+            reconstruction = models(&work, &infos, &pairs, options, &mut tell);
         }
         clock.end("poses");
         Ok(Self {
@@ -79,27 +81,66 @@ impl<'a> Attempt<'a> {
 
     /// Photographs with a pose in the largest model.
     pub fn registered(&self) -> usize {
-        self.reconstruction.models.first().map_or(0, |model| model.registered())
+        registered(&self.reconstruction)
     }
 
     /// For the report.
     pub fn report(&self) -> AttemptReport {
         AttemptReport {
-            max_features: self.work.max_features(),
+            max_features: self.work.sift().max_features,
+            frontal: self.work.sift().frontal,
             registered: self.registered(),
             warnings: self.work.warnings().to_vec(),
         }
     }
 
-    /// The same photographs, to be searched for more features, if too few of them have a pose and more can be found in most of the others. Parts that look
-    /// alike and are mapped apart would only be taken for one another again.
-    pub fn with_more_features(&self, out: &Path) -> Option<Work<'a>> {
+    /// The same photographs, to be matched with frontal descriptors and along epipolar lines, if too few of them have a pose. Parts that look alike and are
+    /// mapped apart would only be taken for one another again.
+    pub fn again(&self, wanted: Option<usize>, out: &Path) -> Option<Work<'a>> {
         let photos = self.work.photos().len();
-        if self.registered() as f64 >= ENOUGH_POSED * photos as f64 || self.reconstruction.apart.is_some() {
+        if self.registered() >= enough(photos) || self.reconstruction.apart.is_some() {
             return None;
         }
         let posed = self.reconstruction.models.first().map(|model| &model.poses);
         let left_out = (0..photos).filter(|i| posed.is_none_or(|poses| poses[*i].is_none()));
-        self.work.with_more_features(left_out, out)
+        Some(self.work.again(wanted, &left_out.collect::<Vec<_>>(), out))
+    }
+}
+
+/// Photographs of the largest model.
+fn registered(found: &Reconstruction) -> usize {
+    found.models.first().map_or(0, |model| model.registered())
+}
+
+/// How many of so many photographs should have a pose.
+fn enough(photos: usize) -> usize {
+    match photos {
+        ..=FEW => photos,
+        _ => (ENOUGH_POSED * photos as f64).ceil() as usize,
+    }
+}
+
+/// Models of photographs without poses. In a second attempt, matches along epipolar lines join where too few photographs have a pose without them: where a
+/// model holds, these weak matches may break it.
+fn models(
+    work: &Work,
+    infos: &[PhotoInfo],
+    pairs: &[PairMatches],
+    options: &MapOptions,
+    tell: &mut dyn FnMut(Progress),
+) -> Reconstruction {
+    let found = reconstruct(infos, work.features(), pairs, options, tell);
+    if !work.sift().frontal || registered(&found) >= enough(infos.len()) {
+        return found;
+    }
+    let guided = MapOptions {
+        guided: true,
+        ..*options
+    };
+    let again = reconstruct(infos, work.features(), pairs, &guided, tell);
+    if registered(&again) > registered(&found) {
+        again
+    } else {
+        found
     }
 }

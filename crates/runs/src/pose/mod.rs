@@ -6,7 +6,7 @@
 //! sparse/0/*.bin   cameras, poses and points with tracks, in COLMAP's format; further models in sparse/1, ..
 //! pose.json        what happened: numbers, times, and each photograph left out with its reason
 //! doctor.html      what is wrong with the capture, and where to take further photographs; doctor.json and doctor/*.png belong to it
-//! features.bin     features and matches, which are reused as long as photographs do not change; features-more.bin, where they had to be more
+//! features.bin     features and matches, which are reused as long as photographs do not change; features-more.bin: those of a second attempt
 //! ```
 
 mod attempt;
@@ -42,7 +42,7 @@ pub use doctor::{DoctorInput, DoctorReport, Finding, doctor};
 use film::is_film;
 pub(crate) use points::{are_missing, find_points};
 
-/// The fraction of the photographs that should have a pose: below it, more features are tried, and no training begins unasked.
+/// The fraction of the photographs that should have a pose: below it, a second attempt is made, and no training begins unasked.
 pub const ENOUGH_POSED: f64 = 0.8;
 /// Fewer photographs make no dataset.
 const MIN_PHOTOS: usize = 3;
@@ -140,7 +140,7 @@ pub struct PoseReport {
     pub scale: Option<ScaleReport>,
     /// Its cameras.
     pub cameras: Vec<CameraReport>,
-    /// What was tried: a second time, with more features, where too few photographs had a pose. The one with more poses was written.
+    /// What was tried: a second time, with frontal descriptors, where too few photographs had a pose. The one with more poses was written.
     pub attempts: Vec<AttemptReport>,
     /// Pairs of photographs that were matched.
     pub pairs: usize,
@@ -161,6 +161,8 @@ pub struct PoseReport {
 pub struct AttemptReport {
     /// The most features of a photograph.
     pub max_features: usize,
+    /// Whether features were also matched as they look from the front.
+    pub frontal: bool,
     /// Photographs with a pose in its largest model.
     pub registered: usize,
     /// What it warned of.
@@ -224,7 +226,7 @@ pub struct StageReport {
 }
 
 /// Finds the poses of photographs and writes them as a dataset. Features and matches of an earlier call are reused. Where fewer than [`ENOUGH_POSED`] of
-/// the photographs have a pose at first, and `max_features` is not given, it tries again with twice as many, and the larger model counts. The result
+/// the photographs have a pose at first, or any of up to 25 has none, it tries again with frontal descriptors, and the larger model counts. The result
 /// depends neither on the number of threads nor on the order of the files.
 ///
 /// # Errors
@@ -295,15 +297,12 @@ pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Resu
     let work = Work::new(input.max_features, Some(out), folder, progress);
     let mut attempt = Attempt::make(work, input, &capture, known, &mut clock, progress)?;
     let mut attempts = vec![attempt.report()];
-    if is_new
-        && input.max_features.is_none()
-        && let Some(work) = attempt.with_more_features(out)
-    {
+    if is_new && let Some(work) = attempt.again(input.max_features, out) {
+        let most = work.sift().max_features;
         progress(PoseProgress::Warned(format!(
-            "{} of {} photographs have a pose: trying again with up to {} features of each",
+            "{} of {} photographs have a pose: trying again with up to {most} features of each, matched from the front and along epipolar lines",
             attempt.registered(),
             folder.photos.len(),
-            work.max_features()
         )));
         let again = Attempt::make(work, input, &capture, None, &mut clock, progress)?;
         attempts.push(again.report());

@@ -1,7 +1,7 @@
 //! Features and matches, with those of an earlier call.
 
 use super::PoseProgress;
-use super::store::{self, Known, Looks};
+use super::store::{self, Known, Looks, Settings};
 use crate::RunError;
 use irradia_formats::{PhotoEntry, PhotoFolder, Pixels};
 use irradia_sfm::doctor::Appearance;
@@ -13,7 +13,7 @@ use std::collections::HashSet;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicUsize, Ordering};
 
-/// The file of features and matches, and of more of them.
+/// The file of features and matches, and of those of a second attempt.
 const STORE: &str = "features.bin";
 const STORE_OF_MORE: &str = "features-more.bin";
 
@@ -34,7 +34,7 @@ pub(super) struct Work<'a> {
     progress: &'a (dyn Fn(PoseProgress) + Sync),
     /// Where features and matches are kept, if they are.
     path: Option<PathBuf>,
-    settings: [u32; 4],
+    settings: Settings,
     sift: Sift,
     known: Known,
     /// Indices of the folder's photographs that could be decoded.
@@ -57,38 +57,44 @@ impl<'a> Work<'a> {
         folder: &'a PhotoFolder,
         progress: &'a (dyn Fn(PoseProgress) + Sync),
     ) -> Self {
-        let most = max_features(wanted, folder.photos.len());
-        Self::with(most, out.map(|out| out.join(STORE)), folder, progress)
+        let sift = Sift {
+            max_features: max_features(wanted, folder.photos.len()),
+            ..Sift::default()
+        };
+        Self::with(sift, out.map(|out| out.join(STORE)), folder, progress)
     }
 
-    /// The same photographs with twice the features, if half of those `left_out` or more have as many as were allowed.
-    pub fn with_more_features(&self, left_out: impl Iterator<Item = usize>, out: &Path) -> Option<Self> {
+    /// The same photographs for a second attempt: with frontal descriptors and, unless their number was wanted, with twice the features if half of those
+    /// `left_out` or more have as many as were allowed.
+    pub fn again(&self, wanted: Option<usize>, left_out: &[usize], out: &Path) -> Self {
         let most = self.sift.max_features;
-        let (mut full, mut all) = (0, 0);
-        for photo in left_out {
-            full += usize::from(self.features[photo].keypoints.len() >= most);
-            all += 1;
-        }
-        let has_more = all > 0 && 2 * full >= all;
-        has_more.then(|| Self::with(2 * most, Some(out.join(STORE_OF_MORE)), self.folder, self.progress))
+        let full = left_out
+            .iter()
+            .filter(|photo| self.features[**photo].keypoints.len() >= most);
+        let more = wanted.is_none() && 2 * full.count() >= left_out.len();
+        let sift = Sift {
+            max_features: if more { 2 * most } else { most },
+            frontal: true,
+            ..self.sift.clone()
+        };
+        Self::with(sift, Some(out.join(STORE_OF_MORE)), self.folder, self.progress)
     }
 
     fn with(
-        max_features: usize,
+        sift: Sift,
         path: Option<PathBuf>,
         folder: &'a PhotoFolder,
         progress: &'a (dyn Fn(PoseProgress) + Sync),
     ) -> Self {
-        let sift = Sift {
-            max_features,
-            ..Sift::default()
+        let settings = Settings {
+            extractor: [
+                sift.max_side,
+                sift.max_features as u32,
+                sift.peak_threshold.to_bits(),
+                sift.edge_threshold.to_bits(),
+            ],
+            frontal: sift.frontal,
         };
-        let settings = [
-            sift.max_side,
-            sift.max_features as u32,
-            sift.peak_threshold.to_bits(),
-            sift.edge_threshold.to_bits(),
-        ];
         let (known, warning) = path
             .as_ref()
             .map(|path| store::read(path, settings))
@@ -112,9 +118,9 @@ impl<'a> Work<'a> {
         work
     }
 
-    /// The most features of a photograph.
-    pub fn max_features(&self) -> usize {
-        self.sift.max_features
+    /// How features are found.
+    pub fn sift(&self) -> &Sift {
+        &self.sift
     }
 
     fn warn(&mut self, warning: Option<String>) {

@@ -1,7 +1,8 @@
 //! Features and matches on disk, by the hash of the photographs' bytes: renamed photographs keep theirs, changed ones lose them.
 //!
 //! Little-endian: the signature; the settings; u64 photographs, each u64 hash, four `f32` of its appearance, u64 features, each
-//! `f32 x, y, scale, angle`, the descriptor and `r, g, b`; u64 pairs, each the hashes of both photographs, u64 matches, each `u32, u32`.
+//! `f32 x, y, scale, angle`, the descriptor, the frontal one if there are such, and `r, g, b`; u64 pairs, each the hashes of both photographs, u64 matches,
+//! each `u32, u32`.
 
 use irradia_formats::{FormatError, write_atomic};
 use irradia_sfm::doctor::Appearance;
@@ -11,9 +12,26 @@ use std::io::{self, Write};
 use std::path::Path;
 
 /// Ends in the version of everything that features and matches depend on beside the settings.
-const SIGNATURE: &[u8; 16] = b"irradia.sfm 0002";
-/// Bytes of a feature.
-const FEATURE: usize = 16 + DESCRIPTOR_BYTES + 3;
+const SIGNATURE: &[u8; 16] = b"irradia.sfm 0003";
+/// What features depend on: settings of their extractor, and whether they have frontal descriptors.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(super) struct Settings {
+    pub extractor: [u32; 4],
+    pub frontal: bool,
+}
+
+impl Settings {
+    fn header(self) -> Vec<u8> {
+        let settings = self.extractor.into_iter().chain([self.frontal.into()]);
+        let settings = settings.flat_map(u32::to_le_bytes);
+        SIGNATURE.iter().copied().chain(settings).collect()
+    }
+
+    /// Bytes of a feature.
+    fn feature(self) -> usize {
+        16 + DESCRIPTOR_BYTES * (1 + usize::from(self.frontal)) + 3
+    }
+}
 
 /// The features of a photograph, the colours there, and figures of its pixels.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -35,14 +53,14 @@ pub(super) struct Known {
 }
 
 /// The content of the file at `path` if it was written under the same `settings`, else nothing; a warning if it is damaged.
-pub(super) fn read(path: &Path, settings: [u32; 4]) -> (Known, Option<String>) {
+pub(super) fn read(path: &Path, settings: Settings) -> (Known, Option<String>) {
     let Ok(bytes) = std::fs::read(path) else {
         return Default::default();
     };
-    let Some(rest) = bytes.strip_prefix(&header(settings)[..]) else {
+    let Some(rest) = bytes.strip_prefix(&settings.header()[..]) else {
         return Default::default();
     };
-    match parse(rest) {
+    match parse(rest, settings) {
         Some(known) => (known, None),
         None => (
             Known::default(),
@@ -51,26 +69,18 @@ pub(super) fn read(path: &Path, settings: [u32; 4]) -> (Known, Option<String>) {
     }
 }
 
-fn header(settings: [u32; 4]) -> Vec<u8> {
-    SIGNATURE
-        .iter()
-        .copied()
-        .chain(settings.into_iter().flat_map(u32::to_le_bytes))
-        .collect()
-}
-
 /// Photographs by their hashes, with their features, the colours of these, and the figures of their pixels.
 pub(super) type Photos<'a> = (&'a [u64], &'a [Features], &'a [Vec<[u8; 3]>], &'a [Appearance]);
 
 /// Writes photographs and the matches between them.
 pub(super) fn write(
     path: &Path,
-    settings: [u32; 4],
+    settings: Settings,
     (hashes, features, colors, appearances): Photos,
     matches: &HashMap<[u64; 2], Vec<[u32; 2]>>,
 ) -> Result<(), FormatError> {
     write_atomic(path, |out| {
-        out.write_all(&header(settings))?;
+        out.write_all(&settings.header())?;
         write_u64(out, hashes.len() as u64)?;
         for (((hash, features), colors), appearance) in hashes.iter().zip(features).zip(colors).zip(appearances) {
             write_u64(out, *hash)?;
@@ -78,11 +88,14 @@ pub(super) fn write(
                 out.write_all(&value.to_le_bytes())?;
             }
             write_u64(out, colors.len() as u64)?;
-            for ((k, descriptor), color) in features.keypoints.iter().zip(&features.descriptors).zip(colors) {
+            for (i, (k, color)) in features.keypoints.iter().zip(colors).enumerate() {
                 for value in [k.x, k.y, k.scale, k.angle] {
                     out.write_all(&value.to_le_bytes())?;
                 }
-                out.write_all(descriptor)?;
+                out.write_all(&features.descriptors[i])?;
+                if settings.frontal {
+                    out.write_all(&features.frontal[i])?;
+                }
                 out.write_all(color)?;
             }
         }
@@ -106,7 +119,7 @@ fn write_u64(out: &mut dyn Write, value: u64) -> io::Result<()> {
 }
 
 /// What follows the header; `None` if it is damaged.
-fn parse(mut bytes: &[u8]) -> Option<Known> {
+fn parse(mut bytes: &[u8], settings: Settings) -> Option<Known> {
     let mut known = Known::default();
     for _ in 0..take_u64(&mut bytes)? {
         let hash = take_u64(&mut bytes)?;
@@ -117,12 +130,16 @@ fn parse(mut bytes: &[u8]) -> Option<Known> {
             appearance: Appearance::from_array(figures),
             ..Looks::default()
         };
-        for feature in take(&mut bytes, count.checked_mul(FEATURE)?)?.chunks_exact(FEATURE) {
+        let size = settings.feature();
+        for feature in take(&mut bytes, count.checked_mul(size)?)?.chunks_exact(size) {
             let (place, rest) = feature.split_at(16);
             let value = |i: usize| f32::from_le_bytes(place[4 * i..][..4].try_into().expect("4 bytes"));
             let [x, y, scale, angle] = [0, 1, 2, 3].map(value);
             looks.features.keypoints.push(Keypoint { x, y, scale, angle });
             looks.features.descriptors.push(*rest.first_chunk()?);
+            if settings.frontal {
+                looks.features.frontal.push(*rest[DESCRIPTOR_BYTES..].first_chunk()?);
+            }
             looks.colors.push(*rest.last_chunk()?);
         }
         known.looks.insert(hash, looks);
@@ -162,7 +179,10 @@ fn take_u64(bytes: &mut &[u8]) -> Option<u64> {
 mod tests {
     use super::*;
 
-    const SETTINGS: [u32; 4] = [1, 2, 3, 4];
+    const SETTINGS: Settings = Settings {
+        extractor: [1, 2, 3, 4],
+        frontal: false,
+    };
 
     fn looks(n: u8) -> Looks {
         let keypoint = |i: u8| Keypoint {
@@ -175,6 +195,7 @@ mod tests {
             features: Features {
                 keypoints: (0..n).map(keypoint).collect(),
                 descriptors: (0..n).map(|i| [i; DESCRIPTOR_BYTES]).collect(),
+                frontal: Vec::new(),
             },
             colors: (0..n).map(|i| [i, 1, 2]).collect(),
             appearance: Appearance::from_array([0.1, 0.5, 0.0, f32::from(n)]),
@@ -188,35 +209,46 @@ mod tests {
         }
     }
 
-    fn save(path: &Path, known: &Known) {
+    fn save(path: &Path, settings: Settings, known: &Known) {
         let hashes: Vec<u64> = known.looks.keys().copied().collect();
         let features: Vec<Features> = known.looks.values().map(|looks| looks.features.clone()).collect();
         let colors: Vec<Vec<[u8; 3]>> = known.looks.values().map(|looks| looks.colors.clone()).collect();
         let appearances: Vec<Appearance> = known.looks.values().map(|looks| looks.appearance).collect();
-        write(
-            path,
-            SETTINGS,
-            (&hashes, &features, &colors, &appearances),
-            &known.matches,
-        )
-        .unwrap();
+        let photos = (&hashes[..], &features[..], &colors[..], &appearances[..]);
+        write(path, settings, photos, &known.matches).unwrap();
     }
 
     #[test]
     fn what_is_written_is_read_back_under_the_same_settings_only() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("features.bin");
-        save(&path, &known());
+        save(&path, SETTINGS, &known());
         assert_eq!(read(&path, SETTINGS), (known(), None));
-        assert_eq!(read(&path, [1, 2, 3, 5]), Default::default());
+        let mut other = SETTINGS;
+        other.extractor[3] = 5;
+        let frontal = Settings {
+            frontal: true,
+            ..SETTINGS
+        };
+        for other in [other, frontal] {
+            assert_eq!(read(&path, other), Default::default());
+        }
         assert_eq!(read(&folder.path().join("none"), SETTINGS), Default::default());
+
+        let mut seen_from_the_front = known();
+        for looks in seen_from_the_front.looks.values_mut() {
+            let of = looks.features.descriptors.iter();
+            looks.features.frontal = of.map(|descriptor| descriptor.map(|byte| byte + 100)).collect();
+        }
+        save(&path, frontal, &seen_from_the_front);
+        assert_eq!(read(&path, frontal), (seen_from_the_front, None));
     }
 
     #[test]
     fn damage_is_noticed_and_forgotten() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("features.bin");
-        save(&path, &known());
+        save(&path, SETTINGS, &known());
         let whole = std::fs::read(&path).unwrap();
         for length in 32..whole.len() {
             std::fs::write(&path, &whole[..length]).unwrap();
@@ -227,7 +259,7 @@ mod tests {
         // A match with a feature that does not exist.
         let mut broken = known();
         broken.matches.insert([8, 7], vec![[0, 0]]);
-        save(&path, &broken);
+        save(&path, SETTINGS, &broken);
         assert!(read(&path, SETTINGS).1.is_some());
     }
 }

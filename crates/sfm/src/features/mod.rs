@@ -5,6 +5,7 @@
 
 mod descriptor;
 mod extrema;
+mod frontal;
 mod gradients;
 mod orientation;
 mod scale_space;

@@ -32,7 +32,7 @@ pub(super) struct Plane {
 }
 
 impl Plane {
-    fn new(width: usize, height: usize) -> Self {
+    pub(super) fn new(width: usize, height: usize) -> Self {
         let stride = width.next_multiple_of(WIDEST) + WIDEST;
         Self {
             width,
@@ -64,7 +64,7 @@ impl Plane {
         self.data[y * self.stride + x]
     }
 
-    fn rows_mut(&mut self) -> impl Iterator<Item = &mut [f32]> {
+    pub(super) fn rows_mut(&mut self) -> impl Iterator<Item = &mut [f32]> {
         self.data.chunks_exact_mut(self.stride)
     }
 
@@ -111,6 +111,11 @@ impl Plane {
     }
 }
 
+/// Blur of a level, in its octave's pixels.
+pub(super) fn sigma_of(level: usize) -> f32 {
+    BASE_SIGMA * 2f32.powf(level as f32 / SCALES as f32)
+}
+
 /// One octave of the scale space.
 pub(super) struct Octave {
     /// `[LEVELS]`, from the least blurred.
@@ -135,7 +140,7 @@ impl Octave {
     fn from_base(level: Level, base: Plane, mut variance: f32, pixel: f32) -> Self {
         let mut levels = vec![base];
         for i in 1..LEVELS {
-            let sigma = BASE_SIGMA * 2f32.powf(i as f32 / SCALES as f32);
+            let sigma = sigma_of(i);
             let next = blurred(level, &levels[i - 1], (sigma * sigma - variance).sqrt());
             variance = sigma * sigma;
             levels.push(next);

@@ -1,10 +1,12 @@
 use super::descriptor::describe;
 use super::extrema::{Extremum, find_extrema};
+use super::frontal::frontal_patch;
 use super::orientation::orientations;
 use super::scale_space::{FIRST_SCALE, Octave, Plane};
 use super::spread::spread;
 use super::{Extractor, GreyPhoto};
-use crate::{Features, Keypoint};
+use crate::keypoints::NO_DESCRIPTOR;
+use crate::{DESCRIPTOR_BYTES, Features, Keypoint};
 use irradia_compute::Level;
 use irradia_scene::resize_area;
 
@@ -23,6 +25,9 @@ pub struct Sift {
     pub peak_threshold: f32,
     /// The largest ratio of principal curvatures. Default 10, as Lowe's and COLMAP's.
     pub edge_threshold: f32,
+    /// Whether features also have frontal descriptors. Default false: they take three times as long, and are worth it only where views differ by so much that
+    /// the others do not match.
+    pub frontal: bool,
     /// What [`Level::detect`] found; tests choose others.
     pub level: Level,
 }
@@ -34,6 +39,7 @@ impl Default for Sift {
             max_features: 4096,
             peak_threshold: 0.02 / 3.0,
             edge_threshold: 10.0,
+            frontal: false,
             level: Level::detect(),
         }
     }
@@ -89,7 +95,7 @@ impl Sift {
             octaves.push(described);
             next = halved;
         }
-        let mut found: Vec<(Keypoint, [u8; 128])> = Vec::new();
+        let mut found: Vec<(Keypoint, [u8; DESCRIPTOR_BYTES], [u8; DESCRIPTOR_BYTES])> = Vec::new();
         // A product rather than either factor: large blobs are repeatable, strong ones are well placed.
         let importance: Vec<[f32; 3]> = places
             .iter()
@@ -99,11 +105,21 @@ impl Sift {
         for i in spread(&importance, [photo.width, photo.height], self.max_features) {
             let (extremum, [x, y, scale]) = (&extrema[i], places[i]);
             let plane = &octaves[extremum.octave][extremum.level - FIRST_SCALE];
-            for angle in orientations(self.level, plane, extremum).into_iter().flatten() {
-                let keypoint = Keypoint { x, y, scale, angle };
-                if let Some(descriptor) = describe(self.level, plane, extremum, angle) {
-                    found.push((keypoint, descriptor));
+            let described = self.described(plane, extremum);
+            let frontal = match self.frontal {
+                true => {
+                    let (patch, centre) = frontal_patch(&octaves, extremum);
+                    self.described(&patch, &centre)
                 }
+                false => [None, None],
+            };
+            for (described, frontal) in described.into_iter().zip(frontal) {
+                let Some((angle, _)) = described.or(frontal) else {
+                    continue;
+                };
+                // Of a feature that has a frontal descriptor alone, the angle is that in its patch.
+                let [descriptor, frontal] = [described, frontal].map(|d| d.map_or(NO_DESCRIPTOR, |d| d.1));
+                found.push((Keypoint { x, y, scale, angle }, descriptor, frontal));
             }
             if found.len() >= self.max_features {
                 break;
@@ -111,9 +127,19 @@ impl Sift {
         }
         found.truncate(self.max_features);
         let order = |k: &Keypoint| [-k.scale, k.y, k.x, k.angle];
-        found.sort_by(|(a, _), (b, _)| order(a).partial_cmp(&order(b)).expect("finite keypoints"));
-        let (keypoints, descriptors) = found.into_iter().unzip();
-        Features { keypoints, descriptors }
+        found.sort_by(|(a, ..), (b, ..)| order(a).partial_cmp(&order(b)).expect("finite keypoints"));
+        let frontal = found.iter().map(|(.., frontal)| *frontal);
+        Features {
+            frontal: if self.frontal { frontal.collect() } else { Vec::new() },
+            keypoints: found.iter().map(|(keypoint, ..)| *keypoint).collect(),
+            descriptors: found.iter().map(|(_, descriptor, _)| *descriptor).collect(),
+        }
+    }
+
+    /// The angles and descriptors at `extremum`, the strongest first.
+    fn described(&self, plane: &Plane, extremum: &Extremum) -> [Option<(f32, [u8; DESCRIPTOR_BYTES])>; 2] {
+        orientations(self.level, plane, extremum)
+            .map(|angle| angle.and_then(|angle| Some((angle, describe(self.level, plane, extremum, angle)?))))
     }
 }
 

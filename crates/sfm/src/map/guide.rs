@@ -7,6 +7,7 @@ use super::focal::Source;
 use super::model::Working;
 use super::tracks::Tracks;
 use super::types::{Known, MapOptions, Model, ModelPoint, PairKind, PhotoInfo, VerifiedPair};
+use super::verify::to_plane;
 use super::{finish, verify};
 use crate::geometry::camera::DCamera;
 use crate::geometry::essential::Motion;
@@ -98,14 +99,11 @@ impl Ideal {
         Self {
             photo: photo as u32,
             pose,
-            inverse: DMat3::from_cols(
-                DVec3::new(1.0 / fx, 0.0, 0.0),
-                DVec3::new(0.0, 1.0 / fy, 0.0),
-                DVec3::new(-cx / fx, -cy / fy, 1.0),
-            ),
+            inverse: to_plane(camera),
             features: Features {
                 keypoints: features.keypoints.iter().map(place).collect(),
                 descriptors: features.descriptors.clone(),
+                frontal: features.frontal.clone(),
             },
         }
     }

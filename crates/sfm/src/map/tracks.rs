@@ -218,7 +218,7 @@ mod tests {
             .collect();
         Features {
             keypoints,
-            descriptors: Vec::new(),
+            ..Features::default()
         }
     }
 

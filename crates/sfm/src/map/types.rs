@@ -68,6 +68,8 @@ pub struct MapOptions {
     pub max_epipolar_error: f64,
     /// Inliers below which a pair is dropped.
     pub min_inliers: usize,
+    /// Whether a pair that passes is matched once more along its epipolar lines, where features need not differ from those elsewhere.
+    pub guided: bool,
     /// Largest reprojection error of an observation, px.
     pub max_error: f64,
     /// Largest reprojection error of an inlier when a photograph is registered, px.
@@ -95,6 +97,7 @@ impl Default for MapOptions {
         Self {
             max_epipolar_error: 4.0,
             min_inliers: 15,
+            guided: false,
             max_error: 4.0,
             max_registration_error: 8.0,
             min_registration_inliers: 20,

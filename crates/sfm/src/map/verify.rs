@@ -8,6 +8,7 @@ use crate::geometry::essential::{Essential, Motion, closest_essential, cross_mat
 use crate::geometry::fundamental::Fundamental;
 use crate::geometry::homography::{Homography, rotation_between};
 use crate::geometry::ransac::{Estimate, Limits, estimate};
+use crate::matching::{MatchOptions, TwoView, match_guided};
 use crate::{Features, PairMatches, median};
 use glam::{DMat3, DVec2, DVec3};
 use rayon::prelude::*;
@@ -17,6 +18,10 @@ const SAMPLES: usize = 600;
 const CONFIDENCE: f64 = 0.9999;
 /// Inliers of a homography, or of a rotation, by those of the essential matrix, from which on it explains the pair.
 const EXPLAINS: f64 = 0.8;
+
+/// Largest distance from a pair's epipolar line of a match that is found along it, by that of its inliers. Whatever is near a line may match; with the whole
+/// distance, models of weak pairs lose a third of their photographs.
+const OFF_LINE: f64 = 0.5;
 
 /// The median angle below which a pair is a rotation, radians: about three pixels at a long side of a thousand.
 const LEAST_ANGLE: f64 = 0.003;
@@ -192,17 +197,18 @@ fn calibrated(
         DVec2::new((at.x - cx) / fx, (at.y - cy) / fy)
     };
     let [features_a, features_b] = pair.photos.map(|p| &features[p as usize]);
-    let points: Vec<[DVec2; 2]> = pair
-        .matches
-        .iter()
-        .map(|[i, j]| {
-            [
-                plane(camera_a, pixel(features_a, *i)),
-                plane(camera_b, pixel(features_b, *j)),
-            ]
-        })
-        .collect();
-    let all = Correspondences::new(points);
+    let on_planes = |matches: &[[u32; 2]]| -> Vec<[DVec2; 2]> {
+        matches
+            .iter()
+            .map(|[i, j]| {
+                [
+                    plane(camera_a, pixel(features_a, *i)),
+                    plane(camera_b, pixel(features_b, *j)),
+                ]
+            })
+            .collect()
+    };
+    let all = Correspondences::new(on_planes(&pair.matches));
     let threshold = options.max_epipolar_error * 0.5 * (1.0 / camera_a.focal() + 1.0 / camera_b.focal());
     let problem = Essential {
         points: &all,
@@ -220,10 +226,10 @@ fn calibrated(
     let best = estimate(&problem, first.into_iter().collect(), limits)?;
     let mut inliers = problem.inliers(&best.model);
     let mut count = inliers.iter().filter(|i| **i).count();
-    if let Some(uncalibrated) = uncalibrated
-        && group.iter().any(|g| g.1 != Source::Prior)
-        && uncalibrated.count as f64 > 1.2 * count as f64
-    {
+    let better = uncalibrated.filter(|uncalibrated| {
+        group.iter().any(|g| g.1 != Source::Prior) && uncalibrated.count as f64 > 1.2 * count as f64
+    });
+    if let Some(uncalibrated) = better {
         // The guessed focal length is off: the matches are those of the fundamental matrix.
         inliers.clone_from(&uncalibrated.inliers);
         count = uncalibrated.count;
@@ -231,11 +237,32 @@ fn calibrated(
     if count < options.min_inliers {
         return None;
     }
-    let kept: Vec<[DVec2; 2]> = select(&all.points, &inliers);
-    let (start, _) = motion_in_front(best.model, kept.iter());
-    let motion = refine_motion(start, &kept, threshold, 3)
-        .map_or(start, |refined| motion_in_front(refined.essential(), kept.iter()).0);
-    let angle = median_angle(&motion, &kept);
+    let refined = |start: Motion, kept: &[[DVec2; 2]]| {
+        refine_motion(start, kept, threshold, 3)
+            .map_or(start, |refined| motion_in_front(refined.essential(), kept.iter()).0)
+    };
+    let mut matches = select(&pair.matches, &inliers);
+    let mut kept: Vec<[DVec2; 2]> = select(&all.points, &inliers);
+    let mut motion = refined(motion_in_front(best.model, kept.iter()).0, &kept);
+    let mut angle = median_angle(&motion, &kept);
+    if options.guided && angle >= LEAST_ANGLE && !(camera_a.fisheye || camera_b.fisheye) {
+        let fundamental = match better {
+            Some(uncalibrated) => {
+                let [a, b] = pair.photos.map(|p| to_centered(&photos[p as usize]));
+                b.transpose() * uncalibrated.matrix * a
+            }
+            None => to_plane(camera_b).transpose() * motion.essential() * to_plane(camera_a),
+        };
+        let lines = TwoView::Fundamental(fundamental);
+        let error = OFF_LINE * options.max_epipolar_error;
+        let guided = match_guided(features_a, features_b, &lines, error, &MatchOptions::default());
+        if guided.len() > matches.len() {
+            matches = guided;
+            kept = on_planes(&matches);
+            motion = refined(motion, &kept);
+            angle = median_angle(&motion, &kept);
+        }
+    }
     let kind = if angle < LEAST_ANGLE {
         PairKind::Rotation
     } else {
@@ -243,11 +270,28 @@ fn calibrated(
     };
     Some(VerifiedPair {
         photos: pair.photos,
-        matches: select(&pair.matches, &inliers),
+        matches,
         kind,
         motion,
         angle: if kind == PairKind::Rotation { 0.0 } else { angle },
     })
+}
+
+/// From homogeneous pixels to the plane z = 1, without distortion.
+pub(super) fn to_plane(camera: &DCamera) -> DMat3 {
+    let [fx, fy, cx, cy, ..] = camera.parameters;
+    DMat3::from_cols(
+        DVec3::new(1.0 / fx, 0.0, 0.0),
+        DVec3::new(0.0, 1.0 / fy, 0.0),
+        DVec3::new(-cx / fx, -cy / fy, 1.0),
+    )
+}
+
+/// From homogeneous pixels to those of [`centered_points`].
+fn to_centered(photo: &PhotoInfo) -> DMat3 {
+    let scale = 1.0 / long_side(photo);
+    let center = 0.5 * scale * DVec2::new(f64::from(photo.width), f64::from(photo.height));
+    DMat3::from_cols(DVec3::X * scale, DVec3::Y * scale, (-center).extend(1.0))
 }
 
 pub(super) fn select<T: Clone>(items: &[T], keep: &[bool]) -> Vec<T> {

@@ -1,8 +1,10 @@
-use super::{MatchOptions, mutual};
+use super::{MatchOptions, joined, mutual};
 use crate::{DESCRIPTOR_BYTES, Features};
 use glam::{DMat3, DVec3};
 use irradia_compute::nearest::Nearest;
 use irradia_compute::simd::{Kernel, Lanes, Mask, Simd};
+
+type Descriptor = [u8; DESCRIPTOR_BYTES];
 
 /// The known geometry of a pair, in pixels at full size.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -24,10 +26,15 @@ pub fn match_guided(
     options: &MatchOptions,
 ) -> Vec<[u32; 2]> {
     let search = Search::new(b, geometry, threshold);
-    let mut of_a = vec![Nearest::NONE; a.keypoints.len()];
-    let mut of_b = vec![Nearest::NONE; b.keypoints.len()];
+    let kinds: &[[&[Descriptor]; 2]] = &[[&a.descriptors, &b.descriptors], [&a.frontal, &b.frontal]];
+    let kinds = &kinds[..if a.frontal.is_empty() || b.frontal.is_empty() {
+        1
+    } else {
+        2
+    }];
+    let mut found = vec![[a, b].map(|photo| vec![Nearest::NONE; photo.keypoints.len()]); kinds.len()];
     let mut near: Vec<u32> = Vec::new();
-    for (i, (keypoint, descriptor)) in a.keypoints.iter().zip(&a.descriptors).enumerate() {
+    for (i, keypoint) in a.keypoints.iter().enumerate() {
         let x1 = DVec3::new(keypoint.x.into(), keypoint.y.into(), 1.0);
         near.clear();
         options.level.run(Along {
@@ -35,16 +42,19 @@ pub fn match_guided(
             x1,
             near: &mut near,
         });
-        for &j in &near {
-            let product = product(descriptor, &b.descriptors[j as usize]);
-            of_a[i].merge(j, product, 0);
-            of_b[j as usize].merge(i as u32, product, 0);
+        for ([of_a, of_b], [a, b]) in found.iter_mut().zip(kinds) {
+            for &j in &near {
+                let product = product(&a[i], &b[j as usize]);
+                of_a[i].merge(j, product, 0);
+                of_b[j as usize].merge(i as u32, product, 0);
+            }
         }
     }
-    mutual(&of_a, &of_b, options)
+    let matches = found.iter().map(|[of_a, of_b]| mutual(of_a, of_b, options));
+    matches.reduce(joined).unwrap_or_default()
 }
 
-fn product(a: &[u8; DESCRIPTOR_BYTES], b: &[u8; DESCRIPTOR_BYTES]) -> u32 {
+fn product(a: &Descriptor, b: &Descriptor) -> u32 {
     a.iter().zip(b).map(|(a, b)| u32::from(*a) * u32::from(*b)).sum()
 }
 
@@ -159,6 +169,7 @@ mod tests {
         Features {
             keypoints: places.iter().map(keypoint).collect(),
             descriptors: (0..places.len()).map(|i| looks[i % 2]).collect(),
+            frontal: Vec::new(),
         }
     }
 

@@ -10,6 +10,7 @@ use crate::{DESCRIPTOR_BYTES, Features, PairMatches};
 use irradia_compute::Level;
 use irradia_compute::nearest::{Nearest, nearest};
 use rayon::prelude::*;
+use std::collections::HashSet;
 
 pub use guided::{TwoView, match_guided};
 pub use pairs::{PairOptions, candidate_pairs};
@@ -53,9 +54,25 @@ fn distance2(product: u32) -> u32 {
     2 * LENGTH2.saturating_sub(product)
 }
 
-/// Pairs of features, one of `a` and one of `b`, that are each other's nearest and pass the tests of `options`; sorted by the first.
+/// Pairs of features, one of `a` and one of `b`, that are each other's nearest and pass the tests of `options`; sorted by the first. Where both have frontal
+/// descriptors, these match what the others leave.
 pub fn match_features(a: &Features, b: &Features, options: &MatchOptions) -> Vec<[u32; 2]> {
-    match_descriptors(&a.descriptors, &b.descriptors, options)
+    let matches = match_descriptors(&a.descriptors, &b.descriptors, options);
+    if a.frontal.is_empty() || b.frontal.is_empty() {
+        return matches;
+    }
+    joined(matches, match_descriptors(&a.frontal, &b.frontal, options))
+}
+
+/// `first`, and those of `second` whose features it leaves; sorted by the first photograph's.
+fn joined(first: Vec<[u32; 2]>, second: Vec<[u32; 2]>) -> Vec<[u32; 2]> {
+    let [of_a, of_b]: [HashSet<u32>; 2] = [0, 1].map(|side| first.iter().map(|pair| pair[side]).collect());
+    let left = second
+        .into_iter()
+        .filter(|[i, j]| !of_a.contains(i) && !of_b.contains(j));
+    let mut all: Vec<[u32; 2]> = first.into_iter().chain(left).collect();
+    all.sort_unstable();
+    all
 }
 
 fn match_descriptors(
@@ -116,8 +133,8 @@ mod tests {
 
     fn features(descriptors: Vec<[u8; DESCRIPTOR_BYTES]>) -> Features {
         Features {
-            keypoints: Vec::new(),
             descriptors,
+            ..Features::default()
         }
     }
 

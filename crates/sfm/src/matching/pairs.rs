@@ -86,8 +86,8 @@ mod tests {
         };
         (0..n)
             .map(|photo| Features {
-                keypoints: Vec::new(),
                 descriptors: (photo * 10..photo * 10 + 20).map(descriptor).collect(),
+                ..Features::default()
             })
             .collect()
     }

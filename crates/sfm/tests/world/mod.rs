@@ -109,7 +109,7 @@ impl World {
             shown.push(here);
             world.features.push(Features {
                 keypoints,
-                descriptors: Vec::new(),
+                ..Features::default()
             });
             world.photos.push(PhotoInfo {
                 name: format!("{i:03}.jpg"),

@@ -1,0 +1,218 @@
+//! The shape of a feature: the ellipse that a tilted view makes of a disc (Baumberg 2000; Mikolajczyk and Schmid, "Scale and affine
+//! invariant interest point detectors", 2004).
+
+use super::extrema::Extremum;
+use super::scale_space::{FIRST_SCALE, Plane, sigma_of};
+
+/// Side of a patch, px: what a descriptor reaches at any angle, with a margin.
+const SIDE: usize = 40;
+/// Standard deviation of the feature in its patch, px.
+const PATCH_SIGMA: f32 = 1.6;
+/// Standard deviation of the window in which gradients tell the shape, in sigmas of the feature (VLFeat).
+const INTEGRATION: f32 = 3.0;
+/// Steps at most.
+const STEPS: usize = 8;
+/// The ratio of the gradients' second moments from which on the shape is found.
+const ROUND: f32 = 1.1;
+/// The longest ellipse, as a ratio of its axes.
+const LONGEST: f32 = 6.0;
+
+/// Blur below which it makes no difference, px.
+const SHARP: f32 = 0.4;
+/// How much more blurred a level may be than wanted: levels are discrete, and a little more is nearer than much less.
+const MORE_BLURRED: f32 = 1.12;
+
+/// The surroundings of `extremum` as they look from the front, up to a turn, and the extremum there.
+pub(super) fn frontal_patch(octaves: &[Vec<Plane>], extremum: &Extremum) -> (Plane, Extremum) {
+    let centre = Extremum {
+        x: 0.5 * SIDE as f32,
+        y: 0.5 * SIDE as f32,
+        sigma: PATCH_SIGMA,
+        ..*extremum
+    };
+    let mut shape = Ellipse::DISC;
+    let mut patch = shape.patch(octaves, extremum);
+    for _ in 0..STEPS {
+        let Some(next) = shape.rounder(second_moments(&patch)) else {
+            break;
+        };
+        if next.ratio() > LONGEST {
+            return (Ellipse::DISC.patch(octaves, extremum), centre);
+        }
+        shape = next;
+        patch = shape.patch(octaves, extremum);
+    }
+    (patch, centre)
+}
+
+/// An ellipse of the area of the unit disc.
+#[derive(Clone, Copy, Debug)]
+struct Ellipse {
+    /// Direction of the long axis.
+    axis: [f32; 2],
+    /// Half of the long axis.
+    long: f32,
+}
+
+impl Ellipse {
+    const DISC: Self = Self {
+        axis: [1.0, 0.0],
+        long: 1.0,
+    };
+
+    fn ratio(&self) -> f32 {
+        self.long * self.long
+    }
+
+    /// The ellipse in whose patch the second moments `[xx, xy, yy]` become equal, if they are far from it.
+    fn rounder(&self, [xx, xy, yy]: [f32; 3]) -> Option<Self> {
+        let det = xx * yy - xy * xy;
+        let (mean, half) = (0.5 * (xx + yy), 0.5 * (xx - yy));
+        let spread = (half * half + xy * xy).sqrt();
+        if det <= 1e-6 * mean * mean || mean + spread < ROUND * ROUND * (mean - spread) {
+            return None;
+        }
+        // C' = B M^-1 B^T, B the patch's axes in the photograph.
+        let scale = 1.0 / det.sqrt();
+        let inverse = [yy * scale, -xy * scale, xx * scale];
+        let ([c, s], a, b) = (self.axis, self.long, 1.0 / self.long);
+        let columns = [[c * a, -s * b], [s * a, c * b]];
+        let product = |i: usize, j: usize| {
+            let ([p, q], [r, t]) = (columns[i], columns[j]);
+            p * r * inverse[0] + (p * t + q * r) * inverse[1] + q * t * inverse[2]
+        };
+        let (xx, xy, yy) = (product(0, 0), product(0, 1), product(1, 1));
+        let (mean, half) = (0.5 * (xx + yy), 0.5 * (xx - yy));
+        let angle = 0.5 * xy.atan2(half);
+        Some(Self {
+            axis: [angle.cos(), angle.sin()],
+            long: (mean + (half * half + xy * xy).sqrt()).sqrt(),
+        })
+    }
+
+    /// The ellipse around `extremum`, as a disc.
+    fn patch(&self, octaves: &[Vec<Plane>], extremum: &Extremum) -> Plane {
+        let sigma = extremum.sigma;
+        let (octave, level) = level_of(octaves, extremum.octave, sigma / self.long);
+        let plane = &octaves[octave][level];
+        // Pixels of the plane by those of the extremum's octave.
+        let finer = (1u32 << (extremum.octave - octave)) as f32;
+        let blur = sigma_of(level + FIRST_SCALE) / finer;
+        let step = sigma / PATCH_SIGMA;
+        let [c, s] = self.axis;
+        let (along, across) = (step * self.long, step / self.long);
+        let mut to = Plane::new(SIDE, SIDE);
+        for (j, row) in to.rows_mut().enumerate() {
+            let v = (j as f32 + 0.5 - 0.5 * SIDE as f32) * across;
+            for (i, value) in row[..SIDE].iter_mut().enumerate() {
+                let u = (i as f32 + 0.5 - 0.5 * SIDE as f32) * along;
+                *value = between(
+                    plane,
+                    (extremum.x + c * u - s * v) * finer,
+                    (extremum.y + s * u + c * v) * finer,
+                );
+            }
+        }
+        let missing = |step: f32| {
+            (PATCH_SIGMA * PATCH_SIGMA - (blur / step) * (blur / step))
+                .max(0.0)
+                .sqrt()
+        };
+        let [x, y] = [along, across].map(missing);
+        blur_rows(&mut to, x);
+        blur_columns(&mut to, y);
+        to
+    }
+}
+
+/// The most blurred level that is blurred by about `sigma` pixels of octave `from` at most: its octave, and its index there.
+fn level_of(octaves: &[Vec<Plane>], from: usize, sigma: f32) -> (usize, usize) {
+    let wanted = MORE_BLURRED * sigma;
+    for octave in (0..=from).rev() {
+        let finer = (1u32 << (from - octave)) as f32;
+        for level in (0..octaves[octave].len()).rev() {
+            if sigma_of(level + FIRST_SCALE) <= wanted * finer {
+                return (octave, level);
+            }
+        }
+    }
+    (0, 0)
+}
+
+/// The value at `(x, y)`, bilinear; the border is repeated outside.
+fn between(plane: &Plane, x: f32, y: f32) -> f32 {
+    let x = (x - 0.5).clamp(0.0, plane.width as f32 - 1.001);
+    let y = (y - 0.5).clamp(0.0, plane.height as f32 - 1.001);
+    let (i, j) = (x as usize, y as usize);
+    let (u, v) = (x - i as f32, y - j as f32);
+    let (above, below) = (plane.row(j), plane.row(j + 1));
+    let top = above[i] + (above[i + 1] - above[i]) * u;
+    let bottom = below[i] + (below[i + 1] - below[i]) * u;
+    top + (bottom - top) * v
+}
+
+/// Weights of a Gaussian, from its centre outwards.
+fn taps(sigma: f32) -> Vec<f32> {
+    let radius = (3.0 * sigma).ceil() as usize;
+    let weights: Vec<f32> = (0..=radius)
+        .map(|i| (-0.5 * (i as f32 / sigma).powi(2)).exp())
+        .collect();
+    let sum = weights[0] + 2.0 * weights[1..].iter().sum::<f32>();
+    weights.iter().map(|weight| weight / sum).collect()
+}
+
+fn blur_rows(plane: &mut Plane, sigma: f32) {
+    if sigma < SHARP {
+        return;
+    }
+    let taps = taps(sigma);
+    for row in plane.rows_mut() {
+        let old: [f32; SIDE] = std::array::from_fn(|i| row[i]);
+        for (i, value) in row[..SIDE].iter_mut().enumerate() {
+            *value = taps[0] * old[i];
+            for (r, tap) in taps.iter().enumerate().skip(1) {
+                *value += tap * (old[i.saturating_sub(r)] + old[(i + r).min(SIDE - 1)]);
+            }
+        }
+    }
+}
+
+fn blur_columns(plane: &mut Plane, sigma: f32) {
+    if sigma < SHARP {
+        return;
+    }
+    let taps = taps(sigma);
+    let old = plane.clone();
+    for (j, row) in plane.rows_mut().enumerate() {
+        for (value, centre) in row.iter_mut().zip(old.row(j)) {
+            *value = taps[0] * centre;
+        }
+        for (r, tap) in taps.iter().enumerate().skip(1) {
+            let (before, after) = (old.row(j.saturating_sub(r)), old.row((j + r).min(SIDE - 1)));
+            for ((value, a), b) in row.iter_mut().zip(before).zip(after) {
+                *value += tap * (a + b);
+            }
+        }
+    }
+}
+
+/// `[xx, xy, yy]` of the gradients of a patch, in a Gaussian window.
+fn second_moments(patch: &Plane) -> [f32; 3] {
+    let scale = 0.5 / (INTEGRATION * PATCH_SIGMA).powi(2);
+    let weights: [f32; SIDE] = std::array::from_fn(|i| {
+        let from_middle = i as f32 + 0.5 - 0.5 * SIDE as f32;
+        (-scale * from_middle * from_middle).exp()
+    });
+    let mut moments = [0.0; 3];
+    for j in 1..SIDE - 1 {
+        let [above, row, below] = [j - 1, j, j + 1].map(|j| patch.row(j));
+        for i in 1..SIDE - 1 {
+            let weight = weights[i] * weights[j];
+            let (gx, gy) = (row[i + 1] - row[i - 1], below[i] - above[i]);
+            moments[0] += weight * gx * gx;
+            moments[1] += weight * gx * gy;
+            moments[2] += weight * gy * gy;
+        }
+    }
+    moments
+}

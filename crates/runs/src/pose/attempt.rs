@@ -105,6 +105,13 @@ impl<'a> Attempt<'a> {
         let left_out = (0..photos).filter(|i| posed.is_none_or(|poses| poses[*i].is_none()));
         Some(self.work.again(wanted, &left_out.collect::<Vec<_>>(), out))
     }
+
+    /// Whether this second attempt is to be preferred to the `first`. Its weak matches make wrong models of few photographs (3 of 20 of a room that was seen from
+    /// one place, two opposite walls of a house as one) and add single ones of what looks alike.
+    pub fn replaces(&self, first: &Self) -> bool {
+        let photos = self.work.photos().len();
+        self.registered() >= photos.div_ceil(2).max(first.registered() + photos.div_ceil(20))
+    }
 }
 
 /// Photographs of the largest model.

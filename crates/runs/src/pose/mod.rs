@@ -140,7 +140,8 @@ pub struct PoseReport {
     pub scale: Option<ScaleReport>,
     /// Its cameras.
     pub cameras: Vec<CameraReport>,
-    /// What was tried: a second time, with frontal descriptors, where too few photographs had a pose. The one with more poses was written.
+    /// What was tried: a second time, with frontal descriptors, where too few photographs had a pose. It was written if it has more
+    /// poses, by a twentieth of the photographs, and half of them.
     pub attempts: Vec<AttemptReport>,
     /// Pairs of photographs that were matched.
     pub pairs: usize,
@@ -226,7 +227,7 @@ pub struct StageReport {
 }
 
 /// Finds the poses of photographs and writes them as a dataset. Features and matches of an earlier call are reused. Where fewer than [`ENOUGH_POSED`] of
-/// the photographs have a pose at first, or any of up to 25 has none, it tries again with frontal descriptors, and the larger model counts. The result
+/// the photographs have a pose at first, or any of up to 25 has none, it tries again with frontal descriptors; a model that is larger by a twentieth of the photographs and holds half of them counts. The result
 /// depends neither on the number of threads nor on the order of the files.
 ///
 /// # Errors
@@ -306,7 +307,7 @@ pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Resu
         )));
         let again = Attempt::make(work, input, &capture, None, &mut clock, progress)?;
         attempts.push(again.report());
-        if again.registered() > attempt.registered() {
+        if again.replaces(&attempt) {
             attempt = again;
         }
     }

@@ -253,14 +253,18 @@ fn calibrated(
             }
             None => to_plane(camera_b).transpose() * motion.essential() * to_plane(camera_a),
         };
-        let lines = TwoView::Fundamental(fundamental);
-        let error = OFF_LINE * options.max_epipolar_error;
-        let guided = match_guided(features_a, features_b, &lines, error, &MatchOptions::default());
+        let guided = match_guided(
+            features_a,
+            features_b,
+            &TwoView::Fundamental(fundamental),
+            OFF_LINE * options.max_epipolar_error,
+            &MatchOptions::default(),
+        );
         if guided.len() > matches.len() {
-            matches = guided;
-            kept = on_planes(&matches);
+            kept = on_planes(&guided);
             motion = refined(motion, &kept);
             angle = median_angle(&motion, &kept);
+            matches = guided;
         }
     }
     let kind = if angle < LEAST_ANGLE {

@@ -1,10 +1,8 @@
-use super::{MatchOptions, joined, mutual};
-use crate::{DESCRIPTOR_BYTES, Features};
+use super::{Descriptor, MatchOptions, comparable, joined, mutual};
+use crate::Features;
 use glam::{DMat3, DVec3};
 use irradia_compute::nearest::Nearest;
 use irradia_compute::simd::{Kernel, Lanes, Mask, Simd};
-
-type Descriptor = [u8; DESCRIPTOR_BYTES];
 
 /// The known geometry of a pair, in pixels at full size.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -26,13 +24,8 @@ pub fn match_guided(
     options: &MatchOptions,
 ) -> Vec<[u32; 2]> {
     let search = Search::new(b, geometry, threshold);
-    let kinds: &[[&[Descriptor]; 2]] = &[[&a.descriptors, &b.descriptors], [&a.frontal, &b.frontal]];
-    let kinds = &kinds[..if a.frontal.is_empty() || b.frontal.is_empty() {
-        1
-    } else {
-        2
-    }];
-    let mut found = vec![[a, b].map(|photo| vec![Nearest::NONE; photo.keypoints.len()]); kinds.len()];
+    let none = |photo: &Features| vec![Nearest::NONE; photo.keypoints.len()];
+    let mut kinds: Vec<_> = comparable(a, b).map(|both| (both, [none(a), none(b)])).collect();
     let mut near: Vec<u32> = Vec::new();
     for (i, keypoint) in a.keypoints.iter().enumerate() {
         let x1 = DVec3::new(keypoint.x.into(), keypoint.y.into(), 1.0);
@@ -42,7 +35,7 @@ pub fn match_guided(
             x1,
             near: &mut near,
         });
-        for ([of_a, of_b], [a, b]) in found.iter_mut().zip(kinds) {
+        for ([a, b], [of_a, of_b]) in &mut kinds {
             for &j in &near {
                 let product = product(&a[i], &b[j as usize]);
                 of_a[i].merge(j, product, 0);
@@ -50,7 +43,7 @@ pub fn match_guided(
             }
         }
     }
-    let matches = found.iter().map(|[of_a, of_b]| mutual(of_a, of_b, options));
+    let matches = kinds.iter().map(|(_, [of_a, of_b])| mutual(of_a, of_b, options));
     matches.reduce(joined).unwrap_or_default()
 }
 

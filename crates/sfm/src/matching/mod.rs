@@ -15,6 +15,8 @@ use std::collections::HashSet;
 pub use guided::{TwoView, match_guided};
 pub use pairs::{PairOptions, candidate_pairs};
 
+type Descriptor = [u8; DESCRIPTOR_BYTES];
+
 /// Squared length of a RootSIFT descriptor, apart from rounding.
 const LENGTH2: u32 = 512 * 512;
 
@@ -57,11 +59,16 @@ fn distance2(product: u32) -> u32 {
 /// Pairs of features, one of `a` and one of `b`, that are each other's nearest and pass the tests of `options`; sorted by the first. Where both have frontal
 /// descriptors, these match what the others leave.
 pub fn match_features(a: &Features, b: &Features, options: &MatchOptions) -> Vec<[u32; 2]> {
-    let matches = match_descriptors(&a.descriptors, &b.descriptors, options);
-    if a.frontal.is_empty() || b.frontal.is_empty() {
-        return matches;
-    }
-    joined(matches, match_descriptors(&a.frontal, &b.frontal, options))
+    let matches = comparable(a, b).map(|[a, b]| match_descriptors(a, b, options));
+    matches.reduce(joined).unwrap_or_default()
+}
+
+/// `[N, 128]` descriptors of two photographs that can be compared: the usual ones, then the frontal ones where both have them.
+fn comparable<'a>(a: &'a Features, b: &'a Features) -> impl Iterator<Item = [&'a [Descriptor]; 2]> {
+    let usual: [&[Descriptor]; 2] = [&a.descriptors, &b.descriptors];
+    let frontal: [&[Descriptor]; 2] = [&a.frontal, &b.frontal];
+    let both = frontal.iter().all(|descriptors| !descriptors.is_empty());
+    [usual].into_iter().chain(both.then_some(frontal))
 }
 
 /// `first`, and those of `second` whose features it leaves; sorted by the first photograph's.
@@ -75,11 +82,7 @@ fn joined(first: Vec<[u32; 2]>, second: Vec<[u32; 2]>) -> Vec<[u32; 2]> {
     all
 }
 
-fn match_descriptors(
-    a: &[[u8; DESCRIPTOR_BYTES]],
-    b: &[[u8; DESCRIPTOR_BYTES]],
-    options: &MatchOptions,
-) -> Vec<[u32; 2]> {
+fn match_descriptors(a: &[Descriptor], b: &[Descriptor], options: &MatchOptions) -> Vec<[u32; 2]> {
     let [of_a, of_b] = nearest(options.level, a, b);
     mutual(&of_a, &of_b, options)
 }

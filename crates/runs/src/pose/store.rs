@@ -250,7 +250,7 @@ mod tests {
         let path = folder.path().join("features.bin");
         save(&path, SETTINGS, &known());
         let whole = std::fs::read(&path).unwrap();
-        for length in 32..whole.len() {
+        for length in SETTINGS.header().len()..whole.len() {
             std::fs::write(&path, &whole[..length]).unwrap();
             let (read, warning) = read(&path, SETTINGS);
             assert_eq!(read, Known::default(), "{length}");

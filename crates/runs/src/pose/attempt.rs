@@ -81,7 +81,7 @@ impl<'a> Attempt<'a> {
 
     /// Photographs with a pose in the largest model.
     pub fn registered(&self) -> usize {
-        registered(&self.reconstruction)
+        self.reconstruction.registered()
     }
 
     /// For the report.
@@ -114,11 +114,6 @@ impl<'a> Attempt<'a> {
     }
 }
 
-/// Photographs of the largest model.
-fn registered(found: &Reconstruction) -> usize {
-    found.models.first().map_or(0, |model| model.registered())
-}
-
 /// How many of so many photographs should have a pose.
 fn enough(photos: usize) -> usize {
     match photos {
@@ -137,7 +132,7 @@ fn models(
     tell: &mut dyn FnMut(Progress),
 ) -> Reconstruction {
     let found = reconstruct(infos, work.features(), pairs, options, tell);
-    if !work.sift().frontal || registered(&found) >= enough(infos.len()) {
+    if !work.sift().frontal || found.registered() >= enough(infos.len()) {
         return found;
     }
     let guided = MapOptions {
@@ -145,7 +140,7 @@ fn models(
         ..*options
     };
     let again = reconstruct(infos, work.features(), pairs, &guided, tell);
-    if registered(&again) > registered(&found) {
+    if again.registered() > found.registered() {
         again
     } else {
         found

@@ -43,6 +43,20 @@ fn photographs(folder: &Path) -> Vec<(String, Camera)> {
         .collect()
 }
 
+/// Degrees by which the turns between successive photographs of `dataset` differ from those of the truth, whatever the world is.
+fn turned_off(dataset: &Dataset, truth: &[(String, Camera)]) -> Vec<f32> {
+    let of = |name: &str| {
+        let (_, camera) = truth.iter().find(|(known, _)| name.ends_with(known.as_str())).unwrap();
+        camera.pose.rotation
+    };
+    let off = |pair: &[View]| {
+        let found = pair[0].camera.pose.rotation.inverse() * pair[1].camera.pose.rotation;
+        let known = of(&pair[0].name).inverse() * of(&pair[1].name);
+        found.angle_between(known).to_degrees()
+    };
+    dataset.views.windows(2).map(off).collect()
+}
+
 fn quietly(input: &PoseInput) -> Result<PoseReport, RunError> {
     pose(input, &|_| {})
 }
@@ -178,22 +192,7 @@ fn ray_traced_photographs_get_their_poses_back_and_a_second_call_reuses_the_feat
     let dataset = read_dataset(&out, &DatasetOptions::default()).unwrap();
     assert_eq!(dataset.views.len(), report.registered);
     assert!(dataset.points.as_ref().is_some_and(|points| points.len() > 200));
-    // Rotations between photographs are those of the truth, whatever the world is.
-    let of = |name: &str| {
-        truth
-            .iter()
-            .find(|(known, _)| name.ends_with(known.as_str()))
-            .unwrap()
-            .1
-            .pose
-            .rotation
-    };
-    let mut angles: Vec<f32> = Vec::new();
-    for (a, b) in dataset.views.iter().zip(&dataset.views[1..]) {
-        let found = a.camera.pose.rotation.inverse() * b.camera.pose.rotation;
-        let known = of(&a.name).inverse() * of(&b.name);
-        angles.push(found.angle_between(known).to_degrees());
-    }
+    let mut angles = turned_off(&dataset, &truth);
     angles.sort_by(f32::total_cmp);
     assert!(angles[angles.len() / 2] < 0.5, "{angles:?}");
 
@@ -374,13 +373,8 @@ fn photographs_far_apart_are_posed_as_they_look_from_the_front() {
     assert!(first.registered < 8 && second.registered >= 13, "{:?}", report.attempts);
     assert_eq!(report.registered, second.registered);
     let dataset = read_dataset(&out, &DatasetOptions::default()).unwrap();
-    let of = |name: &str| all.iter().find(|(known, _)| name.ends_with(known.as_str())).unwrap().1;
-    for pair in dataset.views.windows(2) {
-        let found = pair[0].camera.pose.rotation.inverse() * pair[1].camera.pose.rotation;
-        let [a, b] = [0, 1].map(|i| of(&pair[i].name).pose.rotation);
-        let off = found.angle_between(a.inverse() * b).to_degrees();
-        assert!(off < 3.0, "{} and {}: {off}", pair[0].name, pair[1].name);
-    }
+    let off = turned_off(&dataset, &all);
+    assert!(off.iter().all(|off| *off < 3.0), "{off:?}");
 }
 
 #[test]

@@ -2,7 +2,7 @@
 //! invariant interest point detectors", 2004).
 
 use super::extrema::Extremum;
-use super::scale_space::{FIRST_SCALE, Plane, sigma_of};
+use super::scale_space::{FIRST_SCALE, Plane, gaussian, sigma_of};
 
 /// Side of a patch, px: what a descriptor reaches at any angle, with a margin.
 const SIDE: usize = 40;
@@ -16,9 +16,10 @@ const STEPS: usize = 8;
 const ROUND: f32 = 1.1;
 /// The longest ellipse, as a ratio of its axes.
 const LONGEST: f32 = 6.0;
-
 /// Blur below which it makes no difference, px.
 const SHARP: f32 = 0.4;
+/// Sigmas at which a blur is truncated.
+const REACH: f32 = 3.0;
 /// How much more blurred a level may be than wanted: levels are discrete, and a little more is nearer than much less.
 const MORE_BLURRED: f32 = 1.12;
 
@@ -67,9 +68,8 @@ impl Ellipse {
     /// The ellipse in whose patch the second moments `[xx, xy, yy]` become equal, if they are far from it.
     fn rounder(&self, [xx, xy, yy]: [f32; 3]) -> Option<Self> {
         let det = xx * yy - xy * xy;
-        let (mean, half) = (0.5 * (xx + yy), 0.5 * (xx - yy));
-        let spread = (half * half + xy * xy).sqrt();
-        if det <= 1e-6 * mean * mean || mean + spread < ROUND * ROUND * (mean - spread) {
+        let [short, long] = eigenvalues([xx, xy, yy]);
+        if det <= 1e-6 * (0.5 * (xx + yy)).powi(2) || long < ROUND * ROUND * short {
             return None;
         }
         // C' = B M^-1 B^T, B the patch's axes in the photograph.
@@ -81,12 +81,11 @@ impl Ellipse {
             let ([p, q], [r, t]) = (columns[i], columns[j]);
             p * r * inverse[0] + (p * t + q * r) * inverse[1] + q * t * inverse[2]
         };
-        let (xx, xy, yy) = (product(0, 0), product(0, 1), product(1, 1));
-        let (mean, half) = (0.5 * (xx + yy), 0.5 * (xx - yy));
-        let angle = 0.5 * xy.atan2(half);
+        let shape @ [xx, xy, yy] = [product(0, 0), product(0, 1), product(1, 1)];
+        let angle = 0.5 * xy.atan2(0.5 * (xx - yy));
         Some(Self {
             axis: [angle.cos(), angle.sin()],
-            long: (mean + (half * half + xy * xy).sqrt()).sqrt(),
+            long: eigenvalues(shape)[1].sqrt(),
         })
     }
 
@@ -125,6 +124,13 @@ impl Ellipse {
     }
 }
 
+/// Of the symmetric matrix `[xx, xy, yy]`, ascending.
+fn eigenvalues([xx, xy, yy]: [f32; 3]) -> [f32; 2] {
+    let (mean, half) = (0.5 * (xx + yy), 0.5 * (xx - yy));
+    let spread = (half * half + xy * xy).sqrt();
+    [mean - spread, mean + spread]
+}
+
 /// The most blurred level that is blurred by about `sigma` pixels of octave `from` at most: its octave, and its index there.
 fn level_of(octaves: &[Vec<Plane>], from: usize, sigma: f32) -> (usize, usize) {
     let wanted = MORE_BLURRED * sigma;
@@ -151,21 +157,11 @@ fn between(plane: &Plane, x: f32, y: f32) -> f32 {
     top + (bottom - top) * v
 }
 
-/// Weights of a Gaussian, from its centre outwards.
-fn taps(sigma: f32) -> Vec<f32> {
-    let radius = (3.0 * sigma).ceil() as usize;
-    let weights: Vec<f32> = (0..=radius)
-        .map(|i| (-0.5 * (i as f32 / sigma).powi(2)).exp())
-        .collect();
-    let sum = weights[0] + 2.0 * weights[1..].iter().sum::<f32>();
-    weights.iter().map(|weight| weight / sum).collect()
-}
-
 fn blur_rows(plane: &mut Plane, sigma: f32) {
     if sigma < SHARP {
         return;
     }
-    let taps = taps(sigma);
+    let taps = gaussian(sigma, REACH);
     for row in plane.rows_mut() {
         let old: [f32; SIDE] = std::array::from_fn(|i| row[i]);
         for (i, value) in row[..SIDE].iter_mut().enumerate() {
@@ -181,7 +177,7 @@ fn blur_columns(plane: &mut Plane, sigma: f32) {
     if sigma < SHARP {
         return;
     }
-    let taps = taps(sigma);
+    let taps = gaussian(sigma, REACH);
     let old = plane.clone();
     for (j, row) in plane.rows_mut().enumerate() {
         for (value, centre) in row.iter_mut().zip(old.row(j)) {

@@ -162,13 +162,18 @@ impl Octave {
 
 /// `plane` blurred by a Gaussian of `sigma` pixels, truncated at 4 sigma as in VLFeat; pixels outside repeat the border.
 fn blurred(level: Level, plane: &Plane, sigma: f32) -> Plane {
-    let radius = (4.0 * sigma).ceil() as usize;
+    let taps = gaussian(sigma, 4.0);
+    level.run(Blur { plane, taps: &taps })
+}
+
+/// Weights of a Gaussian of `sigma` pixels, from its centre outwards, truncated at `reach` sigmas.
+pub(super) fn gaussian(sigma: f32, reach: f32) -> Vec<f32> {
+    let radius = (reach * sigma).ceil() as usize;
     let weights: Vec<f64> = (0..=radius)
         .map(|i| (-0.5 * (i as f64 / f64::from(sigma)).powi(2)).exp())
         .collect();
     let sum = weights[0] + 2.0 * weights[1..].iter().sum::<f64>();
-    let taps: Vec<f32> = weights.iter().map(|weight| (weight / sum) as f32).collect();
-    level.run(Blur { plane, taps: &taps })
+    weights.iter().map(|weight| (weight / sum) as f32).collect()
 }
 
 struct Blur<'a> {

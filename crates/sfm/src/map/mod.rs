@@ -100,8 +100,7 @@ pub fn reconstruct(
             cameras[group] = Some((DCamera::centered(lens.width, lens.height, focal), Source::Pairs));
         }
         let again = mapped(&apart, features, pairs, &cameras, options, progress);
-        let registered = |found: &Reconstruction| found.models.first().map_or(0, Model::registered);
-        if registered(&again) < registered(&found) || !zoom::holds(&zoom, &again.models) {
+        if again.registered() < found.registered() || !zoom::holds(&zoom, &again.models) {
             break;
         }
         let zooms = [std::mem::take(&mut found.zooms), vec![zoom]].concat();

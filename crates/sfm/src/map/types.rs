@@ -191,6 +191,11 @@ pub struct Reconstruction {
 }
 
 impl Reconstruction {
+    /// Photographs with a pose in the largest model.
+    pub fn registered(&self) -> usize {
+        self.models.first().map_or(0, Model::registered)
+    }
+
     /// Pairs of photographs that should share points and do not, where they are too many to be chance, and that are not among `matched`.
     pub fn absent_and_unmatched(&self, matched: &[PairMatches]) -> Vec<[u32; 2]> {
         if self.absent.len() < ABSENT_PAIRS {

@@ -35,6 +35,7 @@ mod run;
 pub mod schedule;
 pub mod socket;
 mod spacing;
+mod splat_step;
 pub mod tensor_file;
 pub mod times;
 mod trainer;

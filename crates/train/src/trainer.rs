@@ -1,4 +1,4 @@
-//! Start here: [`Trainer::step`] is one step from batch to update.
+//! Start here: the whole state of a run, and [`Trainer::step`], which advances it; what a step does is in `splat_step.rs` and `field_step.rs`.
 
 use crate::depth_maps::DepthMaps;
 use crate::device::{DeviceLoss, use_device};
@@ -12,27 +12,20 @@ use crate::lights::Lights;
 use crate::memory::{MemoryPlan, Needs};
 use crate::model::Model;
 use crate::normal_maps::NormalMaps;
-use crate::objective::{Objective, ObjectiveValues, Reference};
+use crate::objective::Objective;
 use crate::photos::{PhotoCache, Prepared};
 use crate::pixel_size::pixel_size;
-use crate::recipe::{AdamKind, Choice, DensityControl, LengthUnit, Param, Recipe};
-use crate::schedule::{Clock, Round, StepMetrics, StepPlan, plan, upcoming_views};
+use crate::recipe::{Choice, Recipe};
+use crate::schedule::{Clock, StepMetrics, StepPlan, upcoming_views};
 use crate::socket::{Residual, Sky, Sockets};
 use crate::times::Times;
 use crate::transients::Hidden;
 use cpu_time::ProcessTime;
-use irradia_compute::adam::AdamStep;
 use irradia_compute::{Device, DeviceError};
 use irradia_field::{FieldEngine, FieldError, FieldState, KnownDepth};
 use irradia_measure::Lpips;
-use irradia_scene::{Camera, Dataset, LoadError, Rng, sh};
-use irradia_splat::densify::{DensityChange, classic, fast, mcmc, merge, taming};
-use irradia_splat::init;
-use irradia_splat::regularize::AngleCap;
-use irradia_splat::{
-    Engine, FramePlanes, Gather, Noise, Optimizer, RenderOptions, SplatState, Splats, Statistics, Update, ViewParams,
-    filter,
-};
+use irradia_scene::{Camera, Dataset, LoadError, sh};
+use irradia_splat::{Engine, RenderOptions, SplatState, Splats, filter, init};
 use std::borrow::Cow;
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -116,13 +109,9 @@ impl Default for TrainOptions {
 
 /// Random streams derived from the run's seed, one per use.
 pub(crate) const STREAM_INIT: u64 = 1;
-const STREAM_DENSIFY: u64 = 2;
-const STREAM_STEP: u64 = 5;
 
 /// A run of sparse photographs has at least one part in this many of the recipe's own steps.
 const LEAST_SPARSE: u64 = 5;
-/// Training views over which the convergence error is measured.
-const MEASURED_VIEWS: usize = 8;
 
 /// A run's whole state.
 pub struct Trainer {
@@ -149,7 +138,7 @@ pub struct Trainer {
     /// Extent of the scene, world units: 1.1 times the largest distance of a camera from their mean (3DGS).
     pub extent: f32,
     /// What the rate of the means is relative to, world units: the extent, or a number of pixels.
-    extent_of_rate: f32,
+    pub(crate) extent_of_rate: f32,
     /// Wall time of all steps so far, excluding the loading of photographs and the evaluation of held-out views.
     pub seconds: f64,
     /// CPU time of all steps so far, over all threads.
@@ -171,11 +160,11 @@ pub struct Trainer {
     pub(crate) normal_maps: Option<NormalMaps>,
     /// Known depths of the views on which a field is trained, by view, width and height.
     pub(crate) depths: HashMap<(usize, u32, u32), Arc<[KnownDepth]>>,
-    objective: Objective,
-    device_loss: DeviceLoss,
+    pub(crate) objective: Objective,
+    pub(crate) device_loss: DeviceLoss,
     /// Steps of this process whose frames were read back from a GPU for their losses.
     pub(crate) read_for_losses: u64,
-    free_space: FreeSpace,
+    pub(crate) free_space: FreeSpace,
 }
 
 impl Trainer {
@@ -398,248 +387,12 @@ impl Trainer {
         Ok(report)
     }
 
-    fn splat_step(&mut self, events: &mut Vec<Event>) -> Result<(StepReport, StepMetrics), TrainError> {
-        let plan = plan(&self.recipe, &self.clock);
-        let upcoming = upcoming_views(&self.trained, self.options.seed, &self.clock);
-        let photo = self.photos.get(&upcoming, plan.image_scale)?;
-        let (started, cpu_started) = (Instant::now(), ProcessTime::now());
-        let camera = &self.dataset.views[upcoming[0]].camera;
-        let photo = self.hidden.apply(upcoming[0], camera, &photo).map_or(photo, Arc::new);
-        let mut rng = Rng::new(self.options.seed ^ self.clock.step << 20, STREAM_STEP);
-        let view = upcoming[0];
-        let placement = self.sockets.place(view, &self.scaled_camera(view, plan.image_scale));
-        let camera = placement.camera;
-        if plan.refilter {
-            self.update_filter();
-        }
-
-        let background = plan
-            .is_on(Param::RandomBackground)
-            .then(|| std::array::from_fn(|_| rng.uniform()))
-            .filter(|_| photo.alpha.is_some());
-        let usual = self.render_options(plan.sh_degree);
-        let options = RenderOptions {
-            background: background.unwrap_or(usual.background),
-            depth: plan.compares_depth(),
-            ..usual
-        };
-        let depth_map = self.given_depths(view, &camera, &plan);
-        let normal_map = self.given_normals(view, &camera, &plan);
-        let reference = Reference {
-            photo: &photo,
-            background,
-            depths: &self.known_depths(view, &camera, &plan),
-            depth_map: depth_map.as_ref().map(|(samples, kind)| (&samples[..], *kind)),
-            normal_map: normal_map
-                .as_ref()
-                .map(|(samples, reach)| (&samples[..], *reach, &camera.intrinsics)),
-        };
-        let (update, has_lpips) = (self.update(&plan, &camera), self.options.lpips.is_some());
-        let ahead = self.sockets.are_empty().then(|| {
-            let frame = (&camera, &options);
-            self.device_loss
-                .whole_step(&mut self.engine, frame, &reference, &plan, &update, has_lpips)
-        });
-        let loss = match ahead.flatten() {
-            Some(loss) => loss,
-            None => {
-                self.sockets.render(&mut self.engine, view, placement, &options, &plan);
-                let loss = self.step_losses(&reference, (view, &camera), &plan, &mut rng);
-                self.sockets
-                    .step_before_blending(&mut self.engine, view, &camera, self.extent, &plan);
-                self.engine.update(&update);
-                loss
-            }
-        };
-        let density_started = Instant::now();
-        if let Some(change) = self.control_density(&plan) {
-            events.push(Event::densified(self.clock.step + 1, change, self.engine.len()));
-        }
-        self.times.density += density_started.elapsed().as_secs_f64();
-        self.seconds += started.elapsed().as_secs_f64();
-        self.cpu_seconds += cpu_started.elapsed().as_secs_f64();
-
-        let metrics = StepMetrics {
-            error: loss.l1,
-            measured: if plan.measure {
-                Some(self.measure_error(&plan)?)
-            } else {
-                None
-            },
-            views: self.dataset.train.len() as u64,
-        };
-        let report = StepReport {
-            step: self.clock.step + 1,
-            seconds: self.seconds,
-            seconds_left: 0.0,
-            seconds_left_range: [0.0; 2],
-            pace: self.pace,
-            view,
-            loss: loss.total,
-            mse: loss.mse,
-            splats: self.engine.len(),
-            parameters: None,
-            visible: self.engine.visible(),
-            non_finite: self.engine.non_finite(),
-        };
-        Ok((report, metrics))
-    }
-
-    /// The losses of the last frame, and its backward pass.
-    fn step_losses(
-        &mut self,
-        reference: &Reference,
-        (view, camera): (usize, &Camera),
-        plan: &StepPlan,
-        rng: &mut Rng,
-    ) -> ObjectiveValues {
-        let camera_gradient = self.sockets.needs_camera_gradient();
-        let on_device = (!self.sockets.are_after_blending()).then(|| {
-            let has_lpips = self.options.lpips.is_some();
-            self.device_loss
-                .step(&mut self.engine, reference, plan, camera_gradient, has_lpips)
-        });
-        if let Some(loss) = on_device.flatten() {
-            return loss;
-        }
-        self.read_for_losses += u64::from(self.engine.is_on_gpu());
-        let frame = FramePlanes {
-            color: self.sockets.frame_color(&self.engine),
-            ..self.engine.frame()
-        };
-        let loss = self.objective.evaluate(frame, reference, plan, rng);
-        if plan.gathers == Some(Statistics::Error) {
-            self.objective
-                .error(frame.color, reference.photo, reference.background.is_some());
-            if plan.edge_share > 0.0 {
-                self.objective.add_edges(reference.photo, plan.edge_share);
-            }
-        }
-        self.sockets
-            .step_after_blending(&self.engine, view, camera, &mut self.objective, plan);
-        let mut v_out = self.objective.gradient();
-        v_out.camera = camera_gradient;
-        v_out.gather = match plan.gathers {
-            Some(Statistics::AbsoluteGradient) => Gather::Absolute,
-            Some(Statistics::Error) => self.objective.gather_error(),
-            Some(Statistics::Gradient) | None => Gather::Nothing,
-        };
-        self.engine.backward(&v_out);
-        loss
-    }
-
-    /// The splat update of this step, whose view is that of `camera`.
-    fn update(&self, plan: &StepPlan, camera: &Camera) -> Update {
-        let longer = self.pace.min(1.0).powf(f64::from(self.recipe.length_exponent)) as f32;
-        let mut rates = plan.rates().scaled(longer);
-        rates.means *= self.extent_of_rate;
-        let adam = &self.recipe.adam;
-        let (noise, limit) = (plan.value(Param::Noise), plan.value(Param::ConditionCap));
-        Update {
-            statistics: plan.gathers,
-            regularizers: plan.regularizers(),
-            regularized: self.recipe.regularizers.of.into(),
-            regularizer_unit: match self.recipe.regularizers.unit {
-                LengthUnit::Extent => self.extent,
-                LengthUnit::World => 1.0,
-            },
-            trained_fraction: plan.value(Param::TrainedShare),
-            rates,
-            sh_degree: plan.sh_degree,
-            optimizer: Optimizer {
-                step: AdamStep {
-                    beta1: adam.beta1,
-                    beta2: adam.beta2,
-                    epsilon: adam.epsilon,
-                    step: self.clock.step + 1,
-                },
-                dense: adam.kind == AdamKind::Dense,
-            },
-            noise: (noise > 0.0).then_some(Noise {
-                amount: noise * rates.means,
-                seed: self.options.seed,
-                step: self.clock.step,
-            }),
-            condition_cap: (limit > 0.0).then_some(limit),
-            angle_cap: AngleCap::of(camera),
-        }
-    }
-
-    fn control_density(&mut self, plan: &StepPlan) -> Option<DensityChange> {
-        let change = plan.densify.as_ref().map(|round| self.densify(round));
-        let merged = plan
-            .merge
-            .map(|knobs| merge::merge(self.engine.state_mut(), &knobs.options()));
-        if let Some(ceiling) = plan.reset_opacity {
-            self.engine.edit_density(|state| classic::reset_opacity(state, ceiling));
-        }
-        if change.is_some() && self.recipe.render.smoothing_filter {
-            self.update_filter();
-        }
-        match (change, merged) {
-            (Some(change), Some(merged)) => Some(DensityChange {
-                pruned: change.pruned + merged.pruned,
-                ..change
-            }),
-            (change, merged) => change.or(merged),
-        }
-    }
-
-    fn densify(&mut self, round: &Round) -> DensityChange {
-        let (intersections, pixels) = (self.engine.intersections(), self.engine.pixels());
-        let limit = self
-            .limit(self.clock.stage, round.count_share)
-            .min(self.engine.most_splats());
-        let first = first_count(&self.dataset, &self.recipe);
-        let mut rng = Rng::new(self.options.seed ^ self.clock.step << 20, STREAM_DENSIFY);
-        self.engine.edit_density(|state| {
-            let cleared = self.free_space.clear(state);
-            let limit = limit.min(self.memory.splats_at(intersections, state.len(), pixels));
-            let change = match round.density {
-                DensityControl::Classic(knobs) => {
-                    let options = knobs.options(self.extent, round.prune_large, limit);
-                    classic::densify(state, &options, &mut rng)
-                }
-                DensityControl::Mcmc(knobs) => mcmc::densify(state, &knobs.options(self.pace, limit), &mut rng),
-                DensityControl::Taming(knobs) => {
-                    let target = taming::next_count(state.len(), limit, round.completed);
-                    let options = knobs.options(self.extent, round.prune_large, round.number, target);
-                    taming::densify(state, &options, &mut rng)
-                }
-                DensityControl::Fast(knobs) => {
-                    let floor = ((f64::from(knobs.floor) * self.pixels) as usize).min(first).min(limit);
-                    fast::densify(state, &knobs.options(self.pace, floor, limit))
-                }
-            };
-            DensityChange {
-                pruned: change.pruned + cleared,
-                ..change
-            }
-        })
-    }
-
     /// Maximum number of splats of stage `stage` at `count_share`, a fraction of the cap.
     pub(crate) fn limit(&self, stage: usize, count_share: f64) -> usize {
         let limit = self.cap as f64 * count_share;
         let stage = &self.recipe.stage[stage.min(self.recipe.stage.len() - 1)];
         let fraction = stage.density.map_or(1.0, |density| density.limit_fraction(self.pace));
         ((limit * fraction) as usize).max(1)
-    }
-
-    fn update_filter(&mut self) {
-        let views: Vec<ViewParams> = self
-            .dataset
-            .train
-            .iter()
-            .map(|i| ViewParams::new(&self.dataset.views[*i].camera))
-            .collect();
-        self.engine.edit_density(|state| filter::update(state, &views));
-        self.restore_filter();
-    }
-
-    /// Passes the state's filter to the renderer.
-    pub(crate) fn restore_filter(&mut self) {
-        self.engine.use_filter(self.recipe.render.smoothing_filter);
     }
 
     /// The training views' cameras.
@@ -651,17 +404,6 @@ impl Trainer {
         let mut camera = self.dataset.views[view].camera;
         camera.intrinsics = camera.intrinsics.scaled(scale);
         camera
-    }
-
-    /// Mean L1 error over some training views, evenly spaced, as the plan renders them.
-    fn measure_error(&mut self, plan: &StepPlan) -> Result<f64, TrainError> {
-        let (mut sum, mut count) = (0.0, 0);
-        self.show_training_views(MEASURED_VIEWS, plan, false, |trainer, view, photo| {
-            let shown = trainer.hidden.apply(view, &trainer.dataset.views[view].camera, photo);
-            sum += trainer.error_of_frame(shown.as_ref().unwrap_or(photo));
-            count += 1;
-        })?;
-        Ok(sum / f64::from(count.max(1)))
     }
 
     /// Mean L1 error of the last frame against its photograph.

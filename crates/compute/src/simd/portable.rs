@@ -1,9 +1,10 @@
-//! Lanes without intrinsics: arrays of four `f32`, and one `f64`.
+//! Lanes without run-time dispatch: four `f32`, in the registers that every processor of the architecture has where glam knows them, and one `f64`.
 
 use super::{EXP2, Lanes, Mask, Simd};
+use glam::{BVec4A, Vec4};
 use std::ops::{Add, AddAssign, Div, Mul, MulAssign, Neg, Sub, SubAssign};
 
-/// Arrays of four `f32`; always available.
+/// Four `f32`; always available.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Portable;
 
@@ -11,61 +12,54 @@ pub struct Portable;
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Double;
 
-const N: usize = 4;
-
-/// Four `f32`.
+/// Four `f32`. As an array of them, which the compiler has to find vectors in, the kernels of `irradia-splat` took it three times as long to compile.
 #[derive(Clone, Copy, Debug)]
-#[repr(align(16))]
-pub struct Four([f32; N]);
+pub struct Four(Vec4);
 
 /// Four booleans.
 #[derive(Clone, Copy, Debug)]
-pub struct FourMask([bool; N]);
+pub struct FourMask(BVec4A);
 
 impl Four {
     #[inline(always)]
-    fn zip(self, other: Self, f: impl Fn(f32, f32) -> f32) -> Self {
-        Four(std::array::from_fn(|i| f(self.0[i], other.0[i])))
-    }
-    #[inline(always)]
     fn each(self, f: impl Fn(f32) -> f32) -> Self {
-        Four(self.0.map(f))
+        Four(Vec4::from_array(self.0.to_array().map(f)))
     }
 }
 
 impl Simd for Portable {
     type F = Four;
-    const LANES: usize = N;
+    const LANES: usize = 4;
     #[inline(always)]
     fn splat(self, value: f64) -> Four {
-        Four([value as f32; N])
+        self.set(value as f32)
     }
     #[inline(always)]
     fn set(self, value: f32) -> Four {
-        Four([value; N])
+        Four(Vec4::splat(value))
     }
     #[inline(always)]
     fn load(self, from: &[f32]) -> Four {
-        Four(*from.first_chunk().expect("a whole vector"))
+        Four(Vec4::from_array(*from.first_chunk().expect("a whole vector")))
     }
 }
 
 impl Mask for FourMask {
     #[inline(always)]
     fn and(self, other: Self) -> Self {
-        FourMask(std::array::from_fn(|i| self.0[i] & other.0[i]))
+        FourMask(self.0 & other.0)
     }
     #[inline(always)]
     fn or(self, other: Self) -> Self {
-        FourMask(std::array::from_fn(|i| self.0[i] | other.0[i]))
+        FourMask(self.0 | other.0)
     }
     #[inline(always)]
     fn and_not(self, other: Self) -> Self {
-        FourMask(std::array::from_fn(|i| self.0[i] & !other.0[i]))
+        FourMask(self.0 & !other.0)
     }
     #[inline(always)]
     fn bits(self) -> u32 {
-        (0..N).map(|i| u32::from(self.0[i]) << i).sum()
+        self.0.bitmask()
     }
 }
 
@@ -79,13 +73,13 @@ impl Lanes for Four {
     }
     #[inline(always)]
     fn store(self, to: &mut [f32]) {
-        *to.first_chunk_mut().expect("room for a vector") = self.0;
+        *to.first_chunk_mut().expect("room for a vector") = self.0.to_array();
     }
     #[inline(always)]
     fn mul_add(self, b: Self, c: Self) -> Self {
         // Without an FMA instruction `f32::mul_add` is a library call, fifty times slower than a product and a sum.
         if cfg!(any(target_feature = "fma", target_arch = "aarch64")) {
-            Four(std::array::from_fn(|i| self.0[i].mul_add(b.0[i], c.0[i])))
+            Four(self.0.mul_add(b.0, c.0))
         } else {
             self * b + c
         }
@@ -96,53 +90,52 @@ impl Lanes for Four {
     }
     #[inline(always)]
     fn min(self, other: Self) -> Self {
-        self.zip(other, |a, b| if a < b { a } else { b })
+        Four(self.0.min(other.0))
     }
     #[inline(always)]
     fn max(self, other: Self) -> Self {
-        self.zip(other, |a, b| if a > b { a } else { b })
+        Four(self.0.max(other.0))
     }
     #[inline(always)]
     fn abs(self) -> Self {
-        self.each(f32::abs)
+        Four(self.0.abs())
     }
     #[inline(always)]
     fn floor(self) -> Self {
-        self.each(f32::floor)
+        Four(self.0.floor())
     }
     #[inline(always)]
     fn lt(self, other: Self) -> FourMask {
-        FourMask(std::array::from_fn(|i| self.0[i] < other.0[i]))
+        FourMask(self.0.cmplt(other.0))
     }
     #[inline(always)]
     fn le(self, other: Self) -> FourMask {
-        FourMask(std::array::from_fn(|i| self.0[i] <= other.0[i]))
+        FourMask(self.0.cmple(other.0))
     }
     #[inline(always)]
     fn select(self, mask: FourMask, other: Self) -> Self {
-        Four(std::array::from_fn(|i| if mask.0[i] { self.0[i] } else { other.0[i] }))
+        Four(Vec4::select(mask.0, self.0, other.0))
     }
     #[inline(always)]
     fn exp2_in_range(self) -> Self {
-        // Adding and subtracting 1.5 * 2^23 rounds to the nearest integer without a library call.
-        const MAGIC: f32 = 12_582_912.0;
-        let n = self.each(|v| (v + MAGIC) - MAGIC);
-        let f = self - n;
-        let mut p = Four([EXP2[5]; N]);
+        // Adding 1.5 * 2^23 rounds to the nearest integer without a library call, and leaves it in the last bits.
+        let magic = Portable.set(12_582_912.0);
+        let rounded = self + magic;
+        let f = self - (rounded - magic);
+        let mut p = Portable.set(EXP2[5]);
         for k in (0..5).rev() {
-            p = p.mul_add(f, Four([EXP2[k]; N]));
+            p = p.mul_add(f, Portable.set(EXP2[k]));
         }
-        p.zip(n, |p, n| {
-            p * f32::from_bits(((n as i32).wrapping_add(127) << 23) as u32)
-        })
+        p * rounded.each(|n| f32::from_bits(n.to_bits().wrapping_add(127) << 23))
     }
     #[inline(always)]
     fn recip(self) -> Self {
-        self.each(|v| 1.0 / v)
+        Portable.set(1.0) / self
     }
     #[inline(always)]
     fn sum(self) -> f32 {
-        (self.0[0] + self.0[2]) + (self.0[1] + self.0[3])
+        let [a, b, c, d] = self.0.to_array();
+        (a + c) + (b + d)
     }
 }
 
@@ -250,7 +243,7 @@ macro_rules! lane_operators {
             type Output = Self;
             #[inline(always)]
             fn $method(self, other: Self) -> Self {
-                self.zip(other, |a, b| a $symbol b)
+                Four(self.0 $symbol other.0)
             }
         }
         impl $assign for Four {
@@ -271,7 +264,7 @@ impl Div for Four {
     type Output = Self;
     #[inline(always)]
     fn div(self, other: Self) -> Self {
-        self.zip(other, |a, b| a / b)
+        Four(self.0 / other.0)
     }
 }
 
@@ -279,6 +272,6 @@ impl Neg for Four {
     type Output = Self;
     #[inline(always)]
     fn neg(self) -> Self {
-        self.each(|v| -v)
+        Four(-self.0)
     }
 }

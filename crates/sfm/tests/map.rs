@@ -8,7 +8,7 @@ use irradia_sfm::geometry::camera::DCamera;
 use irradia_sfm::geometry::pose::DPose;
 use irradia_sfm::map::{
     Distance, Known, MapOptions, Model, ModelPoint, Mount, PairKind, PhotoInfo, Reason, Reconstruction,
-    add_guided_points, agreement, extend, reconstruct, to_distances, verify,
+    add_guided_points, agreement, determines_focal, extend, reconstruct, to_distances, verify,
 };
 use irradia_sfm::{DESCRIPTOR_BYTES, Features, Keypoint, PairMatches};
 use std::f64::consts::{FRAC_PI_2, PI};
@@ -134,16 +134,6 @@ fn wall_of_look_alikes(photos: usize) -> (Vec<DVec3>, Vec<PhotoInfo>, Vec<Featur
             std::array::from_fn(|i| (512.0 * values[i] / length).round().min(255.0) as u8)
         })
         .collect();
-    let camera = PhotoInfo {
-        name: String::new(),
-        width: CAMERA.width,
-        height: CAMERA.height,
-        group: 0,
-        focal_prior_px: None,
-        up: None,
-        camera: Some(CAMERA),
-        mount: None,
-    };
     let (mut features, mut shown) = (Vec::new(), Vec::new());
     for pose in &around(40, 1.0)[..photos] {
         let here: Vec<usize> = (0..wall.len()).filter(|_| rng.uniform() < 0.8).collect();
@@ -164,7 +154,21 @@ fn wall_of_look_alikes(photos: usize) -> (Vec<DVec3>, Vec<PhotoInfo>, Vec<Featur
         });
         shown.push(here);
     }
-    (wall, vec![camera; photos], features, shown)
+    (wall, vec![photo(); photos], features, shown)
+}
+
+/// A photograph by a known camera.
+fn photo() -> PhotoInfo {
+    PhotoInfo {
+        name: String::new(),
+        width: CAMERA.width,
+        height: CAMERA.height,
+        group: 0,
+        focal_prior_px: None,
+        up: None,
+        camera: Some(CAMERA),
+        mount: None,
+    }
 }
 
 #[test]
@@ -241,6 +245,59 @@ fn look_alikes_match_along_the_lines_of_known_poses() {
     };
     add_guided_points(&photos[..2], &features[..2], &[], &mut two, &MapOptions::default());
     assert_eq!(two.points, before.points);
+}
+
+/// Of cameras that only step aside, another focal length is another depth.
+#[test]
+fn cameras_that_turn_determine_a_focal_length() {
+    for turn in [true, false] {
+        let mut rng = Rng::new(7, 0);
+        let mut within = |range: f32| f64::from(rng.range(-range, range));
+        let wall: Vec<DVec3> = (0..300)
+            .map(|_| {
+                let [y, z] = [within(2.0), within(2.0)];
+                DVec3::new(4.0 + 0.5 * (3.0 * y).sin() * z, y, z)
+            })
+            .collect();
+        let poses: Vec<DPose> = (0..8)
+            .map(|_| {
+                let eye = DVec3::new(0.0, within(1.0), within(1.0));
+                look(eye, if turn { 4.0 * DVec3::X } else { eye + DVec3::X })
+            })
+            .collect();
+        let mut keypoint = |pose: &DPose, point: &DVec3| {
+            let at = CAMERA.pixel(pose.camera_from_world(*point)).as_vec2();
+            let [x, y] = [at.x, at.y].map(|v| v + within(0.5) as f32);
+            Keypoint {
+                x,
+                y,
+                scale: 2.0,
+                angle: 0.0,
+            }
+        };
+        let features: Vec<Features> = poses
+            .iter()
+            .map(|pose| Features {
+                keypoints: wall.iter().map(|point| keypoint(pose, point)).collect(),
+                ..Features::default()
+            })
+            .collect();
+        let track = |point: u32| (0..poses.len() as u32).map(|photo| (photo, point)).collect();
+        let points = (0..).zip(&wall).map(|(i, position)| ModelPoint {
+            position: *position,
+            error: 0.3,
+            track: track(i),
+        });
+        let model = Model {
+            cameras: vec![Some(CAMERA)],
+            points: points.collect(),
+            focal_held: vec![false],
+            poses: poses.iter().copied().map(Some).collect(),
+        };
+        let photos = vec![photo(); poses.len()];
+        let determined = determines_focal(&photos, &features, &model, 0);
+        assert_eq!(determined, turn);
+    }
 }
 
 /// Panoramas on a walk through a room, each as the six faces of a cube, with a known camera.

@@ -1,7 +1,7 @@
 //! Focal lengths: several settings, zooms that no metadata tell, and such as cannot be known.
 
 use super::{Diagnosis, Evidence};
-use crate::map::{PairKind, Source, Zoom};
+use crate::map::{PairKind, Source, Zoom, determines_focal};
 
 /// Ratio of focal lengths in the metadata from which on they are two settings: less is breathing while the lens focuses.
 const SETTING: f64 = 1.08;
@@ -78,9 +78,13 @@ pub(super) fn focal_unknown(evidence: &Evidence) -> Vec<Diagnosis> {
                 .filter(|pair| pair.photos.iter().all(|p| of_group(*p as usize)))
         };
         let general = pairs().filter(|pair| pair.kind == PairKind::General).count();
-        // What the pairs leave open, many photographs of a scene with depth may still determine together.
         let open = *source == Source::Guess && (general as f64) < GENERAL * pairs().count() as f64;
-        if (open || held) && photos.len() > 2 {
+        // What the pairs leave open, many photographs of a scene with depth may still determine together.
+        let determined = || {
+            let model = evidence.model.filter(|model| model.cameras[group].is_some());
+            model.is_some_and(|model| determines_focal(evidence.photos, evidence.features, model, group))
+        };
+        if photos.len() > 2 && (held || open && !determined()) {
             found.push(Diagnosis::FocalUnknown { photos });
         }
     }

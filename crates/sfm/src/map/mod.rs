@@ -15,6 +15,7 @@ mod grow;
 mod guide;
 mod metric;
 mod model;
+mod observable;
 mod readjust;
 mod refine;
 mod seed;
@@ -32,6 +33,7 @@ pub(crate) use finish::up;
 pub use focal::Source;
 pub use guide::add_guided_points;
 pub use metric::{Metric, to_metres};
+pub use observable::determines_focal;
 pub(crate) use types::rigs;
 pub use types::{
     Absent, Known, LeftOut, MapOptions, Model, ModelPoint, Mount, PairKind, PhotoInfo, Progress, Reason,

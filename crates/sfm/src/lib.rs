@@ -6,6 +6,7 @@
 #![forbid(unsafe_code)]
 
 pub mod adjust;
+mod connected;
 pub mod doctor;
 pub mod features;
 pub mod geometry;
@@ -14,5 +15,6 @@ pub mod map;
 pub mod matching;
 mod median;
 
+pub(crate) use connected::connected;
 pub use keypoints::{DESCRIPTOR_BYTES, Features, Keypoint, PairMatches};
 pub(crate) use median::median;

@@ -8,7 +8,8 @@ use irradia_sfm::geometry::camera::DCamera;
 use irradia_sfm::geometry::pose::DPose;
 use irradia_sfm::map::{
     Distance, Known, MapOptions, Model, ModelPoint, Mount, PairKind, PhotoInfo, Reason, Reconstruction,
-    add_guided_points, agreement, determines_focal, extend, reconstruct, to_distances, verify,
+    add_guided_points, agreement, determines_focal, extend, reconstruct, same_place, stands_still, to_distances,
+    verify,
 };
 use irradia_sfm::{DESCRIPTOR_BYTES, Features, Keypoint, PairMatches};
 use std::f64::consts::{FRAC_PI_2, PI};
@@ -245,6 +246,47 @@ fn look_alikes_match_along_the_lines_of_known_poses() {
     };
     add_guided_points(&photos[..2], &features[..2], &[], &mut two, &MapOptions::default());
     assert_eq!(two.points, before.points);
+}
+
+/// A world of which every photograph has the same `still` keypoints in the same places, matched in all pairs.
+fn behind_glass(still: usize) -> World {
+    let mut world = World::new(around(24, 1.0), 1500, 0.5, 0.2, 1);
+    let mut rng = Rng::new(11, 0);
+    let [width, height] = [CAMERA.width, CAMERA.height].map(|side| side as f32);
+    let on_the_glass: Vec<Keypoint> = (0..still)
+        .map(|_| Keypoint {
+            x: rng.range(0.0, width),
+            y: rng.range(0.0, height),
+            scale: 2.0,
+            angle: 0.0,
+        })
+        .collect();
+    let first: Vec<u32> = world.features.iter().map(|of| of.keypoints.len() as u32).collect();
+    for features in &mut world.features {
+        features.keypoints.extend(&on_the_glass);
+        features.descriptors.extend(vec![[0; DESCRIPTOR_BYTES]; still]);
+    }
+    for pair in &mut world.pairs {
+        let [a, b] = pair.photos.map(|photo| first[photo as usize]);
+        pair.matches.extend((0..still as u32).map(|i| [a + i, b + i]));
+    }
+    world
+}
+
+#[test]
+fn poses_follow_what_moves_and_not_what_stands_still() {
+    let world = behind_glass(400);
+    let most = world.pairs.iter().filter(|pair| pair.matches.len() < 800).count();
+    assert!(2 * most > world.pairs.len(), "most matches stand still in most pairs");
+    let found = stands_still(&world.photos, &world.features, &world.pairs).expect("400 keypoints stand still");
+    assert!(found.fraction > 0.5, "{found:?}");
+    let result = world.map();
+    let model = &result.models[0];
+    assert_eq!(model.registered(), 24);
+    assert!(world.auc(model, 1.0) > 90.0, "{}", world.auc(model, 1.0));
+    let clean = behind_glass(0);
+    assert_eq!(stands_still(&clean.photos, &clean.features, &clean.pairs), None);
+    assert!(same_place(&clean.photos, &clean.features, &clean.pairs).is_empty());
 }
 
 /// Of cameras that only step aside, another focal length is another depth.

@@ -24,7 +24,7 @@ pub use types::{Diagnosis, Kind};
 
 use crate::geometry::camera::DCamera;
 use crate::map::{Absent, LeftOut, Model, PairKind, PhotoInfo, Reason, Source, VerifiedPair, Zoom, rigs};
-use crate::{Features, PairMatches};
+use crate::{Features, PairMatches, connected};
 use std::collections::BTreeMap;
 
 /// Everything that is known of a capture. All that is by photograph has the same order.
@@ -107,33 +107,6 @@ impl Graph {
     }
 }
 
-/// The parts of `count` photographs that links join, largest first, each ascending.
-fn connected<L: Iterator<Item = usize>>(count: usize, linked: impl Fn(usize) -> L) -> Vec<Vec<usize>> {
-    let mut reached = vec![false; count];
-    let mut parts: Vec<Vec<usize>> = Vec::new();
-    for start in 0..count {
-        if reached[start] {
-            continue;
-        }
-        reached[start] = true;
-        let mut part = vec![start];
-        let mut next = 0;
-        while next < part.len() {
-            for other in linked(part[next]) {
-                if !reached[other] {
-                    reached[other] = true;
-                    part.push(other);
-                }
-            }
-            next += 1;
-        }
-        part.sort_unstable();
-        parts.push(part);
-    }
-    parts.sort_by_key(|part| (std::cmp::Reverse(part.len()), part[0]));
-    parts
-}
-
 /// All that is wrong with a capture, the gravest first.
 ///
 /// # Panics
@@ -151,16 +124,7 @@ pub fn diagnose(evidence: &Evidence) -> Vec<Diagnosis> {
         return Vec::new();
     }
     let graph = Graph::new(evidence, HOLDS);
-    let mut still = motion::stands_still(evidence);
-    // Pairs on a turntable seem taken from one place.
-    let mut twice = Vec::new();
-    if still.is_empty() {
-        twice = motion::twice(evidence);
-        still = motion::stands_behind(evidence, &twice);
-    }
-    if !still.is_empty() {
-        twice.clear();
-    }
+    let (still, twice) = motion::still(evidence);
     let (moving, showing) = if still.is_empty() {
         moving::moving(evidence)
     } else {

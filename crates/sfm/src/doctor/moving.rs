@@ -5,13 +5,14 @@
 //! is taken for its copy, but seldom between photographs that share most, and a third photograph that shows both tells them apart: what
 //! moves is one thing everywhere.
 
-use super::motion::{AGREES, limits, most_named, places, showing};
+use super::motion::{limits, most_named, places};
 use super::{Diagnosis, Evidence};
 use crate::PairMatches;
 use crate::geometry::correspondences::{Correspondences, sampson_squared};
 use crate::geometry::fundamental::Fundamental;
 use crate::geometry::homography::Homography;
 use crate::geometry::ransac::estimate;
+use crate::map::AGREES;
 use crate::median;
 use glam::DVec2;
 use rayon::prelude::*;
@@ -54,7 +55,8 @@ pub(super) fn moving(evidence: &Evidence) -> (Vec<Diagnosis>, Vec<[u32; 2]>) {
             is_one_thing(&partners, pair.photos, &group).then_some(group.len())
         })
         .collect();
-    let found = showing(&compared, &counts);
+    let showing = compared.iter().zip(&counts).filter(|of| of.1.is_some());
+    let found: Vec<[u32; 2]> = showing.map(|of| of.0.photos).collect();
     if found.len() < PAIRS || (found.len() as f64) < FRACTION * compared.len() as f64 {
         return (Vec::new(), Vec::new());
     }

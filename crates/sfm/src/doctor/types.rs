@@ -464,7 +464,7 @@ impl Display for Sentence<'_> {
             } => write!(
                 f,
                 "{:.0} % of the matches stand still while the rest moves, in {} of {} pairs, such as {}: a turntable before a fixed \
-                 background, or writing on the pictures; mask it",
+                 background, what carries the camera, or writing on the pictures; mask it",
                 100.0 * fraction,
                 pairs[0],
                 pairs[1],

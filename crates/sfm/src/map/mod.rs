@@ -1,7 +1,7 @@
 //! From verified matches to cameras and points: the incremental mapper.
 //!
 //! [`reconstruct`] verifies pairs (`verify`), guesses focal lengths (`focal`), joins matches to tracks (`tracks`) and grows
-//! models from seed pairs (`grow`), adjusting as they grow (`refine`). It depends on nothing but its input: no clock, no
+//! models from seed pairs (`grow`), adjusting as they grow (`refine`). Matches that stand still while others move are left out (`still`). It depends on nothing but its input: no clock, no
 //! threads, no order of hashing.
 
 mod absent;
@@ -19,6 +19,7 @@ mod observable;
 mod readjust;
 mod refine;
 mod seed;
+mod still;
 mod tracks;
 mod triangulation;
 mod types;
@@ -34,12 +35,15 @@ pub use focal::Source;
 pub use guide::add_guided_points;
 pub use metric::{Metric, to_metres};
 pub use observable::determines_focal;
+pub(crate) use still::AGREES;
+pub use still::{StandsStill, same_place, stands_behind, stands_still};
 pub(crate) use types::rigs;
 pub use types::{
     Absent, Known, LeftOut, MapOptions, Model, ModelPoint, Mount, PairKind, PhotoInfo, Progress, Reason,
     Reconstruction, VerifiedPair, Zoom,
 };
 pub use verify::{Cameras, verify};
+pub(crate) use verify::{centered_points, seed_of};
 
 use crate::geometry::camera::DCamera;
 use crate::{Features, PairMatches};
@@ -67,6 +71,8 @@ pub fn reconstruct(
     progress: &mut dyn FnMut(Progress),
 ) -> Reconstruction {
     assert_eq!(photos.len(), features.len(), "one set of features a photograph");
+    let moving = still::without(photos, features, pairs);
+    let pairs = moving.as_deref().unwrap_or(pairs);
     let mut known = known_cameras(photos);
     let mut found = mapped(photos, features, pairs, &known, options, progress);
     let fisheyes = found.models.first().map(|model| fisheye::find(photos, features, model));
@@ -212,6 +218,8 @@ pub fn extend(
     progress: &mut dyn FnMut(Progress),
 ) -> Reconstruction {
     assert_eq!(photos.len(), known.poses.len(), "a pose or none a photograph");
+    let moving = still::without(photos, features, pairs);
+    let pairs = moving.as_deref().unwrap_or(pairs);
     let held: Vec<_> = known.cameras.iter().map(|c| c.map(|c| (c, Source::Prior))).collect();
     let (cameras, verified) = verify::verify_with(photos, features, pairs, &held, options, progress);
     assert_eq!(cameras.len(), known.cameras.len(), "a camera or none a group");

@@ -99,7 +99,7 @@ pub(super) fn verify_with(
     (cameras, verified)
 }
 
-pub(super) fn seed_of(pair: &PairMatches) -> u64 {
+pub(crate) fn seed_of(pair: &PairMatches) -> u64 {
     u64::from(pair.photos[0]) << 32 | u64::from(pair.photos[1])
 }
 
@@ -112,7 +112,7 @@ fn long_side(photo: &PhotoInfo) -> f64 {
 }
 
 /// Points of a pair, centred and divided by each photograph's long side.
-pub(super) fn centered_points(photos: &[PhotoInfo], features: &[Features], pair: &PairMatches) -> Vec<[DVec2; 2]> {
+pub(crate) fn centered_points(photos: &[PhotoInfo], features: &[Features], pair: &PairMatches) -> Vec<[DVec2; 2]> {
     let place = |side: usize, keypoint: u32| {
         let photo = &photos[pair.photos[side] as usize];
         let center = 0.5 * DVec2::new(f64::from(photo.width), f64::from(photo.height));

@@ -1,27 +1,11 @@
 //! What the motion between photographs tells: none, turns only, something that stands still.
 
 use super::{Diagnosis, Evidence, Graph, turns_only};
-use crate::PairMatches;
-use crate::geometry::ransac::Limits;
-use crate::map::{VerifiedPair, centered_points, same_place, seed_of, stands_behind, stands_still};
-use glam::DVec2;
+use crate::map::{VerifiedPair, same_place, stands_behind, stands_still};
 use std::collections::BTreeMap;
 
 /// Photographs of one place from which on it is a fault of the capture.
 const TURNED: usize = 3;
-
-/// Matches of a pair, centred and divided by the long sides.
-pub(super) fn places(evidence: &Evidence, pair: &PairMatches) -> Vec<[DVec2; 2]> {
-    centered_points(evidence.photos, evidence.features, pair)
-}
-
-pub(super) fn limits(pair: &PairMatches, samples: usize) -> Limits {
-    Limits {
-        samples,
-        confidence: 0.999,
-        seed: seed_of(pair),
-    }
-}
 
 /// Photographs all of whose pairs only turn. What moves across the picture seems to turn: pairs that are `moving` tell nothing.
 pub(super) fn rotation_only(evidence: &Evidence, graph: &Graph, moving: &[[u32; 2]]) -> Vec<Diagnosis> {

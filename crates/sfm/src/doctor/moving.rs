@@ -5,14 +5,14 @@
 //! is taken for its copy, but seldom between photographs that share most, and a third photograph that shows both tells them apart: what
 //! moves is one thing everywhere.
 
-use super::motion::{limits, most_named, places};
+use super::motion::most_named;
 use super::{Diagnosis, Evidence};
 use crate::PairMatches;
 use crate::geometry::correspondences::{Correspondences, sampson_squared};
 use crate::geometry::fundamental::Fundamental;
 use crate::geometry::homography::Homography;
 use crate::geometry::ransac::estimate;
-use crate::map::AGREES;
+use crate::map::{AGREES, centered_points, limits};
 use crate::median;
 use glam::DVec2;
 use rayon::prelude::*;
@@ -85,7 +85,8 @@ fn strongest<'a>(evidence: &Evidence<'a>) -> Vec<&'a PairMatches> {
 
 /// Matches on something compact that agree with one another and not with the scene.
 fn own_motion(evidence: &Evidence, pair: &PairMatches) -> Option<Vec<[u32; 2]>> {
-    let mut rest: Vec<Match> = pair.matches.iter().copied().zip(places(evidence, pair)).collect();
+    let places = centered_points(evidence.photos, evidence.features, pair);
+    let mut rest: Vec<Match> = pair.matches.iter().copied().zip(places).collect();
     let mut others: Vec<Match> = Vec::new();
     for _ in 0..PLANES {
         let (group, left) = plane(pair, rest)?;

@@ -35,15 +35,15 @@ pub use focal::Source;
 pub use guide::add_guided_points;
 pub use metric::{Metric, to_metres};
 pub use observable::determines_focal;
-pub(crate) use still::AGREES;
+pub(crate) use still::{AGREES, limits};
 pub use still::{StandsStill, same_place, stands_behind, stands_still};
 pub(crate) use types::rigs;
 pub use types::{
     Absent, Known, LeftOut, MapOptions, Model, ModelPoint, Mount, PairKind, PhotoInfo, Progress, Reason,
     Reconstruction, VerifiedPair, Zoom,
 };
+pub(crate) use verify::centered_points;
 pub use verify::{Cameras, verify};
-pub(crate) use verify::{centered_points, seed_of};
 
 use crate::geometry::camera::DCamera;
 use crate::{Features, PairMatches};

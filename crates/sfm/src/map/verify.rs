@@ -99,7 +99,7 @@ pub(super) fn verify_with(
     (cameras, verified)
 }
 
-pub(crate) fn seed_of(pair: &PairMatches) -> u64 {
+pub(super) fn seed_of(pair: &PairMatches) -> u64 {
     u64::from(pair.photos[0]) << 32 | u64::from(pair.photos[1])
 }
 

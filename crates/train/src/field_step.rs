@@ -109,20 +109,7 @@ impl Trainer {
             measured: None,
             views: train.len() as u64,
         };
-        let report = StepReport {
-            step: self.clock.step + 1,
-            seconds: self.seconds,
-            seconds_left: 0.0,
-            seconds_left_range: [0.0; 2],
-            pace: self.pace,
-            view: chosen[0],
-            loss: loss.total,
-            mse: loss.color,
-            splats: 0,
-            parameters: self.parameters(),
-            visible: 0,
-            non_finite: 0,
-        };
+        let report = self.step_report(chosen[0], loss.total, loss.color);
         Ok((report, metrics))
     }
 

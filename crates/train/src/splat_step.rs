@@ -94,18 +94,10 @@ impl Trainer {
             views: self.dataset.train.len() as u64,
         };
         let report = StepReport {
-            step: self.clock.step + 1,
-            seconds: self.seconds,
-            seconds_left: 0.0,
-            seconds_left_range: [0.0; 2],
-            pace: self.pace,
-            view,
-            loss: loss.total,
-            mse: loss.mse,
             splats: self.engine.len(),
-            parameters: None,
             visible: self.engine.visible(),
             non_finite: self.engine.non_finite(),
+            ..self.step_report(view, loss.total, loss.mse)
         };
         Ok((report, metrics))
     }

@@ -406,6 +406,24 @@ impl Trainer {
         camera
     }
 
+    /// What both kinds of step report of the one that was just made, on `view`; the time left is not known yet, and splats are the caller's.
+    pub(crate) fn step_report(&self, view: usize, loss: f64, mse: f64) -> StepReport {
+        StepReport {
+            step: self.clock.step + 1,
+            seconds: self.seconds,
+            seconds_left: 0.0,
+            seconds_left_range: [0.0; 2],
+            pace: self.pace,
+            view,
+            loss,
+            mse,
+            splats: 0,
+            parameters: self.parameters(),
+            visible: 0,
+            non_finite: 0,
+        }
+    }
+
     /// Mean L1 error of the last frame against its photograph.
     pub(crate) fn error_of_frame(&mut self, photo: &Prepared) -> f64 {
         let color = self.sockets.frame_color(&self.engine);

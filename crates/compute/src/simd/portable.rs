@@ -12,7 +12,7 @@ pub struct Portable;
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Double;
 
-/// Four `f32`. As an array of them, which the compiler has to find vectors in, the kernels of `irradia-splat` took it three times as long to compile.
+/// Four `f32`. With an array of them, in which the compiler has to find vectors, `irradia-splat` took twice as long to compile.
 #[derive(Clone, Copy, Debug)]
 pub struct Four(Vec4);
 

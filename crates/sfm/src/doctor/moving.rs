@@ -12,7 +12,7 @@ use crate::geometry::correspondences::{Correspondences, sampson_squared};
 use crate::geometry::fundamental::Fundamental;
 use crate::geometry::homography::Homography;
 use crate::geometry::ransac::estimate;
-use crate::map::{AGREES, centered_points, limits};
+use crate::map::{AGREES, centered_points, limits, showing};
 use crate::median;
 use glam::DVec2;
 use rayon::prelude::*;
@@ -55,8 +55,7 @@ pub(super) fn moving(evidence: &Evidence) -> (Vec<Diagnosis>, Vec<[u32; 2]>) {
             is_one_thing(&partners, pair.photos, &group).then_some(group.len())
         })
         .collect();
-    let showing = compared.iter().zip(&counts).filter(|of| of.1.is_some());
-    let found: Vec<[u32; 2]> = showing.map(|of| of.0.photos).collect();
+    let found = showing(&compared, &counts);
     if found.len() < PAIRS || (found.len() as f64) < FRACTION * compared.len() as f64 {
         return (Vec::new(), Vec::new());
     }

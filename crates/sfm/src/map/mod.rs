@@ -35,7 +35,7 @@ pub use focal::Source;
 pub use guide::add_guided_points;
 pub use metric::{Metric, to_metres};
 pub use observable::determines_focal;
-pub(crate) use still::{AGREES, limits};
+pub(crate) use still::{AGREES, limits, showing};
 pub use still::{StandsStill, same_place, stands_behind, stands_still};
 pub(crate) use types::rigs;
 pub use types::{
@@ -71,8 +71,7 @@ pub fn reconstruct(
     progress: &mut dyn FnMut(Progress),
 ) -> Reconstruction {
     assert_eq!(photos.len(), features.len(), "one set of features a photograph");
-    let moving = still::without(photos, features, pairs);
-    let pairs = moving.as_deref().unwrap_or(pairs);
+    let pairs = &still::without(photos, features, pairs)[..];
     let mut known = known_cameras(photos);
     let mut found = mapped(photos, features, pairs, &known, options, progress);
     let fisheyes = found.models.first().map(|model| fisheye::find(photos, features, model));
@@ -218,8 +217,7 @@ pub fn extend(
     progress: &mut dyn FnMut(Progress),
 ) -> Reconstruction {
     assert_eq!(photos.len(), known.poses.len(), "a pose or none a photograph");
-    let moving = still::without(photos, features, pairs);
-    let pairs = moving.as_deref().unwrap_or(pairs);
+    let pairs = &still::without(photos, features, pairs)[..];
     let held: Vec<_> = known.cameras.iter().map(|c| c.map(|c| (c, Source::Prior))).collect();
     let (cameras, verified) = verify::verify_with(photos, features, pairs, &held, options, progress);
     assert_eq!(cameras.len(), known.cameras.len(), "a camera or none a group");

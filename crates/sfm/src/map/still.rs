@@ -12,6 +12,7 @@ use crate::geometry::ransac::{Limits, estimate};
 use crate::{Features, PairMatches, connected, median};
 use glam::DVec2;
 use rayon::prelude::*;
+use std::borrow::Cow;
 
 /// Largest shift of a match that stands still, in long sides: keypoints of the same pixels repeat within a pixel.
 const STILL: f64 = 0.002;
@@ -51,8 +52,7 @@ pub fn stands_still(photos: &[PhotoInfo], features: &[Features], pairs: &[PairMa
         .par_iter()
         .map(|pair| fraction(photos, features, pair))
         .collect();
-    let showing = compared.iter().zip(&fractions).filter(|of| of.1.is_some());
-    let found: Vec<[u32; 2]> = showing.map(|of| of.0.photos).collect();
+    let found = showing(&compared, &fractions);
     (found.len() >= 3 && found.len() as f64 >= PAIRS * compared.len() as f64).then(|| StandsStill {
         pairs: found,
         compared: compared.len(),
@@ -108,11 +108,15 @@ pub fn stands_behind(photos: usize, same: &[[u32; 2]]) -> Option<Vec<usize>> {
     (longest.len() >= CHAIN && longest.len() as f64 >= CHAIN_FRACTION * photos as f64).then_some(longest)
 }
 
-/// `pairs` without the matches that stand still; `None` if no part of the pictures does.
-pub(super) fn without(photos: &[PhotoInfo], features: &[Features], pairs: &[PairMatches]) -> Option<Vec<PairMatches>> {
+/// `pairs` without the matches that stand still, if a part of the pictures does.
+pub(super) fn without<'a>(
+    photos: &[PhotoInfo],
+    features: &[Features],
+    pairs: &'a [PairMatches],
+) -> Cow<'a, [PairMatches]> {
     let behind = || stands_behind(photos.len(), &same_place(photos, features, pairs));
     if stands_still(photos, features, pairs).is_none() && behind().is_none() {
-        return None;
+        return pairs.into();
     }
     let moving = |pair: &PairMatches| {
         let places = centered_points(photos, features, pair);
@@ -122,7 +126,13 @@ pub(super) fn without(photos: &[PhotoInfo], features: &[Features], pairs: &[Pair
             matches: matches.map(|of| *of.0).collect(),
         }
     };
-    Some(pairs.iter().map(moving).collect())
+    pairs.iter().map(moving).collect()
+}
+
+/// Photographs of the pairs that have a value.
+pub(crate) fn showing<T>(pairs: &[&PairMatches], values: &[Option<T>]) -> Vec<[u32; 2]> {
+    let both = pairs.iter().zip(values);
+    both.filter(|b| b.1.is_some()).map(|b| b.0.photos).collect()
 }
 
 /// How a geometry is estimated that tells what moves otherwise.

@@ -14,7 +14,9 @@ mod keypoints;
 pub mod map;
 pub mod matching;
 mod median;
+mod still_scene;
 
 pub(crate) use connected::connected;
 pub use keypoints::{DESCRIPTOR_BYTES, Features, Keypoint, PairMatches};
 pub(crate) use median::median;
+pub use still_scene::{Shown, StillScene};

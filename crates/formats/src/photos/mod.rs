@@ -67,6 +67,18 @@ impl PhotoEntry {
         }
     }
 
+    /// The same photograph, which has no mask, with the one in the file `mask`.
+    ///
+    /// # Errors
+    /// When the file cannot be read.
+    pub fn with_mask(&self, mask: PathBuf) -> Result<Self, FormatError> {
+        Ok(Self {
+            hash: self.hash ^ mask_hash(&mask)?,
+            mask: Some(mask),
+            ..self.clone()
+        })
+    }
+
     /// The mask at `width` x `height`, 0 where the photograph does not count; `None` if it has none.
     ///
     /// # Errors
@@ -277,7 +289,7 @@ fn read_entry(file: &Found) -> Result<PhotoEntry, String> {
     let header = read_header(path).map_err(reason)?;
     let mut hash = fnv(&read_file(path).map_err(reason)?);
     if let Some(mask) = mask {
-        hash ^= fnv(&read_file(mask).map_err(reason)?).rotate_left(1);
+        hash ^= mask_hash(mask).map_err(reason)?;
     }
     let stored = [header.width, header.height];
     let tags = read_exif(path).map_or_else(CameraTags::default, |block| parse_camera_tags(&block, stored));
@@ -297,6 +309,11 @@ fn read_entry(file: &Found) -> Result<PhotoEntry, String> {
         orientation,
         jpeg: header.jpeg,
     })
+}
+
+/// What a mask adds to the hash of its photograph.
+fn mask_hash(mask: &Path) -> Result<u64, FormatError> {
+    Ok(fnv(&read_file(mask)?).rotate_left(1))
 }
 
 /// FNV-1a, 64 bits, of words of 8 bytes: enough to tell files apart, at a byte in a fraction of a nanosecond.

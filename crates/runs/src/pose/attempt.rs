@@ -3,10 +3,10 @@
 use super::capture::Capture;
 use super::known::KnownPoses;
 use super::stages::Work;
-use super::{AttemptReport, Clock, ENOUGH_POSED, PoseInput, PoseProgress};
+use super::{AttemptReport, Clock, ENOUGH_POSED, PoseProgress};
 use crate::RunError;
 use irradia_sfm::PairMatches;
-use irradia_sfm::map::{MapOptions, PhotoInfo, Progress, Reconstruction, extend, reconstruct};
+use irradia_sfm::map::{MapOptions, PhotoInfo, Progress, Reconstruction, extend, moving, reconstruct};
 use irradia_sfm::matching::PairOptions;
 use std::path::Path;
 
@@ -14,6 +14,14 @@ use std::path::Path;
 const FILM_SUCCESSORS: usize = 10;
 /// Up to so many photographs each should have a pose: every one is missed, and a second attempt takes seconds.
 const FEW: usize = 25;
+
+/// Photographs with features and matches.
+pub(super) struct Matched<'a> {
+    pub work: Work<'a>,
+    /// Of the photographs that have features.
+    pub infos: Vec<PhotoInfo>,
+    pub pairs: Vec<PairMatches>,
+}
 
 /// What was found.
 pub(super) struct Attempt<'a> {
@@ -24,36 +32,49 @@ pub(super) struct Attempt<'a> {
     pub reconstruction: Reconstruction,
 }
 
-impl<'a> Attempt<'a> {
-    /// Features, matches and models of the photographs of `work`, or poses for those that are not `known`.
-    pub fn make(
-        mut work: Work<'a>,
-        input: &PoseInput,
-        capture: &Capture,
-        known: Option<KnownPoses>,
-        clock: &mut Clock,
-        progress: &(dyn Fn(PoseProgress) + Sync),
-    ) -> Result<Self, RunError> {
+impl<'a> Matched<'a> {
+    /// Features and matches of the photographs of `work`.
+    pub fn find(mut work: Work<'a>, capture: &Capture, clock: &mut Clock) -> Result<Self, RunError> {
         work.find_features()?;
         clock.end("features");
         let pair_options = PairOptions {
             successors: if capture.has_films { FILM_SUCCESSORS } else { 0 },
             ..PairOptions::default()
         };
-        let mut pairs = work.match_pairs(&pair_options)?;
+        let pairs = work.match_pairs(&pair_options)?;
         clock.end("matches");
+        let infos = capture.infos(work.photos());
+        Ok(Self { work, infos, pairs })
+    }
 
+    /// The same without matches that stand still: at the edges of masks some are left.
+    pub fn moving(mut self) -> Self {
+        self.pairs = moving(&self.infos, self.work.features(), &self.pairs);
+        self
+    }
+
+    /// Models of the photographs, or poses for those that are not `known`.
+    pub fn map(
+        self,
+        options: &MapOptions,
+        known: Option<KnownPoses>,
+        clock: &mut Clock,
+        progress: &(dyn Fn(PoseProgress) + Sync),
+    ) -> Result<Attempt<'a>, RunError> {
+        let Self {
+            mut work,
+            mut infos,
+            mut pairs,
+        } = self;
         progress(PoseProgress::Stage {
             name: "poses",
             of: work.photos().len(),
         });
-        let mut infos = capture.infos(work.photos());
         let mut tell = |event| {
             if let Progress::Registered { photos, .. } = event {
                 progress(PoseProgress::Done(photos));
             }
         };
-        let options = &input.mapping;
         let is_new = known.is_none();
         let mut reconstruction = match known {
             None => models(&work, &infos, &pairs, options, &mut tell),
@@ -71,14 +92,16 @@ impl<'a> Attempt<'a> {
             reconstruction = models(&work, &infos, &pairs, options, &mut tell);
         }
         clock.end("poses");
-        Ok(Self {
+        Ok(Attempt {
             work,
             infos,
             pairs,
             reconstruction,
         })
     }
+}
 
+impl<'a> Attempt<'a> {
     /// Photographs with a pose in the largest model.
     pub fn registered(&self) -> usize {
         self.reconstruction.registered()

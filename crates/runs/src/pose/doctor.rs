@@ -1,15 +1,14 @@
 //! The capture doctor on files: `doctor.json`, and `doctor.html` with small pictures and a plan.
 
 use super::capture::Capture;
-use super::stages::Work;
+use super::stages::{Work, in_rgb};
 use super::{PoseProgress, check_enough};
 use crate::RunError;
 use crate::folder::to_json;
 use irradia_formats::{PhotoFolder, write_atomic, write_png};
-use irradia_scene::resize_area;
 use irradia_sfm::PairMatches;
 use irradia_sfm::doctor::{Diagnosis, Evidence, diagnose, shots};
-use irradia_sfm::map::{MapOptions, Model, PhotoInfo, Reconstruction, verify};
+use irradia_sfm::map::{MapOptions, Model, PhotoInfo, Reconstruction, StandsStill, verify};
 use irradia_sfm::matching::PairOptions;
 use serde::Serialize;
 use std::collections::BTreeMap;
@@ -127,7 +126,7 @@ pub fn doctor(input: &DoctorInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> 
         cameras,
         ..Reconstruction::default()
     };
-    let mut report = examine(&work, &infos, &pairs, &found);
+    let mut report = examine(&work, &infos, &pairs, &found, None);
     add_unreadable(&mut report, folder, &work);
     report.seconds = started.elapsed().as_secs_f64();
     if let Some(out) = &input.out {
@@ -136,12 +135,13 @@ pub fn doctor(input: &DoctorInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> 
     Ok(report)
 }
 
-/// Diagnoses what is known after verification, or after mapping if there is a model.
+/// Diagnoses what is known after verification, or after mapping if there is a model; `masked` stood still before it was masked.
 pub(super) fn examine(
     work: &Work,
     infos: &[PhotoInfo],
     matches: &[PairMatches],
     found: &Reconstruction,
+    masked: Option<&StandsStill>,
 ) -> DoctorReport {
     let model = found.models.first();
     let evidence = Evidence {
@@ -150,6 +150,7 @@ pub(super) fn examine(
         features: work.features(),
         colors: work.colors(),
         matches,
+        masked,
         pairs: &found.pairs,
         cameras: &found.cameras,
         model,
@@ -275,10 +276,5 @@ fn small(photo: &irradia_formats::PhotoEntry) -> Result<([u32; 2], Vec<u8>), Run
     let size = [pixels.width, pixels.height];
     let factor = size[0].max(size[1]).div_ceil(SMALL).max(1);
     let to = size.map(|side| (side / factor).max(1));
-    let reduced = resize_area(&pixels.data, pixels.channels, size, to);
-    let channels = pixels.channels as usize;
-    let rgb = reduced
-        .chunks_exact(channels)
-        .flat_map(|pixel| [0, 1, 2].map(|c| pixel[c.min(channels - 1)]));
-    Ok((to, rgb.collect()))
+    Ok((to, in_rgb(&pixels, to)))
 }

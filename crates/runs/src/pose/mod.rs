@@ -6,7 +6,9 @@
 //! sparse/0/*.bin   cameras, poses and points with tracks, in COLMAP's format; further models in sparse/1, ..
 //! pose.json        what happened: numbers, times, and each photograph left out with its reason
 //! doctor.html      what is wrong with the capture, and where to take further photographs; doctor.json and doctor/*.png belong to it
-//! features.bin     features and matches, which are reused as long as photographs do not change; features-more.bin: those of a second attempt
+//! masks/           those of the photographs, or of what stands still in them while the rest moves
+//! features.bin     features and matches, which are reused as long as photographs do not change; features-masked.bin: those of what moves;
+//!                  features-more.bin: those of a second attempt
 //! ```
 
 mod attempt;
@@ -21,11 +23,12 @@ mod output;
 mod place;
 mod points;
 mod stages;
+mod still;
 mod store;
 
 use crate::RunError;
 use crate::folder::to_json;
-use attempt::Attempt;
+use attempt::{Attempt, Matched};
 use capture::Capture;
 use irradia_formats::{PhotoFolder, write_atomic};
 use irradia_sfm::doctor::Kind;
@@ -220,7 +223,7 @@ pub struct ScaleReport {
 /// Time of a stage.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct StageReport {
-    /// `photographs` (with frames of films and faces of panoramas), `features`, `matches`, `poses`, `doctor`, `writing` or `colmap`.
+    /// `photographs` (with frames of films and faces of panoramas), `features`, `matches`, `masks`, `poses`, `doctor`, `writing` or `colmap`.
     pub name: &'static str,
     /// Wall time.
     pub seconds: f64,
@@ -267,7 +270,7 @@ pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Resu
         }
         capture.folder = known.with(capture.folder)?;
     }
-    let folder = &capture.folder;
+    let mut folder = &capture.folder;
     check_enough(&input.photos, folder)?;
     place::check(&input.distances, folder)?;
     clock.end("photographs");
@@ -296,7 +299,17 @@ pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Resu
 
     let is_new = known.is_none();
     let work = Work::new(input.max_features, Some(out), folder, progress);
-    let mut attempt = Attempt::make(work, input, &capture, known, &mut clock, progress)?;
+    let mut matched = Matched::find(work, &capture, &mut clock)?;
+    let masked = match is_new && !capture.has_panoramas() {
+        true => still::mask(&matched, folder, out, progress)?,
+        false => None,
+    };
+    if let Some(masked) = &masked {
+        clock.end("masks");
+        folder = &masked.folder;
+        matched = Matched::find(matched.work.masked(folder, out), &capture, &mut clock)?.moving();
+    }
+    let mut attempt = matched.map(&input.mapping, known, &mut clock, progress)?;
     let mut attempts = vec![attempt.report()];
     if is_new && let Some(work) = attempt.again(input.max_features, out) {
         let most = work.sift().max_features;
@@ -305,7 +318,11 @@ pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Resu
             attempt.registered(),
             folder.photos.len(),
         )));
-        let again = Attempt::make(work, input, &capture, None, &mut clock, progress)?;
+        let mut again = Matched::find(work, &capture, &mut clock)?;
+        if masked.is_some() {
+            again = again.moving();
+        }
+        let again = again.map(&input.mapping, None, &mut clock, progress)?;
         attempts.push(again.report());
         if again.replaces(&attempt) {
             attempt = again;
@@ -327,7 +344,8 @@ pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Resu
         _ => None,
     };
     clock.end("poses");
-    let examined = doctor::examine(&work, &infos, &pairs, &reconstruction);
+    let stood_still = masked.as_ref().map(|masked| &masked.still);
+    let examined = doctor::examine(&work, &infos, &pairs, &reconstruction, stood_still);
     doctor::write(out, folder, &work, &examined)?;
     clock.end("doctor");
     if reconstruction.models.is_empty() {
@@ -347,6 +365,7 @@ pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Resu
     report.attempts = attempts;
     report.pairs = pairs.len();
     report.warnings = work.warnings().to_vec();
+    report.warnings.extend(masked.map(|masked| masked.told));
     report.stages = clock.stages;
     report.seconds = started.elapsed().as_secs_f64();
     write_atomic(&out.join(REPORT), |file| file.write_all(&to_json(&report)))?;

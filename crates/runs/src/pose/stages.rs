@@ -4,6 +4,7 @@ use super::PoseProgress;
 use super::store::{self, Known, Looks, Settings};
 use crate::RunError;
 use irradia_formats::{PhotoEntry, PhotoFolder, Pixels};
+use irradia_scene::resize_area;
 use irradia_sfm::doctor::Appearance;
 use irradia_sfm::features::{Extractor, GreyPhoto, Sift};
 use irradia_sfm::matching::{MatchOptions, PairOptions, candidate_pairs, match_pairs};
@@ -13,9 +14,10 @@ use std::collections::HashSet;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicUsize, Ordering};
 
-/// The file of features and matches, and of those of a second attempt.
+/// The file of features and matches, of those of a second attempt, and of those of what does not stand still.
 const STORE: &str = "features.bin";
 const STORE_OF_MORE: &str = "features-more.bin";
+const STORE_OF_MASKED: &str = "features-masked.bin";
 
 /// Photographs up to which each has so many features, since a scene of few photographs has few points otherwise, and matching them costs little: splats
 /// that begin from them end 0.7 dB better on lund_door, 12 photographs.
@@ -78,6 +80,19 @@ impl<'a> Work<'a> {
             ..self.sift.clone()
         };
         Self::with(sift, Some(out.join(STORE_OF_MORE)), self.folder, self.progress)
+    }
+
+    /// The same photographs with the masks of `folder`.
+    pub fn masked<'b>(&self, folder: &'b PhotoFolder, out: &Path) -> Work<'b>
+    where
+        'a: 'b,
+    {
+        Work::with(
+            self.sift.clone(),
+            Some(out.join(STORE_OF_MASKED)),
+            folder,
+            self.progress,
+        )
     }
 
     fn with(
@@ -296,6 +311,16 @@ fn mask_of(photo: &PhotoEntry, pixels: &Pixels) -> Result<Option<Vec<u8>>, Strin
         (Some(given), None) => Some(given),
         (None, alpha) => alpha.map(Iterator::collect),
     })
+}
+
+/// `[to[1], to[0], 3]` the pixels reduced to that size.
+pub(super) fn in_rgb(pixels: &Pixels, to: [u32; 2]) -> Vec<u8> {
+    let reduced = resize_area(&pixels.data, pixels.channels, [pixels.width, pixels.height], to);
+    let channels = pixels.channels as usize;
+    let rgb = reduced
+        .chunks_exact(channels)
+        .flat_map(|pixel| [0, 1, 2].map(|c| pixel[c.min(channels - 1)]));
+    rgb.collect()
 }
 
 /// `[H, W]` the brightness of `[H, W, channels]`.

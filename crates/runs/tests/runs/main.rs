@@ -10,6 +10,7 @@ mod pose;
 mod requests;
 mod scenes;
 mod snapshots;
+mod turntable;
 mod watched;
 mod wide;
 mod world;

@@ -23,7 +23,7 @@ pub use turns::{Turns, turns};
 pub use types::{Diagnosis, Kind};
 
 use crate::geometry::camera::DCamera;
-use crate::map::{Absent, LeftOut, Model, PairKind, PhotoInfo, Reason, Source, VerifiedPair, Zoom, rigs};
+use crate::map::{Absent, LeftOut, Model, PairKind, PhotoInfo, Reason, Source, StandsStill, VerifiedPair, Zoom, rigs};
 use crate::{Features, PairMatches, connected};
 use std::collections::BTreeMap;
 
@@ -40,6 +40,8 @@ pub struct Evidence<'a> {
     pub colors: &'a [Vec<[u8; 3]>],
     /// Pairs before verification.
     pub matches: &'a [PairMatches],
+    /// What stood still before it was masked, if it was; `features` and `matches` have nothing of it.
+    pub masked: Option<&'a StandsStill>,
     /// Pairs after it.
     pub pairs: &'a [VerifiedPair],
     /// `[groups]` the camera of each group before any adjustment, and where its focal length comes from.

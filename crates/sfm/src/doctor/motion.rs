@@ -1,7 +1,7 @@
 //! What the motion between photographs tells: none, turns only, something that stands still.
 
 use super::{Diagnosis, Evidence, Graph, turns_only};
-use crate::map::{VerifiedPair, same_place, stands_behind, stands_still};
+use crate::map::{VerifiedPair, same_place, stands_still};
 use std::collections::BTreeMap;
 
 /// Photographs of one place from which on it is a fault of the capture.
@@ -46,28 +46,26 @@ pub(super) fn still(evidence: &Evidence) -> (Vec<Diagnosis>, Vec<Diagnosis>) {
         matches,
         ..
     } = evidence;
-    if let Some(found) = stands_still(photos, features, matches) {
-        let diagnosis = Diagnosis::StandsStill {
-            photos: most_named(&found.pairs),
-            pairs: [found.pairs.len(), found.compared],
-            fraction: found.fraction,
-        };
-        return (vec![diagnosis], Vec::new());
-    }
-    let same = same_place(photos, features, matches);
-    match stands_behind(photos.len(), &same) {
-        Some(chain) => {
+    let found = evidence
+        .masked
+        .cloned()
+        .or_else(|| stands_still(photos, features, matches));
+    match found {
+        Some(found) => {
             let diagnosis = Diagnosis::StandsStill {
-                photos: chain,
-                pairs: [same.len(), matches.len()],
-                fraction: 1.0,
+                photos: most_named(&found.pairs),
+                pairs: [found.pairs.len(), found.compared],
+                fraction: found.fraction,
+                masked: evidence.masked.is_some(),
             };
             (vec![diagnosis], Vec::new())
         }
         None => {
-            let twice = same.iter().map(|pair| Diagnosis::Twice {
-                photos: pair.map(|p| p as usize),
-            });
+            let twice = same_place(photos, features, matches)
+                .into_iter()
+                .map(|pair| Diagnosis::Twice {
+                    photos: pair.map(|p| p as usize),
+                });
             (Vec::new(), twice.collect())
         }
     }

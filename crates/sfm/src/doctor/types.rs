@@ -184,6 +184,8 @@ pub enum Diagnosis {
         pairs: [usize; 2],
         /// Median fraction of the matches that stands still.
         fraction: f64,
+        /// Whether it has been masked.
+        masked: bool,
     },
     /// Something moved between photographs.
     Moving {
@@ -461,14 +463,16 @@ impl Display for Sentence<'_> {
                 photos,
                 pairs,
                 fraction,
+                masked,
             } => write!(
                 f,
                 "{:.0} % of the matches stand still while the rest moves, in {} of {} pairs, such as {}: a turntable before a fixed \
-                 background, what carries the camera, or writing on the pictures; mask it",
+                 background, what carries the camera, or writing on the pictures; {}",
                 100.0 * fraction,
                 pairs[0],
                 pairs[1],
-                self.list(photos)
+                self.list(photos),
+                if *masked { "it is masked" } else { "mask it" }
             ),
             Diagnosis::Moving { photos, pairs, matches } => write!(
                 f,

@@ -36,7 +36,7 @@ pub use guide::add_guided_points;
 pub use metric::{Metric, to_metres};
 pub use observable::determines_focal;
 pub(crate) use still::{AGREES, limits, showing};
-pub use still::{StandsStill, same_place, stands_behind, stands_still};
+pub use still::{StandsStill, moving, same_place, stands_still};
 pub(crate) use types::rigs;
 pub use types::{
     Absent, Known, LeftOut, MapOptions, Model, ModelPoint, Mount, PairKind, PhotoInfo, Progress, Reason,

@@ -45,13 +45,26 @@ pub struct StandsStill {
     pub fraction: f64,
 }
 
-/// Whether a part of the pictures stands still while the rest moves by a geometry with which it does not agree.
+impl StandsStill {
+    /// The photographs, of so many, in which the same stands still, largest group first; those that show nothing of it are left out.
+    pub fn groups(&self, photos: usize) -> Vec<Vec<usize>> {
+        let mut parts = parts(photos, &self.pairs);
+        parts.retain(|part| part.len() > 1);
+        parts
+    }
+}
+
+/// Whether a part of the pictures stands still while the rest moves by a geometry with which it does not agree, or while nothing that moves is matched.
 pub fn stands_still(photos: &[PhotoInfo], features: &[Features], pairs: &[PairMatches]) -> Option<StandsStill> {
-    let compared: Vec<&PairMatches> = pairs.iter().filter(|p| p.matches.len() >= 3 * MATCHES).collect();
-    let fractions: Vec<Option<f64>> = compared
+    beside_what_moves(photos, features, pairs).or_else(|| alone(photos, features, pairs))
+}
+
+fn beside_what_moves(photos: &[PhotoInfo], features: &[Features], pairs: &[PairMatches]) -> Option<StandsStill> {
+    let (compared, fractions): (Vec<&PairMatches>, Vec<Option<f64>>) = pairs
         .par_iter()
-        .map(|pair| fraction(photos, features, pair))
-        .collect();
+        .filter(|pair| pair.matches.len() >= 3 * MATCHES)
+        .filter_map(|pair| Some((pair, fraction(photos, features, pair)?)))
+        .unzip();
     let found = showing(&compared, &fractions);
     (found.len() >= 3 && found.len() as f64 >= PAIRS * compared.len() as f64).then(|| StandsStill {
         pairs: found,
@@ -60,14 +73,17 @@ pub fn stands_still(photos: &[PhotoInfo], features: &[Features], pairs: &[PairMa
     })
 }
 
-/// The fraction of a pair's matches that stands still, if the others move otherwise.
-fn fraction(photos: &[PhotoInfo], features: &[Features], pair: &PairMatches) -> Option<f64> {
+/// The fraction of a pair's matches that stands still, if the others move otherwise; `None` if no others tell, as those of opposite sides of a turntable.
+fn fraction(photos: &[PhotoInfo], features: &[Features], pair: &PairMatches) -> Option<Option<f64>> {
     let places = centered_points(photos, features, pair);
     let (still, others): (Vec<_>, Vec<_>) = places.into_iter().partition(stays);
     let part = still.len() as f64 / pair.matches.len() as f64;
     let moving: Vec<[DVec2; 2]> = others.into_iter().filter(|p| shift(p) > MOVES).collect();
-    if still.len() < MATCHES || part < FRACTION || moving.len() < 2 * MATCHES {
+    if moving.len() < 2 * MATCHES {
         return None;
+    }
+    if still.len() < MATCHES || part < FRACTION {
+        return Some(None);
     }
     let points = Correspondences::new(moving);
     let problem = Fundamental {
@@ -75,10 +91,13 @@ fn fraction(photos: &[PhotoInfo], features: &[Features], pair: &PairMatches) -> 
         threshold: AGREES,
     };
     let found = estimate(&problem, Vec::new(), limits(pair, 300))?;
+    if found.inliers <= points.points.len() / 3 || found.inliers < 15 {
+        return None;
+    }
     let off = |p: &&[DVec2; 2]| sampson_squared(&found.model, **p) > AGREES * AGREES;
     // Far away or straight ahead, matches stand still and agree.
     let disagree = 2 * still.iter().filter(off).count() > still.len();
-    (disagree && found.inliers > points.points.len() / 3 && found.inliers >= 15).then_some(part)
+    Some(disagree.then_some(part))
 }
 
 /// Pairs that show the same from the same place.
@@ -95,17 +114,26 @@ pub fn same_place(photos: &[PhotoInfo], features: &[Features], pairs: &[PairMatc
     pairs.iter().filter(same).map(|pair| pair.photos).collect()
 }
 
-/// The longest chain of pairs from the `same` place, if it is one of a background that stands still.
-pub fn stands_behind(photos: usize, same: &[[u32; 2]]) -> Option<Vec<usize>> {
+/// The longest chain of pairs from the same place, if it is one of a background that stands still.
+fn alone(photos: &[PhotoInfo], features: &[Features], pairs: &[PairMatches]) -> Option<StandsStill> {
+    let mut same = same_place(photos, features, pairs);
+    let longest = parts(photos.len(), &same).into_iter().next()?;
+    same.retain(|pair| longest.contains(&(pair[0] as usize)));
+    (longest.len() >= CHAIN && longest.len() as f64 >= CHAIN_FRACTION * photos.len() as f64).then_some(StandsStill {
+        pairs: same,
+        compared: pairs.len(),
+        fraction: 1.0,
+    })
+}
+
+/// Photographs that `pairs` join, largest part first.
+fn parts(photos: usize, pairs: &[[u32; 2]]) -> Vec<Vec<usize>> {
     let mut partners = vec![Vec::new(); photos];
-    for [a, b] in same {
+    for [a, b] in pairs {
         partners[*a as usize].push(*b as usize);
         partners[*b as usize].push(*a as usize);
     }
-    let longest = connected(photos, |photo| partners[photo].iter().copied())
-        .into_iter()
-        .next()?;
-    (longest.len() >= CHAIN && longest.len() as f64 >= CHAIN_FRACTION * photos as f64).then_some(longest)
+    connected(photos, |photo| partners[photo].iter().copied())
 }
 
 /// `pairs` without the matches that stand still, if a part of the pictures does.
@@ -114,10 +142,14 @@ pub(super) fn without<'a>(
     features: &[Features],
     pairs: &'a [PairMatches],
 ) -> Cow<'a, [PairMatches]> {
-    let behind = || stands_behind(photos.len(), &same_place(photos, features, pairs));
-    if stands_still(photos, features, pairs).is_none() && behind().is_none() {
-        return pairs.into();
+    match stands_still(photos, features, pairs) {
+        Some(_) => moving(photos, features, pairs).into(),
+        None => pairs.into(),
     }
+}
+
+/// `pairs` without the matches that stand still.
+pub fn moving(photos: &[PhotoInfo], features: &[Features], pairs: &[PairMatches]) -> Vec<PairMatches> {
     let moving = |pair: &PairMatches| {
         let places = centered_points(photos, features, pair);
         let matches = pair.matches.iter().zip(&places).filter(|of| !stays(of.1));

@@ -1,0 +1,218 @@
+//! Masks of what stands still in the pictures while the rest moves: poses and splats are those of the rest.
+
+use super::PoseProgress;
+use super::attempt::Matched;
+use super::stages::in_rgb;
+use crate::RunError;
+use irradia_formats::{PhotoEntry, PhotoFolder, write_png};
+use irradia_sfm::StillScene;
+use irradia_sfm::map::{StandsStill, stands_still};
+use rayon::prelude::*;
+use std::collections::BTreeMap;
+use std::fs;
+use std::path::Path;
+
+/// The folder of masks, and what tells that they are of an earlier call.
+const MASKS: &str = "masks";
+const RECORD: &str = ".irradia";
+/// Longer side of the pictures in which masks are found, px.
+const SIDE: u32 = 480;
+/// Photographs of one camera from which on what is behind can be told.
+const LEAST: usize = 4;
+/// A photograph shows what is behind others if it has this part of what they show of it in the mean.
+const SHOWS: f64 = 0.5;
+/// Least part of the pixels that moves: photographs of one place are no turntable.
+const MOVES: f64 = 0.03;
+
+/// What was masked.
+pub(super) struct Masked {
+    /// The photographs with their masks.
+    pub folder: PhotoFolder,
+    pub still: StandsStill,
+    /// For the user.
+    pub told: String,
+}
+
+/// What stands still behind some photographs.
+struct Behind {
+    scene: StillScene,
+    /// The part of a picture that shows it, at least.
+    least: f64,
+}
+
+impl Behind {
+    /// From those of `pictures` that are of `group`, if there are enough.
+    fn of(group: &[usize], [width, height]: [u32; 2], pictures: &BTreeMap<usize, Vec<u8>>) -> Option<Self> {
+        let of: Vec<Vec<u8>> = group.iter().filter_map(|photo| pictures.get(photo).cloned()).collect();
+        (of.len() >= LEAST).then(|| {
+            let scene = StillScene::of(width as usize, height as usize, &of);
+            let share: f64 = of
+                .par_iter()
+                .map(|picture| scene.shown(picture).share())
+                .collect::<Vec<_>>()
+                .iter()
+                .sum();
+            let least = SHOWS * share / of.len() as f64;
+            Self { scene, least }
+        })
+    }
+}
+
+/// Pixels, row by row: where something stands still.
+struct Mask {
+    size: [u32; 2],
+    still: Vec<bool>,
+}
+
+/// Writes masks into `out`, if a part of the pictures stands still and no photograph has a mask of its own.
+pub(super) fn mask(
+    matched: &Matched,
+    folder: &PhotoFolder,
+    out: &Path,
+    progress: &(dyn Fn(PoseProgress) + Sync),
+) -> Result<Option<Masked>, RunError> {
+    let written = out.join(MASKS);
+    if folder.photos.iter().any(|photo| photo.mask.is_some()) {
+        return Ok(None);
+    }
+    if written.join(RECORD).exists() {
+        fs::remove_dir_all(&written).map_err(RunError::io("clear", &written))?;
+    } else if written.exists() {
+        // Somebody's, for the training.
+        return Ok(None);
+    }
+    let Some(still) = stands_still(&matched.infos, matched.work.features(), &matched.pairs) else {
+        return Ok(None);
+    };
+    let masks = find(matched, folder, &still)?;
+    if masks.is_empty() {
+        return Ok(None);
+    }
+    write(&written, folder, &masks)?;
+    let with_mask = |photo: &PhotoEntry| photo.with_mask(written.join(file_name(photo)));
+    let photos = folder.photos.iter().map(with_mask).collect::<Result<_, _>>()?;
+    let masked: usize = masks
+        .values()
+        .map(|mask| mask.still.iter().filter(|is| **is).count())
+        .sum();
+    let of: usize = masks.values().map(|mask| mask.still.len()).sum();
+    let told = format!(
+        "{:.0} % of {} photographs stand still while the rest moves (the background of a turntable, or what carries the camera): masked in {}; give \
+         masks of your own, in a folder masks beside the photographs, to decide otherwise",
+        100.0 * masked as f64 / of as f64,
+        masks.len(),
+        written.display()
+    );
+    progress(PoseProgress::Warned(told.clone()));
+    Ok(Some(Masked {
+        folder: PhotoFolder {
+            photos,
+            left_out: folder.left_out.clone(),
+        },
+        still,
+        told,
+    }))
+}
+
+/// Masks by index of the folder's photographs.
+fn find(matched: &Matched, folder: &PhotoFolder, still: &StandsStill) -> Result<BTreeMap<usize, Mask>, RunError> {
+    let groups = still.groups(matched.infos.len());
+    let mut cameras: BTreeMap<usize, Vec<usize>> = BTreeMap::new();
+    for (photo, info) in matched.infos.iter().enumerate() {
+        cameras.entry(info.group).or_default().push(photo);
+    }
+    let mut masks = BTreeMap::new();
+    for photos in cameras.values() {
+        let entry = |photo: usize| &folder.photos[matched.work.photos()[photo]];
+        let size = small(entry(photos[0]));
+        let pictures = photos
+            .par_iter()
+            .map(|photo| Ok((*photo, in_rgb(&entry(*photo).read(SIDE)?, size))))
+            .collect::<Result<BTreeMap<usize, Vec<u8>>, RunError>>()?;
+        let scenes: Vec<Behind> = groups
+            .iter()
+            .filter_map(|group| Behind::of(group, size, &pictures))
+            .collect();
+        for (photo, still) in shown(&scenes, &pictures) {
+            masks.insert(matched.work.photos()[photo], Mask { size, still });
+        }
+    }
+    Ok(masks)
+}
+
+/// Where `pictures` show what is behind them, by photograph. Of several `scenes`, such as those of rings of different height, each shows the one it has most of.
+fn shown(scenes: &[Behind], pictures: &BTreeMap<usize, Vec<u8>>) -> BTreeMap<usize, Vec<bool>> {
+    let most = |picture: &[u8]| {
+        let all = scenes.iter().map(|behind| behind.scene.shown(picture)).enumerate();
+        let shown = all.filter(|(i, shown)| shown.share() >= scenes[*i].least);
+        shown.max_by(|a, b| a.1.share().total_cmp(&b.1.share()))
+    };
+    let of_pictures: Vec<_> = pictures
+        .par_iter()
+        .filter_map(|(photo, picture)| most(picture).map(|(scene, shown)| (scene, *photo, shown.mask())))
+        .collect();
+    let mut by_scene: BTreeMap<usize, BTreeMap<usize, Vec<bool>>> = BTreeMap::new();
+    for (scene, photo, still) in of_pictures {
+        by_scene.entry(scene).or_default().insert(photo, still);
+    }
+    let moves = |masks: &BTreeMap<usize, Vec<bool>>| {
+        let pixels = || masks.values().flatten();
+        pixels().filter(|still| !**still).count() as f64 >= MOVES * pixels().count() as f64
+    };
+    by_scene.into_values().filter(moves).flatten().collect()
+}
+
+/// The size of the picture in which the mask of `photo` is found, the same for all of its camera.
+fn small(photo: &PhotoEntry) -> [u32; 2] {
+    let size = [photo.width, photo.height];
+    let scale = (f64::from(SIDE) / f64::from(photo.width.max(photo.height))).min(1.0);
+    size.map(|side| ((scale * f64::from(side)).round() as u32).max(1))
+}
+
+fn file_name(photo: &PhotoEntry) -> String {
+    format!("{}.png", photo.name)
+}
+
+/// One mask for each photograph, at its size: white where nothing is known to stand still.
+fn write(folder: &Path, of: &PhotoFolder, masks: &BTreeMap<usize, Mask>) -> Result<(), RunError> {
+    let new = folder.with_extension("new");
+    if new.exists() {
+        fs::remove_dir_all(&new).map_err(RunError::io("clear", &new))?;
+    }
+    fs::create_dir_all(&new).map_err(RunError::io("create", &new))?;
+    let record = new.join(RECORD);
+    fs::write(&record, b"").map_err(RunError::io("write", &record))?;
+    of.photos.par_iter().enumerate().try_for_each(|(i, photo)| {
+        let size = [photo.width, photo.height];
+        let pixels = match masks.get(&i) {
+            Some(mask) => mask.enlarged(size),
+            None => vec![255; size[0] as usize * size[1] as usize],
+        };
+        write_png(&new.join(file_name(photo)), size[0], size[1], 1, &pixels)
+    })?;
+    fs::rename(&new, folder).map_err(RunError::io("rename", &new))
+}
+
+impl Mask {
+    /// The mask at `size`, black where something stands still, with smooth edges.
+    fn enlarged(&self, [width, height]: [u32; 2]) -> Vec<u8> {
+        let [w, h] = self.size.map(|side| side as usize);
+        // Where the centre of a pixel lies between two others, and how far from the first.
+        let between = |at: u32, of: u32, side: usize| {
+            let at = ((at as f32 + 0.5) * side as f32 / of as f32 - 0.5).clamp(0.0, (side - 1) as f32);
+            (at as usize, (at as usize + 1).min(side - 1), at.fract())
+        };
+        let columns: Vec<_> = (0..width).map(|x| between(x, width, w)).collect();
+        let mut pixels = Vec::with_capacity(width as usize * height as usize);
+        for y in 0..height {
+            let (above, below, down) = between(y, height, h);
+            let still = |x: usize, y: usize| f32::from(u8::from(self.still[y * w + x]));
+            pixels.extend(columns.iter().map(|&(left, right, across)| {
+                let row = |y: usize| still(left, y) * (1.0 - across) + still(right, y) * across;
+                let covered = row(above) * (1.0 - down) + row(below) * down;
+                if covered >= 0.5 { 0 } else { 255 }
+            }));
+        }
+        pixels
+    }
+}

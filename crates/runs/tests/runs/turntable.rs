@@ -1,0 +1,125 @@
+//! What turns before a background that stands still: poses and masks.
+
+use glam::Vec3;
+use irradia_runs::formats::{DatasetOptions, read_dataset, read_image, write_png};
+use irradia_runs::scene::{Camera, Intrinsics, Pose, Rng};
+use irradia_runs::synth::SceneName;
+use irradia_runs::{PoseInput, PoseReport, pose};
+use std::fs;
+use std::path::Path;
+
+const SIZE: [u32; 2] = [320, 240];
+/// Photographs around the scene.
+const RING: usize = 32;
+/// Nothing of the table is as far from its cameras.
+const FAR: f32 = 6.0;
+
+/// `[photographs][H, W]` whether it is background.
+type Backgrounds = Vec<Vec<bool>>;
+
+/// Writes photographs all around the demo scene, before a wall of patches that stands still if there is to be one.
+fn turntable(photos: &Path, wall: bool) -> Backgrounds {
+    fs::create_dir_all(photos).unwrap();
+    let scene = SceneName::Demo.build(1).0;
+    let mut rng = Rng::new(5, 5);
+    let patches: Vec<[u8; 3]> = (0..80 * 60)
+        .map(|_| [0; 3].map(|_: u8| rng.range(0.0, 256.0) as u8))
+        .collect();
+    let photograph = |i: usize| {
+        let azimuth = std::f32::consts::TAU * i as f32 / RING as f32;
+        let away = Vec3::new(azimuth.cos(), azimuth.sin(), 0.45 + 0.1 * (3.0 * azimuth).sin());
+        let pose = Pose::look_at(4.0 * away, Vec3::Z * 0.3, Vec3::Z);
+        let frame = scene.trace(
+            &Camera::new(pose, Intrinsics::from_fov_x(SIZE[0], SIZE[1], 0.9)),
+            2,
+            i as u64,
+        );
+        let far: Vec<bool> = frame
+            .depth
+            .data
+            .iter()
+            .map(|depth| *depth > FAR || *depth == 0.0)
+            .collect();
+        let mut rgb = frame.color.to_u8();
+        for (at, pixel) in rgb.chunks_exact_mut(3).enumerate().filter(|(at, _)| wall && far[*at]) {
+            let [x, y] = [at % SIZE[0] as usize, at / SIZE[0] as usize];
+            pixel.copy_from_slice(&patches[y / 4 * 80 + x / 4]);
+        }
+        write_png(&photos.join(format!("{i:02}.png")), SIZE[0], SIZE[1], 3, &rgb).unwrap();
+        far
+    };
+    (0..RING).map(photograph).collect()
+}
+
+/// Poses `photos` in `out`.
+fn posed(photos: &Path, out: &Path) -> PoseReport {
+    pose(&PoseInput::new(photos, out), &|_| {}).unwrap()
+}
+
+/// Degrees from each photograph to the next.
+fn steps(out: &Path) -> Vec<f32> {
+    let dataset = read_dataset(out, &DatasetOptions::default()).unwrap();
+    assert_eq!(dataset.views.len(), RING);
+    let turn = |pair: &[irradia_runs::scene::View]| {
+        let [a, b] = [0, 1].map(|i: usize| pair[i].camera.pose.rotation);
+        a.angle_between(b).to_degrees()
+    };
+    dataset.views.windows(2).map(turn).collect()
+}
+
+#[test]
+fn what_turns_is_posed_and_what_stands_still_behind_it_is_masked() {
+    let folder = tempfile::tempdir().unwrap();
+    let [photos, out] = ["photos", "data"].map(|name| folder.path().join(name));
+    let backgrounds = turntable(&photos, true);
+    let report = posed(&photos, &out);
+    assert_eq!(report.registered, RING, "{report:?}");
+    let told = |kind: &str| report.findings.iter().find(|finding| finding.kind == kind);
+    assert!(told("stands-still").unwrap().sentence.ends_with("it is masked"));
+    assert!(
+        report
+            .warnings
+            .iter()
+            .any(|warning| warning.contains("masks of your own"))
+    );
+    // 11.25 degrees around, with a little up and down.
+    assert!(
+        steps(&out).iter().all(|step| (10.5..12.5).contains(step)),
+        "{:?}",
+        steps(&out)
+    );
+    let masks = out.join("masks");
+    let (mut behind, mut before) = ([0usize; 2], [0usize; 2]);
+    for (i, far) in backgrounds.iter().enumerate() {
+        let mask = read_image(&masks.join(format!("{i:02}.png.png"))).unwrap();
+        assert_eq!([mask.width, mask.height], SIZE);
+        let kept = mask.data.chunks_exact(mask.channels as usize).map(|pixel| pixel[0] > 0);
+        for (kept, far) in kept.zip(far) {
+            let [count, right] = if *far { &mut behind } else { &mut before };
+            *count += 1;
+            *right += usize::from(kept != *far);
+        }
+    }
+    let [behind, before] = [behind, before].map(|[count, right]| right as f64 / count as f64);
+    assert!(behind > 0.93 && before > 0.93, "{behind} {before}");
+
+    // All of it is known the second time.
+    let model = fs::read(out.join("sparse/0/images.bin")).unwrap();
+    let again = posed(&photos, &out);
+    assert_eq!(again.warnings, report.warnings);
+    assert_eq!(fs::read(out.join("sparse/0/images.bin")).unwrap(), model);
+    // Photographs with masks of their own keep these.
+    let own = folder.path().join("own");
+    fs::create_dir(&own).unwrap();
+    fs::rename(&photos, own.join("images")).unwrap();
+    fs::create_dir(own.join("masks")).unwrap();
+    let white = vec![255; (SIZE[0] * SIZE[1]) as usize];
+    write_png(&own.join("masks/00.png"), SIZE[0], SIZE[1], 1, &white).unwrap();
+    let kept = posed(&own, &folder.path().join("kept"));
+    assert!(kept.warnings.is_empty(), "{:?}", kept.warnings);
+    assert_eq!(fs::read_dir(folder.path().join("kept/masks")).unwrap().count(), 1);
+    // Where nothing stands still any more, nothing is masked any more.
+    turntable(&photos, false);
+    assert!(posed(&photos, &out).warnings.is_empty());
+    assert!(!masks.exists());
+}

@@ -1,0 +1,433 @@
+//! What stands still in the pictures of a camera while the rest moves: the background of a turntable, parts of what carries the camera, writing.
+//!
+//! Background subtraction, as for a camera at rest (Stauffer and Grimson, "Adaptive background mixture models", 1999, with the strongest mode alone), in patches and
+//! relative to their texture, so that plain surfaces that move are not taken for others that do not: a patch without texture takes the side of what surrounds it.
+
+use crate::median;
+use rayon::prelude::*;
+
+/// Pictures at most of which the colours behind are found.
+const SAMPLES: usize = 32;
+/// Largest difference of a channel between pictures that show the same at a pixel, of 255: noise, and a little of other light.
+const SAME: u8 = 15;
+/// Least fraction of the pictures that show the colour behind.
+const SUPPORT: f32 = 0.25;
+/// Pixels on each side of a patch's centre.
+const REACH: usize = 2;
+/// Standard deviation of a channel from which on a patch has texture, and difference from which on it certainly differs, of 255.
+const TEXTURE: f32 = 5.0;
+const DIFFERS: f32 = 7.5;
+/// Variance of the difference by that of the patch, up to which it stands still, and from which on it moves.
+const STILL: f32 = 0.15;
+const MOVES: f32 = 0.5;
+/// Largest difference of a channel's mean, of 255, of what stands still in other light.
+const SHADE: f32 = 20.0;
+/// Difference of a patch without texture by that of half of the patches that stand still, up to which it is noise, also between pictures, the support it needs, and the part of the pixels around
+/// such a region that must stand still, so that it does: a wall between twigs, but not a white floor on which all moves.
+const QUIET: f64 = 3.0;
+const QUIET_SUPPORT: f32 = 0.6;
+const BESIDE: f64 = 0.1;
+/// Fraction of the pixels up to which a region is noise.
+const SPECK: f64 = 0.0008;
+
+/// What a patch does.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Label {
+    Still,
+    Moving,
+    /// Without texture, and what differs is noise.
+    Quiet,
+    Open,
+}
+
+/// What is the same in most pictures of a camera.
+pub struct StillScene {
+    width: usize,
+    /// `[3][H, W]`
+    color: [Vec<f32>; 3],
+    /// `[H, W]` the variance around each pixel.
+    texture: Vec<f32>,
+    /// `[H, W]` the fraction of the pictures that show it.
+    support: Vec<f32>,
+    /// `[H, W]` whether enough show it, and differ by no more than noise.
+    constant: Vec<bool>,
+}
+
+impl StillScene {
+    /// What most of `pictures`, `[H, W, 3]`, show.
+    ///
+    /// # Panics
+    /// When there is no picture, or one has not `width * height` pixels.
+    pub fn of(width: usize, height: usize, pictures: &[Vec<u8>]) -> Self {
+        assert!(!pictures.is_empty() && pictures.iter().all(|p| p.len() == 3 * width * height));
+        let count = pictures.len().min(SAMPLES);
+        let samples: Vec<&Vec<u8>> = (0..count).map(|i| &pictures[i * pictures.len() / count]).collect();
+        let at = |pixel: usize| {
+            let colors: Vec<[u8; 3]> = (samples.iter().map(|s| [0, 1, 2].map(|c| s[3 * pixel + c]))).collect();
+            Mode::of(&colors)
+        };
+        let modes: Vec<Mode> = (0..width * height).into_par_iter().map(at).collect();
+        let color = [0, 1, 2].map(|c| modes.iter().map(|mode| mode.color[c]).collect());
+        let texture = variance(width, &color);
+        let spread = means(width, &modes.iter().map(|mode| mode.variance).collect::<Vec<_>>());
+        let often = |i: &usize| modes[*i].support >= QUIET_SUPPORT;
+        let textured = (0..modes.len()).filter(|i| often(i) && texture[*i] > 3.0 * TEXTURE * TEXTURE);
+        let noise = median(textured.map(|i| f64::from(spread[i])).collect()).unwrap_or(0.0);
+        let constant = (0..modes.len()).map(|i| often(&i) && f64::from(spread[i]) < QUIET * noise);
+        Self {
+            width,
+            constant: constant.collect(),
+            support: modes.iter().map(|mode| mode.support).collect(),
+            texture,
+            color,
+        }
+    }
+
+    /// Where `picture`, `[H, W, 3]`, shows this scene.
+    ///
+    /// # Panics
+    /// When the picture has another size.
+    pub fn shown(&self, picture: &[u8]) -> Shown {
+        assert_eq!(picture.len(), 3 * self.texture.len());
+        let color = [0, 1, 2].map(|c| channel(picture, c));
+        let texture = variance(self.width, &color);
+        let labels = self.labels_in([1.0; 3], &color, &texture);
+        Shown {
+            width: self.width,
+            labels: self.labels_in(self.light(&color, &labels), &color, &texture),
+        }
+    }
+
+    /// What each patch of a picture does if this scene is `light` times as bright there.
+    fn labels_in(&self, light: [f32; 3], color: &[Vec<f32>; 3], texture: &[f32]) -> Vec<Label> {
+        let difference = [0, 1, 2].map(|c| -> Vec<f32> {
+            let both = color[c].iter().zip(&self.color[c]);
+            both.map(|(a, b)| a - light[c] * b).collect()
+        });
+        let shade = difference.each_ref().map(|d| means(self.width, d));
+        let varies = variance(self.width, &difference);
+        let square = |i: usize| varies[i] + shade.iter().map(|s| s[i] * s[i]).sum::<f32>();
+        let label = |i: usize| {
+            let texture = texture[i].max(self.texture[i]);
+            let is_shade = shade.iter().all(|s| s[i].abs() < SHADE);
+            if varies[i] < STILL * texture
+                && texture > 3.0 * TEXTURE * TEXTURE
+                && is_shade
+                && self.support[i] >= SUPPORT
+            {
+                Label::Still
+            } else if square(i) > MOVES * texture && square(i) > 3.0 * DIFFERS * DIFFERS {
+                Label::Moving
+            } else {
+                Label::Open
+            }
+        };
+        let mut labels: Vec<Label> = (0..texture.len()).map(label).collect();
+        let of_still = (0..labels.len()).filter(|i| labels[*i] == Label::Still).map(square);
+        if let Some(noise) = median(of_still.map(f64::from).collect()) {
+            for (i, label) in labels.iter_mut().enumerate() {
+                if *label == Label::Open && self.constant[i] && f64::from(square(i)) < QUIET * noise {
+                    *label = Label::Quiet;
+                }
+            }
+        }
+        labels
+    }
+
+    /// How much brighter than here each channel of a picture is where it shows this scene.
+    fn light(&self, color: &[Vec<f32>; 3], labels: &[Label]) -> [f32; 3] {
+        let sum = |values: &[f32]| -> f32 {
+            let of = values.iter().zip(labels).filter(|v| *v.1 == Label::Still);
+            of.map(|v| v.0).sum()
+        };
+        [0, 1, 2].map(|c| {
+            let here = sum(&color[c]);
+            if here > 0.0 {
+                here / sum(&self.color[c]).max(1.0)
+            } else {
+                1.0
+            }
+        })
+    }
+}
+
+/// Where a picture shows a [`StillScene`].
+pub struct Shown {
+    width: usize,
+    /// `[H, W]`
+    labels: Vec<Label>,
+}
+
+impl Shown {
+    /// The fraction of the pixels whose texture is that of the scene.
+    pub fn share(&self) -> f64 {
+        let still = self.labels.iter().filter(|label| **label == Label::Still).count();
+        still as f64 / self.labels.len() as f64
+    }
+
+    /// `[H, W]` where it is.
+    pub fn mask(mut self) -> Vec<bool> {
+        let (width, labels) = (self.width, &mut self.labels);
+        let least = (SPECK * labels.len() as f64) as usize;
+        join(width, labels, BESIDE, |label, _| label == Label::Quiet);
+        // What is left of them has nothing beside it that tells.
+        (labels.iter_mut().filter(|label| **label == Label::Quiet)).for_each(|label| *label = Label::Open);
+        join(width, labels, 0.5, |label, _| label == Label::Open);
+        smooth(width, labels);
+        join(width, labels, 0.5, |_, pixels| pixels < least);
+        grown(width, labels)
+    }
+}
+
+/// The colour that most pictures have at a pixel.
+struct Mode {
+    color: [f32; 3],
+    /// The fraction of the pictures that have it; 0 of fewer than three.
+    support: f32,
+    /// Among those, summed over the channels.
+    variance: f32,
+}
+
+impl Mode {
+    /// The first of several.
+    fn of(colors: &[[u8; 3]]) -> Self {
+        let same = |a: &[u8; 3], b: &[u8; 3]| a.iter().zip(b).all(|(a, b)| a.abs_diff(*b) <= SAME);
+        let count = |a: &[u8; 3]| colors.iter().filter(|b| same(a, b)).count();
+        let more = |most: (usize, [u8; 3]), next: (usize, [u8; 3])| if next.0 > most.0 { next } else { most };
+        let (n, center) = colors.iter().map(|a| (count(a), *a)).fold((0, [0; 3]), more);
+        let (mut color, mut variance) = ([0.0; 3], 0.0);
+        for c in 0..3 {
+            let values = || colors.iter().filter(|b| same(&center, b)).map(|b| f32::from(b[c]));
+            color[c] = values().sum::<f32>() / n as f32;
+            variance += values().map(|v| (v - color[c]).powi(2)).sum::<f32>() / n as f32;
+        }
+        let support = if n > 2 { n as f32 / colors.len() as f32 } else { 0.0 };
+        Self {
+            color,
+            support,
+            variance,
+        }
+    }
+}
+
+fn channel(picture: &[u8], c: usize) -> Vec<f32> {
+    picture.iter().skip(c).step_by(3).map(|v| f32::from(*v)).collect()
+}
+
+/// `[H, W]` the mean over the patch around each pixel.
+fn means(width: usize, values: &[f32]) -> Vec<f32> {
+    let height = values.len() / width;
+    let patch = |at: usize, of: usize| at.saturating_sub(REACH)..(at + REACH + 1).min(of);
+    let mut rows = Vec::with_capacity(values.len());
+    for row in values.chunks_exact(width) {
+        rows.extend((0..width).map(|x| {
+            let near = &row[patch(x, width)];
+            near.iter().sum::<f32>() / near.len() as f32
+        }));
+    }
+    let mut both = vec![0.0; values.len()];
+    for (y, mean) in both.chunks_exact_mut(width).enumerate() {
+        let near = patch(y, height);
+        let part = 1.0 / near.len() as f32;
+        for row in near.map(|y| &rows[y * width..][..width]) {
+            mean.iter_mut().zip(row).for_each(|(mean, value)| *mean += part * value);
+        }
+    }
+    both
+}
+
+/// `[H, W]` the variance over the patch around each pixel, summed over the channels.
+fn variance(width: usize, color: &[Vec<f32>; 3]) -> Vec<f32> {
+    let squares: Vec<f32> = (0..color[0].len())
+        .map(|i| color.iter().map(|c| c[i] * c[i]).sum())
+        .collect();
+    let (mut variance, means) = (means(width, &squares), color.each_ref().map(|c| means(width, c)));
+    for (i, variance) in variance.iter_mut().enumerate() {
+        *variance = (*variance - means.iter().map(|m| m[i] * m[i]).sum::<f32>()).max(0.0);
+    }
+    variance
+}
+
+/// Lets connected pixels of one label that are `weak`, by the label and their number, stand still if more than the part `least` of what is around them does, and
+/// else move.
+fn join(width: usize, labels: &mut [Label], least: f64, weak: impl Fn(Label, usize) -> bool) {
+    let mut seen = vec![false; labels.len()];
+    for start in 0..labels.len() {
+        if seen[start] {
+            continue;
+        }
+        let label = labels[start];
+        let (mut region, mut next) = (vec![start], 0);
+        let mut around = [0usize; 2];
+        seen[start] = true;
+        while let Some(&at) = region.get(next) {
+            next += 1;
+            for to in adjacent(width, labels.len(), at) {
+                match labels[to] {
+                    other if other == label => {
+                        if !std::mem::replace(&mut seen[to], true) {
+                            region.push(to);
+                        }
+                    }
+                    Label::Still => around[0] += 1,
+                    Label::Moving => around[1] += 1,
+                    Label::Quiet | Label::Open => {}
+                }
+            }
+        }
+        if weak(label, region.len()) && around != [0; 2] {
+            let still = around[0] as f64 > least * (around[0] + around[1]) as f64;
+            let joined = if still { Label::Still } else { Label::Moving };
+            region.into_iter().for_each(|at| labels[at] = joined);
+        }
+    }
+}
+
+/// The pixels beside, above and below another of `pixels`.
+fn adjacent(width: usize, pixels: usize, at: usize) -> impl Iterator<Item = usize> {
+    let x = at % width;
+    let to = [
+        (x > 0).then(|| at - 1),
+        (x + 1 < width).then_some(at + 1),
+        at.checked_sub(width),
+        (at + width < pixels).then_some(at + width),
+    ];
+    to.into_iter().flatten()
+}
+
+/// Gives each pixel the label that most of it and the four around it have.
+fn smooth(width: usize, labels: &mut [Label]) {
+    let before = labels.to_vec();
+    for (at, label) in labels.iter_mut().enumerate() {
+        let (mut same, mut other) = (1, 0);
+        for to in adjacent(width, before.len(), at) {
+            match before[to] == *label {
+                true => same += 1,
+                false => other += 1,
+            }
+        }
+        if other > same {
+            *label = match *label {
+                Label::Still => Label::Moving,
+                _ => Label::Still,
+            };
+        }
+    }
+}
+
+/// What stands still and the pixels around it, which show a little of it.
+fn grown(width: usize, labels: &[Label]) -> Vec<bool> {
+    let is_still = |at: usize| labels[at] == Label::Still;
+    let all = 0..labels.len();
+    all.map(|at| is_still(at) || adjacent(width, labels.len(), at).any(is_still))
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const SIDE: usize = 120;
+
+    fn noise(seed: u32, x: usize, y: usize) -> u8 {
+        let hash = (seed ^ (x as u32).wrapping_mul(0x9e37_79b9) ^ (y as u32).wrapping_mul(0x85eb_ca6b))
+            .wrapping_mul(0xc2b2_ae35);
+        (hash >> 24) as u8
+    }
+
+    fn center(picture: usize) -> f32 {
+        40.0 + 2.0 * picture as f32
+    }
+
+    /// A disc of 60 pixels that wanders over `behind` and has one colour at its centre, in `light`.
+    fn turntable(
+        pictures: usize,
+        behind: impl Fn(usize, usize, usize) -> u8,
+        light: impl Fn(usize) -> f32,
+    ) -> Vec<Vec<u8>> {
+        let picture = |i: usize| {
+            let pixel = |at: usize| {
+                let (x, y) = (at % SIDE, at / SIDE);
+                let away = (x as f32 - center(i)).hypot(y as f32 - 60.0);
+                let value = match away {
+                    ..12.0 => 90,
+                    ..30.0 => noise(1, (x + 120 - 2 * i) / 3, y / 3) / 2 + 60,
+                    _ => behind(x, y, i),
+                };
+                [(light(i) * f32::from(value)) as u8 + noise(i as u32, x, y) % 3; 3]
+            };
+            (0..SIDE * SIDE).flat_map(pixel).collect()
+        };
+        (0..pictures).map(picture).collect()
+    }
+
+    fn masks(pictures: &[Vec<u8>]) -> Vec<Vec<bool>> {
+        let still = StillScene::of(SIDE, SIDE, pictures);
+        pictures.iter().map(|picture| still.shown(picture).mask()).collect()
+    }
+
+    /// The fractions of what is behind and of the disc that are masked.
+    fn masked(pictures: &[Vec<u8>]) -> [f64; 2] {
+        let masks = masks(pictures);
+        let (mut still, mut of) = ([0usize; 2], [0usize; 2]);
+        for (i, mask) in masks.iter().enumerate() {
+            for (at, is) in mask.iter().enumerate() {
+                let away = ((at % SIDE) as f32 - center(i)).hypot((at / SIDE) as f32 - 60.0);
+                let part = match away {
+                    ..28.0 => 1,
+                    34.0.. => 0,
+                    _ => continue,
+                };
+                of[part] += 1;
+                still[part] += usize::from(*is);
+            }
+        }
+        [0, 1].map(|part| still[part] as f64 / of[part] as f64)
+    }
+
+    #[test]
+    fn what_stands_still_is_masked_and_what_moves_before_it_is_not() {
+        let textured = |x: usize, y: usize, _: usize| noise(2, x / 4, y / 4).min(250);
+        let [behind, disc] = masked(&turntable(20, textured, |_| 1.0));
+        assert!(behind > 0.98 && disc < 0.02, "{behind} {disc}");
+        let pictures = turntable(20, textured, |_| 1.0);
+        let still = StillScene::of(SIDE, SIDE, &pictures);
+        let other = turntable(1, |x, y, _| noise(3, x / 4, y / 4).min(250), |_| 1.0).remove(0);
+        let shares = [&pictures[7], &other].map(|picture| still.shown(picture).share());
+        assert!(shares[0] > 0.5 && shares[1] < 0.05, "{shares:?}");
+        // In light that changes from picture to picture, and with a plain part that writing surrounds.
+        let plain = |x: usize, y: usize, _: usize| {
+            if (40..110).contains(&x) && y < 25 {
+                120
+            } else {
+                noise(2, x / 4, y / 4).min(250)
+            }
+        };
+        let [behind, disc] = masked(&turntable(20, plain, |i| [0.9, 0.95, 1.0][i % 3]));
+        assert!(behind > 0.97 && disc < 0.02, "{behind} {disc}");
+    }
+
+    #[test]
+    fn a_plain_floor_that_moves_is_not_masked() {
+        // All that stands still is a label in the corner; the floor, 14,000 pixels, is plain but for its shade, and what moves on it has texture.
+        let shaded = |x: usize, i: usize| (120 + (x + 2 * i) / 8) as u8;
+        let corner = |x: usize, y: usize, i: usize| {
+            if x < 20 && y < 20 {
+                noise(2, x / 3, y / 3).min(250)
+            } else {
+                shaded(x, i)
+            }
+        };
+        let masks = masks(&turntable(20, corner, |_| 1.0));
+        let in_corner = |at: usize| at % SIDE < 18 && at / SIDE < 18;
+        for mask in masks {
+            let still = |inside: bool| {
+                (0..SIDE * SIDE)
+                    .filter(|at| mask[*at] && in_corner(*at) == inside)
+                    .count()
+            };
+            assert!(still(true) > 300, "{}", still(true));
+            assert!(still(false) < 500, "{}", still(false));
+        }
+    }
+}

@@ -664,3 +664,32 @@ fn known_distances_bring_a_model_to_metres_with_an_error_that_holds() {
     assert_eq!(to_distances(&mut turned, &world.photos, &[distance(3, 4, 1.0)]), None);
     assert_eq!(turned, before);
 }
+
+/// A ring of narrow views: pairs fit nearly every focal length, and a model from a short one is flat.
+#[test]
+fn narrow_views_all_around_are_one_model() {
+    let camera = DCamera::centered(CAMERA.width, CAMERA.height, 6.0 * f64::from(CAMERA.width));
+    let ring: Vec<DPose> = (0..40)
+        .map(|i| {
+            let angle = std::f64::consts::TAU * f64::from(i) / 40.0;
+            look(DVec3::new(20.0 * angle.cos(), 20.0 * angle.sin(), 1.0), DVec3::ZERO)
+        })
+        .collect();
+    let mut rng = Rng::new(3, 0);
+    let mut uniform = |range: f32| f64::from(rng.range(-range, range));
+    // On a cylinder.
+    let points: Vec<(DVec3, DVec3)> = (0..1000)
+        .map(|_| {
+            let angle = uniform(std::f32::consts::PI);
+            let out = DVec3::new(angle.cos(), angle.sin(), 0.0);
+            (1.5 * out + DVec3::Z * uniform(1.5), out)
+        })
+        .collect();
+    let world = World::of_points(camera, ring, &points, 0, 1.0, 0.5, 4);
+    let result = world.map();
+    let model = &result.models[0];
+    assert_eq!(model.registered(), 40);
+    let focal = model.cameras[0].expect("registered").focal() / camera.focal();
+    assert!((focal - 1.0).abs() < 0.1, "{focal}");
+    assert!(world.auc(model, 5.0) > 80.0, "{}", world.auc(model, 5.0));
+}

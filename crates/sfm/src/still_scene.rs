@@ -58,10 +58,12 @@ impl StillScene {
     ///
     /// # Panics
     /// When there is no picture, or one has not `width * height` pixels.
-    pub fn of(width: usize, height: usize, pictures: &[Vec<u8>]) -> Self {
-        assert!(!pictures.is_empty() && pictures.iter().all(|p| p.len() == 3 * width * height));
+    pub fn of(width: usize, height: usize, pictures: &[impl AsRef<[u8]>]) -> Self {
+        assert!(!pictures.is_empty() && pictures.iter().all(|p| p.as_ref().len() == 3 * width * height));
         let count = pictures.len().min(SAMPLES);
-        let samples: Vec<&Vec<u8>> = (0..count).map(|i| &pictures[i * pictures.len() / count]).collect();
+        let samples: Vec<&[u8]> = (0..count)
+            .map(|i| pictures[i * pictures.len() / count].as_ref())
+            .collect();
         let at = |pixel: usize| {
             let colors: Vec<[u8; 3]> = (samples.iter().map(|s| [0, 1, 2].map(|c| s[3 * pixel + c]))).collect();
             Mode::of(&colors)

@@ -25,47 +25,38 @@ pub(super) struct Matched<'a> {
 
 /// What was found.
 pub(super) struct Attempt<'a> {
-    pub work: Work<'a>,
-    /// Of the photographs that have features.
-    pub infos: Vec<PhotoInfo>,
-    pub pairs: Vec<PairMatches>,
+    pub matched: Matched<'a>,
     pub reconstruction: Reconstruction,
 }
 
 impl<'a> Matched<'a> {
-    /// Features and matches of the photographs of `work`.
-    pub fn find(mut work: Work<'a>, capture: &Capture, clock: &mut Clock) -> Result<Self, RunError> {
+    /// Features and matches of the photographs of `work`. Of those in which what stands still is `masked`, some are left at the edges of the masks: their matches
+    /// are left out.
+    pub fn find(mut work: Work<'a>, capture: &Capture, masked: bool, clock: &mut Clock) -> Result<Self, RunError> {
         work.find_features()?;
         clock.end("features");
         let pair_options = PairOptions {
             successors: if capture.has_films { FILM_SUCCESSORS } else { 0 },
             ..PairOptions::default()
         };
-        let pairs = work.match_pairs(&pair_options)?;
+        let mut pairs = work.match_pairs(&pair_options)?;
         clock.end("matches");
         let infos = capture.infos(work.photos());
+        if masked {
+            pairs = moving(&infos, work.features(), &pairs);
+        }
         Ok(Self { work, infos, pairs })
-    }
-
-    /// The same without matches that stand still: at the edges of masks some are left.
-    pub fn moving(mut self) -> Self {
-        self.pairs = moving(&self.infos, self.work.features(), &self.pairs);
-        self
     }
 
     /// Models of the photographs, or poses for those that are not `known`.
     pub fn map(
-        self,
+        mut self,
         options: &MapOptions,
         known: Option<KnownPoses>,
         clock: &mut Clock,
         progress: &(dyn Fn(PoseProgress) + Sync),
     ) -> Result<Attempt<'a>, RunError> {
-        let Self {
-            mut work,
-            mut infos,
-            mut pairs,
-        } = self;
+        let Self { work, infos, pairs } = &mut self;
         progress(PoseProgress::Stage {
             name: "poses",
             of: work.photos().len(),
@@ -77,25 +68,23 @@ impl<'a> Matched<'a> {
         };
         let is_new = known.is_none();
         let mut reconstruction = match known {
-            None => models(&work, &infos, &pairs, options, &mut tell),
+            None => models(work, infos, pairs, options, &mut tell),
             Some(known) => {
-                let known = known.of(&mut infos)?;
-                extend(&infos, work.features(), &pairs, &known, options, &mut tell)
+                let known = known.of(infos)?;
+                extend(infos, work.features(), pairs, &known, options, &mut tell)
             }
         };
-        let unmatched = reconstruction.absent_and_unmatched(&pairs);
+        let unmatched = reconstruction.absent_and_unmatched(pairs);
         if is_new && !unmatched.is_empty() {
             // Of many photographs not all pairs are matched: where too much is absent, the rest must be as well.
             let mut all: Vec<[u32; 2]> = pairs.iter().map(|pair| pair.photos).chain(unmatched).collect();
             all.sort_unstable();
-            pairs = work.matches_of(all)?;
-            reconstruction = models(&work, &infos, &pairs, options, &mut tell);
+            *pairs = work.matches_of(all)?;
+            reconstruction = models(work, infos, pairs, options, &mut tell);
         }
         clock.end("poses");
         Ok(Attempt {
-            work,
-            infos,
-            pairs,
+            matched: self,
             reconstruction,
         })
     }
@@ -110,29 +99,29 @@ impl<'a> Attempt<'a> {
     /// For the report.
     pub fn report(&self) -> AttemptReport {
         AttemptReport {
-            max_features: self.work.sift().max_features,
-            frontal: self.work.sift().frontal,
+            max_features: self.matched.work.sift().max_features,
+            frontal: self.matched.work.sift().frontal,
             registered: self.registered(),
-            warnings: self.work.warnings().to_vec(),
+            warnings: self.matched.work.warnings().to_vec(),
         }
     }
 
     /// The same photographs, to be matched with frontal descriptors and along epipolar lines, if too few of them have a pose. Parts that look alike and are
     /// mapped apart would only be taken for one another again.
     pub fn again(&self, wanted: Option<usize>, out: &Path) -> Option<Work<'a>> {
-        let photos = self.work.photos().len();
+        let photos = self.matched.work.photos().len();
         if self.registered() >= enough(photos) || self.reconstruction.apart.is_some() {
             return None;
         }
         let posed = self.reconstruction.models.first().map(|model| &model.poses);
         let left_out = (0..photos).filter(|i| posed.is_none_or(|poses| poses[*i].is_none()));
-        Some(self.work.again(wanted, &left_out.collect::<Vec<_>>(), out))
+        Some(self.matched.work.again(wanted, &left_out.collect::<Vec<_>>(), out))
     }
 
     /// Whether this second attempt is to be preferred to the `first`. Its weak matches make wrong models of few photographs (3 of 20 of a room that was seen from
     /// one place, two opposite walls of a house as one) and add single ones of what looks alike.
     pub fn replaces(&self, first: &Self) -> bool {
-        let photos = self.work.photos().len();
+        let photos = self.matched.work.photos().len();
         self.registered() >= photos.div_ceil(2).max(first.registered() + photos.div_ceil(20))
     }
 }

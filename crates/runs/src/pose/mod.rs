@@ -299,7 +299,7 @@ pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Resu
 
     let is_new = known.is_none();
     let work = Work::new(input.max_features, Some(out), folder, progress);
-    let mut matched = Matched::find(work, &capture, &mut clock)?;
+    let mut matched = Matched::find(work, &capture, false, &mut clock)?;
     let masked = match is_new && !capture.has_panoramas() {
         true => still::mask(&matched, folder, out, progress)?,
         false => None,
@@ -307,7 +307,7 @@ pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Resu
     if let Some(masked) = &masked {
         clock.end("masks");
         folder = &masked.folder;
-        matched = Matched::find(matched.work.masked(folder, out), &capture, &mut clock)?.moving();
+        matched = Matched::find(matched.work.masked(folder, out), &capture, true, &mut clock)?;
     }
     let mut attempt = matched.map(&input.mapping, known, &mut clock, progress)?;
     let mut attempts = vec![attempt.report()];
@@ -318,10 +318,7 @@ pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Resu
             attempt.registered(),
             folder.photos.len(),
         )));
-        let mut again = Matched::find(work, &capture, &mut clock)?;
-        if masked.is_some() {
-            again = again.moving();
-        }
+        let again = Matched::find(work, &capture, masked.is_some(), &mut clock)?;
         let again = again.map(&input.mapping, None, &mut clock, progress)?;
         attempts.push(again.report());
         if again.replaces(&attempt) {
@@ -329,9 +326,7 @@ pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Resu
         }
     }
     let Attempt {
-        work,
-        mut infos,
-        pairs,
+        matched: Matched { work, mut infos, pairs },
         mut reconstruction,
     } = attempt;
     reconstruction.regroup(&mut infos);

@@ -43,7 +43,7 @@ struct Behind {
 impl Behind {
     /// From those of `pictures` that are of `group`, if there are enough.
     fn of(group: &[usize], [width, height]: [u32; 2], pictures: &BTreeMap<usize, Vec<u8>>) -> Option<Self> {
-        let of: Vec<Vec<u8>> = group.iter().filter_map(|photo| pictures.get(photo).cloned()).collect();
+        let of: Vec<&Vec<u8>> = group.iter().filter_map(|photo| pictures.get(photo)).collect();
         (of.len() >= LEAST).then(|| {
             let scene = StillScene::of(width as usize, height as usize, &of);
             let share: f64 = of
@@ -143,13 +143,16 @@ fn find(matched: &Matched, folder: &PhotoFolder, still: &StandsStill) -> Result<
 /// Where `pictures` show what is behind them, by photograph. Of several `scenes`, such as those of rings of different height, each shows the one it has most of.
 fn shown(scenes: &[Behind], pictures: &BTreeMap<usize, Vec<u8>>) -> BTreeMap<usize, Vec<bool>> {
     let most = |picture: &[u8]| {
-        let all = scenes.iter().map(|behind| behind.scene.shown(picture)).enumerate();
-        let shown = all.filter(|(i, shown)| shown.share() >= scenes[*i].least);
-        shown.max_by(|a, b| a.1.share().total_cmp(&b.1.share()))
+        let all = scenes.iter().enumerate().map(|(i, behind)| {
+            let shown = behind.scene.shown(picture);
+            (i, shown.share(), shown)
+        });
+        let shown = all.filter(|(i, share, _)| *share >= scenes[*i].least);
+        shown.max_by(|a, b| a.1.total_cmp(&b.1))
     };
     let of_pictures: Vec<_> = pictures
         .par_iter()
-        .filter_map(|(photo, picture)| most(picture).map(|(scene, shown)| (scene, *photo, shown.mask())))
+        .filter_map(|(photo, picture)| most(picture).map(|(scene, _, shown)| (scene, *photo, shown.mask())))
         .collect();
     let mut by_scene: BTreeMap<usize, BTreeMap<usize, Vec<bool>>> = BTreeMap::new();
     for (scene, photo, still) in of_pictures {

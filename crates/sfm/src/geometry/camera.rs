@@ -55,6 +55,11 @@ impl DCamera {
         }
     }
 
+    /// The longer side of its pictures, px.
+    pub fn long_side(&self) -> f64 {
+        f64::from(self.width.max(self.height))
+    }
+
     /// Pixels per unit of the plane z = 1, averaged over both axes.
     pub fn focal(&self) -> f64 {
         0.5 * (self.parameters[0] + self.parameters[1])

@@ -19,7 +19,7 @@ const LEAST: usize = 5;
 
 /// The cameras of a model that are rather fisheyes: groups, and the cameras that fit.
 pub(super) fn find(photos: &[PhotoInfo], features: &[Features], model: &Model) -> Vec<(usize, DCamera)> {
-    let is_wide = |camera: &DCamera| camera.focal() < WIDE * f64::from(camera.width.max(camera.height));
+    let is_wide = |camera: &DCamera| camera.focal() < WIDE * camera.long_side();
     let count = |group: usize| {
         (0..photos.len())
             .filter(|p| photos[*p].group == group && model.poses[*p].is_some())

@@ -166,19 +166,15 @@ fn with_own_focals(
 /// becomes flat, and breaks.
 fn narrow(photos: &[PhotoInfo], cameras: &Cameras) -> Option<Vec<Option<(DCamera, Source)>>> {
     let told = |photo: &PhotoInfo| photo.focal_prior_px.is_some() || photo.camera.is_some();
-    let shorter = |(camera, _): &(DCamera, Source)| camera.focal() < NARROW / 2.0 * long_side(camera);
+    let shorter = |(camera, _): &(DCamera, Source)| camera.focal() < NARROW / 2.0 * camera.long_side();
     if photos.iter().any(told) || !cameras.iter().all(shorter) {
         return None;
     }
     let camera = |(camera, _): &(DCamera, Source)| {
-        let focal = NARROW * long_side(camera);
+        let focal = NARROW * camera.long_side();
         Some((DCamera::centered(camera.width, camera.height, focal), Source::Guess))
     };
     Some(cameras.iter().map(camera).collect())
-}
-
-fn long_side(camera: &DCamera) -> f64 {
-    f64::from(camera.width.max(camera.height))
 }
 
 /// Photographs of the largest model, and what its points explain of them.

@@ -303,8 +303,7 @@ impl Working<'_> {
 
     /// Takes an adjusted camera, unless its values are not those of a camera.
     fn take_camera(&mut self, group: usize, camera: DCamera) {
-        let long_side = f64::from(camera.width.max(camera.height));
-        let focal = camera.focal() / long_side;
+        let focal = camera.focal() / camera.long_side();
         let lens = camera.parameters[4..].iter().all(|k| k.abs() < 1.0);
         if (0.2..10.0).contains(&focal) && lens {
             self.cameras[group] = camera;
@@ -317,7 +316,7 @@ impl Working<'_> {
 /// What is known of cameras in general, so that what a set of photographs does not determine stays where it usually is:
 /// square pixels, a principal point near the centre, a weak lens, a focal length within `focal` of the first one.
 fn belief(camera: &DCamera, first_focal: f64, focal: f64) -> Belief {
-    let long_side = f64::from(camera.width.max(camera.height));
+    let long_side = camera.long_side();
     let deviations = [
         focal * first_focal,
         0.002,

@@ -67,11 +67,12 @@ impl<'a> Matched<'a> {
             }
         };
         let is_new = known.is_none();
-        let mut reconstruction = match known {
+        let (mut reconstruction, options) = match known {
             None => models(work, infos, pairs, options, &mut tell),
             Some(known) => {
                 let known = known.of(infos)?;
-                extend(infos, work.features(), pairs, &known, options, &mut tell)
+                let extended = extend(infos, work.features(), pairs, &known, options, &mut tell);
+                (extended, *options)
             }
         };
         let unmatched = reconstruction.absent_and_unmatched(pairs);
@@ -80,7 +81,7 @@ impl<'a> Matched<'a> {
             let mut all: Vec<[u32; 2]> = pairs.iter().map(|pair| pair.photos).chain(unmatched).collect();
             all.sort_unstable();
             *pairs = work.matches_of(all)?;
-            reconstruction = models(work, infos, pairs, options, &mut tell);
+            reconstruction = reconstruct(infos, work.features(), pairs, &options, &mut tell);
         }
         clock.end("poses");
         Ok(Attempt {
@@ -134,27 +135,29 @@ fn enough(photos: usize) -> usize {
     }
 }
 
-/// Models of photographs without poses. In a second attempt, matches along epipolar lines join where too few photographs have a pose without them: where a
-/// model holds, these weak matches may break it.
+/// Models of photographs without poses, and how they were made. In a second attempt, matches along epipolar lines join where too few photographs have a pose without
+/// them: where a model holds, these weak matches may break it. Narrow views are of the first.
 fn models(
     work: &Work,
     infos: &[PhotoInfo],
     pairs: &[PairMatches],
     options: &MapOptions,
     tell: &mut dyn FnMut(Progress),
-) -> Reconstruction {
-    let found = reconstruct(infos, work.features(), pairs, options, tell);
-    if !work.sift().frontal || found.registered() >= enough(infos.len()) {
-        return found;
-    }
-    let guided = MapOptions {
-        guided: true,
+) -> (Reconstruction, MapOptions) {
+    let is_second = work.sift().frontal;
+    let usual = MapOptions {
+        narrow: options.narrow && !is_second,
         ..*options
     };
+    let found = reconstruct(infos, work.features(), pairs, &usual, tell);
+    if !is_second || found.registered() >= enough(infos.len()) {
+        return (found, usual);
+    }
+    let guided = MapOptions { guided: true, ..usual };
     let again = reconstruct(infos, work.features(), pairs, &guided, tell);
     if again.registered() > found.registered() {
-        again
+        (again, guided)
     } else {
-        found
+        (found, usual)
     }
 }

@@ -72,13 +72,11 @@ pub(super) fn mask(
     progress: &(dyn Fn(PoseProgress) + Sync),
 ) -> Result<Option<Masked>, RunError> {
     let written = out.join(MASKS);
-    if folder.photos.iter().any(|photo| photo.mask.is_some()) {
-        return Ok(None);
-    }
     if written.join(RECORD).exists() {
         fs::remove_dir_all(&written).map_err(RunError::io("clear", &written))?;
-    } else if written.exists() {
-        // Somebody's, for the training.
+    }
+    // Somebody's, for the poses or for the training alone.
+    if written.exists() || folder.photos.iter().any(|photo| photo.mask.is_some()) {
         return Ok(None);
     }
     let Some(still) = stands_still(&matched.infos, matched.work.features(), &matched.pairs) else {

@@ -17,8 +17,9 @@ use glam::{DMat3, DQuat, DVec2, DVec3};
 use rayon::prelude::*;
 use schur::Linearization;
 
-/// Unknowns of poses and cameras beyond which conjugate gradients are used: 330 photographs.
-pub const DIRECT_LIMIT: usize = 2000;
+/// Unknowns of poses and cameras beyond which conjugate gradients are used: 2,000 photographs. On two cores the direct solution takes 0.13 s of 2,400 unknowns that all depend on
+/// one another and 0.88 s of 4,800; 200 iterations take 0.7 s and 2.7 s, and end before they have converged.
+pub const DIRECT_LIMIT: usize = 12_000;
 
 /// Which intrinsics of a camera are adjusted; the others are held.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

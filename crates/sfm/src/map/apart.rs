@@ -43,15 +43,17 @@ pub(super) fn parted(input: &Input, found: Grown, progress: &mut dyn FnMut(Progr
         let part = parts(photos.len(), pairs, &strengths(photos, features, pairs), &seen);
         let within = |pair: &&VerifiedPair| part[pair.photos[0] as usize] == part[pair.photos[1] as usize];
         let kept: Vec<VerifiedPair> = pairs.iter().filter(within).cloned().collect();
-        let parts = grown(input, &kept, progress);
-        let registered = |found: &Grown| found.models.iter().map(Model::registered).sum::<usize>() as f64;
-        let left: usize = parts.models.iter().map(|model| absent(photos, model).len()).sum();
-        if registered(&parts) >= KEEPS * registered(&found) && 2 * left <= absent_pairs.len() {
-            return Parted {
-                apart: Some(parts.models.len()),
-                found: parts,
-                absent: absent_pairs,
-            };
+        if kept.len() < pairs.len() {
+            let parts = grown(input, &kept, progress);
+            let registered = |found: &Grown| found.models.iter().map(Model::registered).sum::<usize>() as f64;
+            let left: usize = parts.models.iter().map(|model| absent(photos, model).len()).sum();
+            if registered(&parts) >= KEEPS * registered(&found) && 2 * left <= absent_pairs.len() {
+                return Parted {
+                    apart: Some(parts.models.len()),
+                    found: parts,
+                    absent: absent_pairs,
+                };
+            }
         }
     }
     Parted {

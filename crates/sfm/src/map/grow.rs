@@ -12,8 +12,11 @@ use crate::geometry::ransac::{Estimate, Limits};
 use crate::geometry::resection::Resection;
 use glam::{DVec2, DVec3};
 
-/// Seeds tried for one model.
+/// Seeds tried for one model, and those among which they are selected.
 const SEEDS: usize = 12;
+const CANDIDATES: usize = 20 * SEEDS;
+/// Models of the same search that hold both photographs of a seed, from which on it is skipped: it would lead to the same once more.
+const AGAIN: usize = 2;
 /// Fraction of what its photographs show that a model explains, where focal lengths are open. Those that are right explain 0.88 to
 /// 1.00 of six captures cut in ten ways, and 0.74 of a clock with three models; wrong ones 0.06 to 0.67.
 const EXPLAINED: f64 = 0.8;
@@ -51,7 +54,16 @@ pub(super) fn model<'a>(
     let open = empty.has_open_focals();
     let size = |model: &Working| if open { model.used_count() } else { model.registered() };
     let mut best: Option<(Working, Vec<usize>)> = None;
-    for seed in seeds(pairs, taken, SEEDS) {
+    let mut held = vec![0; pairs.len()];
+    let mut left = SEEDS;
+    for seed in seeds(pairs, taken, CANDIDATES) {
+        if left == 0 {
+            break;
+        }
+        if !open && held[seed] >= AGAIN {
+            continue;
+        }
+        left -= 1;
         let reachable = reachable(&pairs[seed], pairs, taken);
         if best
             .as_ref()
@@ -63,6 +75,9 @@ pub(super) fn model<'a>(
         let mut failures = vec![0; photos.len()];
         if !grown.start(&pairs[seed]) || !grown.grow(taken, &mut failures, progress) {
             continue;
+        }
+        for (pair, held) in pairs.iter().zip(&mut held) {
+            *held += usize::from(pair.photos.iter().all(|photo| grown.poses[*photo as usize].is_some()));
         }
         if grown.registered() >= options.min_model_photos
             && best.as_ref().is_none_or(|(best, _)| size(&grown) > size(best))

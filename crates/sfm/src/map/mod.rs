@@ -79,7 +79,10 @@ pub fn reconstruct(
     let mut known = known_cameras(photos);
     let mut found = mapped(photos, features, pairs, &known, options, progress);
     let in_doubt = found.apart.is_some() || (found.registered() as f64) < IN_DOUBT * photos.len() as f64;
-    if in_doubt && let Some(narrow) = narrow(photos, &found.cameras) {
+    if options.narrow
+        && in_doubt
+        && let Some(narrow) = narrow(photos, &found.cameras)
+    {
         let again = mapped(photos, features, pairs, &narrow, options, progress);
         if again.apart.is_none() && explained(&again) > explained(&found) {
             found = again;

@@ -70,6 +70,8 @@ pub struct MapOptions {
     pub min_inliers: usize,
     /// Whether a pair that passes is matched once more along its epipolar lines, where features need not differ from those elsewhere.
     pub guided: bool,
+    /// Whether what may be a narrow view is mapped once more as one, where the model is in doubt and no metadata tell a focal length.
+    pub narrow: bool,
     /// Largest reprojection error of an observation, px.
     pub max_error: f64,
     /// Largest reprojection error of an inlier when a photograph is registered, px.
@@ -98,6 +100,7 @@ impl Default for MapOptions {
             max_epipolar_error: 4.0,
             min_inliers: 15,
             guided: false,
+            narrow: true,
             max_error: 4.0,
             max_registration_error: 8.0,
             min_registration_inliers: 20,

@@ -6,6 +6,7 @@
 #![forbid(unsafe_code)]
 
 pub mod adjust;
+mod backdrop;
 mod connected;
 pub mod doctor;
 pub mod features;
@@ -16,6 +17,7 @@ pub mod matching;
 mod median;
 mod still_scene;
 
+pub use backdrop::Backdrop;
 pub(crate) use connected::connected;
 pub use keypoints::{DESCRIPTOR_BYTES, Features, Keypoint, PairMatches};
 pub(crate) use median::median;

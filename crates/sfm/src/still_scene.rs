@@ -212,12 +212,12 @@ impl Mode {
     }
 }
 
-fn channel(picture: &[u8], c: usize) -> Vec<f32> {
+pub(crate) fn channel(picture: &[u8], c: usize) -> Vec<f32> {
     picture.iter().skip(c).step_by(3).map(|v| f32::from(*v)).collect()
 }
 
 /// `[H, W]` the mean over the patch around each pixel.
-fn means(width: usize, values: &[f32]) -> Vec<f32> {
+pub(crate) fn means(width: usize, values: &[f32]) -> Vec<f32> {
     let height = values.len() / width;
     let patch = |at: usize, of: usize| at.saturating_sub(REACH)..(at + REACH + 1).min(of);
     let mut rows = Vec::with_capacity(values.len());
@@ -239,7 +239,7 @@ fn means(width: usize, values: &[f32]) -> Vec<f32> {
 }
 
 /// `[H, W]` the variance over the patch around each pixel, summed over the channels.
-fn variance(width: usize, color: &[Vec<f32>; 3]) -> Vec<f32> {
+pub(crate) fn variance(width: usize, color: &[Vec<f32>; 3]) -> Vec<f32> {
     let squares: Vec<f32> = (0..color[0].len())
         .map(|i| color.iter().map(|c| c[i] * c[i]).sum())
         .collect();
@@ -286,7 +286,7 @@ fn join(width: usize, labels: &mut [Label], least: f64, weak: impl Fn(Label, usi
 }
 
 /// The pixels beside, above and below another of `pixels`.
-fn adjacent(width: usize, pixels: usize, at: usize) -> impl Iterator<Item = usize> {
+pub(crate) fn adjacent(width: usize, pixels: usize, at: usize) -> impl Iterator<Item = usize> {
     let x = at % width;
     let to = [
         (x > 0).then(|| at - 1),

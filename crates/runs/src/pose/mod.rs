@@ -325,6 +325,14 @@ pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Resu
             attempt = again;
         }
     }
+    let told = match &masked {
+        Some(masked) => Some(masked.told.clone()),
+        None if is_new && !capture.has_panoramas() => still::mask_backdrop(&attempt, folder, out, progress)?,
+        None => None,
+    };
+    if masked.is_none() && told.is_some() {
+        clock.end("masks");
+    }
     let Attempt {
         matched: Matched { work, mut infos, pairs },
         mut reconstruction,
@@ -360,7 +368,7 @@ pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Resu
     report.attempts = attempts;
     report.pairs = pairs.len();
     report.warnings = work.warnings().to_vec();
-    report.warnings.extend(masked.map(|masked| masked.told));
+    report.warnings.extend(told);
     report.stages = clock.stages;
     report.seconds = started.elapsed().as_secs_f64();
     write_atomic(&out.join(REPORT), |file| file.write_all(&to_json(&report)))?;

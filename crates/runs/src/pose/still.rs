@@ -1,16 +1,17 @@
-//! Masks of what stands still in the pictures while the rest moves: poses and splats are those of the rest.
+//! Masks of what stands still in the pictures while the rest moves: poses and splats are those of the rest. What has texture is found by matches that stand still,
+//! before the poses; the plain backdrop of a turntable by the poses.
 
 use super::PoseProgress;
-use super::attempt::Matched;
+use super::attempt::{Attempt, Matched};
 use super::stages::in_rgb;
 use crate::RunError;
 use irradia_formats::{PhotoEntry, PhotoFolder, write_png};
-use irradia_sfm::StillScene;
-use irradia_sfm::map::{StandsStill, stands_still};
+use irradia_sfm::map::{StandsStill, stands_still, turntable};
+use irradia_sfm::{Backdrop, StillScene};
 use rayon::prelude::*;
 use std::collections::BTreeMap;
 use std::fs;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// The folder of masks, and what tells that they are of an earlier call.
 const MASKS: &str = "masks";
@@ -23,6 +24,11 @@ const LEAST: usize = 4;
 const SHOWS: f64 = 0.5;
 /// Least part of the pixels that moves: photographs of one place are no turntable.
 const MOVES: f64 = 0.03;
+/// A backdrop surrounds what turns: it is more than this part of the border of half of the pictures. A camera that circles exactly, such as that of a drone, has the plain sky in the
+/// upper half at most.
+const SURROUNDS: f64 = 0.55;
+/// How far the colour of a backdrop must range in half of the pictures, of 255: one colour is the same wherever it is, and no harm.
+const RANGE: f64 = 8.0;
 
 /// What was masked.
 pub(super) struct Masked {
@@ -71,12 +77,7 @@ pub(super) fn mask(
     out: &Path,
     progress: &(dyn Fn(PoseProgress) + Sync),
 ) -> Result<Option<Masked>, RunError> {
-    let written = out.join(MASKS);
-    if written.join(RECORD).exists() {
-        fs::remove_dir_all(&written).map_err(RunError::io("clear", &written))?;
-    }
-    // Somebody's, for the poses or for the training alone.
-    if written.exists() || folder.photos.iter().any(|photo| photo.mask.is_some()) {
+    if !is_free(folder, out)? {
         return Ok(None);
     }
     let Some(still) = stands_still(&matched.infos, matched.work.features(), &matched.pairs) else {
@@ -86,20 +87,13 @@ pub(super) fn mask(
     if masks.is_empty() {
         return Ok(None);
     }
-    write(&written, folder, &masks)?;
+    let written = write(out, folder, &masks)?;
     let with_mask = |photo: &PhotoEntry| photo.with_mask(written.join(file_name(photo)));
     let photos = folder.photos.iter().map(with_mask).collect::<Result<_, _>>()?;
-    let masked: usize = masks
-        .values()
-        .map(|mask| mask.still.iter().filter(|is| **is).count())
-        .sum();
-    let of: usize = masks.values().map(|mask| mask.still.len()).sum();
-    let told = format!(
-        "{:.0} % of {} photographs stand still while the rest moves (the background of a turntable, or what carries the camera): masked in {}; give \
-         masks of your own, in a folder masks beside the photographs, to decide otherwise",
-        100.0 * masked as f64 / of as f64,
-        masks.len(),
-        written.display()
+    let told = told(
+        &masks,
+        "stand still while the rest moves (the background of a turntable, or what carries the camera)",
+        &written,
     );
     progress(PoseProgress::Warned(told.clone()));
     Ok(Some(Masked {
@@ -112,9 +106,107 @@ pub(super) fn mask(
     }))
 }
 
+/// Writes masks of the backdrop into `out`, if the poses are those of a turntable before a plain one and no photograph has a mask of its own; what the user should know.
+/// The poses are right without.
+pub(super) fn mask_backdrop(
+    attempt: &Attempt,
+    folder: &PhotoFolder,
+    out: &Path,
+    progress: &(dyn Fn(PoseProgress) + Sync),
+) -> Result<Option<String>, RunError> {
+    let rings = attempt.reconstruction.models.first().map_or(Vec::new(), turntable);
+    if rings.is_empty() || !is_free(folder, out)? {
+        return Ok(None);
+    }
+    let masks = behind_turntable(&attempt.matched, folder, &rings)?;
+    if masks.is_empty() {
+        return Ok(None);
+    }
+    let written = write(out, folder, &masks)?;
+    let told = told(&masks, "are the backdrop of a turntable", &written);
+    progress(PoseProgress::Warned(told.clone()));
+    Ok(Some(told))
+}
+
+/// Whether there are no masks, once those of an earlier call are removed.
+fn is_free(folder: &PhotoFolder, out: &Path) -> Result<bool, RunError> {
+    let written = out.join(MASKS);
+    if written.join(RECORD).exists() {
+        fs::remove_dir_all(&written).map_err(RunError::io("clear", &written))?;
+    }
+    // Somebody's, for the poses or for the training alone.
+    Ok(!written.exists() && folder.photos.iter().all(|photo| photo.mask.is_none()))
+}
+
+fn told(masks: &BTreeMap<usize, Mask>, what: &str, written: &Path) -> String {
+    let masked: usize = (masks.values()).map(|mask| share(&mask.still)).sum();
+    let of: usize = masks.values().map(|mask| mask.still.len()).sum();
+    format!(
+        "{:.0} % of {} photographs {what}: masked in {}; give masks of your own, in a folder masks beside the photographs, to decide otherwise",
+        100.0 * masked as f64 / of as f64,
+        masks.len(),
+        written.display()
+    )
+}
+
 /// Masks by index of the folder's photographs.
 fn find(matched: &Matched, folder: &PhotoFolder, still: &StandsStill) -> Result<BTreeMap<usize, Mask>, RunError> {
     let groups = still.groups(matched.infos.len());
+    of_cameras(matched, folder, |size, pictures| {
+        let scenes: Vec<Behind> = groups
+            .iter()
+            .filter_map(|group| Behind::of(group, size, pictures))
+            .collect();
+        shown(&scenes, pictures)
+    })
+}
+
+/// As [`find`], of a plain backdrop behind what turns in `rings`.
+fn behind_turntable(
+    matched: &Matched,
+    folder: &PhotoFolder,
+    rings: &[Vec<usize>],
+) -> Result<BTreeMap<usize, Mask>, RunError> {
+    of_cameras(matched, folder, |[width, height], pictures| {
+        let backdrops: Vec<Backdrop> = rings
+            .iter()
+            .map(|ring| ring.iter().filter_map(|photo| pictures.get(photo)).collect::<Vec<_>>())
+            .filter(|of| of.len() >= LEAST)
+            .map(|of| Backdrop::of(width as usize, height as usize, &of))
+            .collect();
+        let most = |picture: &[u8]| {
+            let all = backdrops.iter().map(|backdrop| (backdrop, backdrop.shown(picture)));
+            all.max_by_key(|(_, shown)| share(shown))
+        };
+        let masks: Vec<_> = pictures
+            .par_iter()
+            .filter_map(|(photo, picture)| most(picture).map(|(backdrop, shown)| (*photo, backdrop, shown)))
+            .collect();
+        let half_have = |value: &dyn Fn(&Backdrop, &[bool]) -> f64, least: f64| {
+            let enough = masks.iter().filter(|(_, of, shown)| value(of, shown) >= least).count();
+            2 * enough > masks.len()
+        };
+        let is_one = half_have(&|of, shown| of.surrounds(shown), SURROUNDS)
+            && half_have(&|of, shown| f64::from(of.range(shown)), RANGE);
+        let mean = masks.iter().map(|mask| share(&mask.2)).sum::<usize>() as f64 / masks.len().max(1) as f64;
+        let kept = masks
+            .into_iter()
+            .filter(|mask| is_one && share(&mask.2) as f64 >= SHOWS * mean);
+        kept.map(|(photo, _, shown)| (photo, shown)).collect()
+    })
+}
+
+/// Pixels of a mask where something stands still.
+fn share(mask: &[bool]) -> usize {
+    mask.iter().filter(|still| **still).count()
+}
+
+/// Masks by index of the folder's photographs, from those that `of` finds in the small pictures, `[H, W, 3]`, of each camera.
+fn of_cameras(
+    matched: &Matched,
+    folder: &PhotoFolder,
+    of: impl Fn([u32; 2], &BTreeMap<usize, Vec<u8>>) -> BTreeMap<usize, Vec<bool>>,
+) -> Result<BTreeMap<usize, Mask>, RunError> {
     let mut cameras: BTreeMap<usize, Vec<usize>> = BTreeMap::new();
     for (photo, info) in matched.infos.iter().enumerate() {
         cameras.entry(info.group).or_default().push(photo);
@@ -127,11 +219,7 @@ fn find(matched: &Matched, folder: &PhotoFolder, still: &StandsStill) -> Result<
             .par_iter()
             .map(|photo| Ok((*photo, in_rgb(&entry(*photo).read(SIDE)?, size))))
             .collect::<Result<BTreeMap<usize, Vec<u8>>, RunError>>()?;
-        let scenes: Vec<Behind> = groups
-            .iter()
-            .filter_map(|group| Behind::of(group, size, &pictures))
-            .collect();
-        for (photo, still) in shown(&scenes, &pictures) {
+        for (photo, still) in of(size, &pictures) {
             masks.insert(matched.work.photos()[photo], Mask { size, still });
         }
     }
@@ -174,8 +262,9 @@ fn file_name(photo: &PhotoEntry) -> String {
     format!("{}.png", photo.name)
 }
 
-/// One mask for each photograph, at its size: white where nothing is known to stand still.
-fn write(folder: &Path, of: &PhotoFolder, masks: &BTreeMap<usize, Mask>) -> Result<(), RunError> {
+/// One mask for each photograph, at its size, in a folder of `out`: white where nothing is known to stand still.
+fn write(out: &Path, of: &PhotoFolder, masks: &BTreeMap<usize, Mask>) -> Result<PathBuf, RunError> {
+    let folder = out.join(MASKS);
     let new = folder.with_extension("new");
     if new.exists() {
         fs::remove_dir_all(&new).map_err(RunError::io("clear", &new))?;
@@ -191,7 +280,8 @@ fn write(folder: &Path, of: &PhotoFolder, masks: &BTreeMap<usize, Mask>) -> Resu
         };
         write_png(&new.join(file_name(photo)), size[0], size[1], 1, &pixels)
     })?;
-    fs::rename(&new, folder).map_err(RunError::io("rename", &new))
+    fs::rename(&new, &folder).map_err(RunError::io("rename", &new))?;
+    Ok(folder)
 }
 
 impl Mask {

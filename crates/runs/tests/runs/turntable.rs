@@ -17,8 +17,19 @@ const FAR: f32 = 6.0;
 /// `[photographs][H, W]` whether it is background.
 type Backgrounds = Vec<Vec<bool>>;
 
-/// Writes photographs all around the demo scene, before a wall of patches that stands still if there is to be one.
-fn turntable(photos: &Path, wall: bool) -> Backgrounds {
+/// What the demo scene turns before.
+#[derive(Clone, Copy, PartialEq)]
+enum Behind {
+    /// The camera moves around it: its own sky.
+    Sky,
+    /// A wall of patches that stands still.
+    Wall,
+    /// Paper, lit from one side, in light that changes, that stands still.
+    Paper,
+}
+
+/// Writes photographs all around the demo scene, from heights that differ by `wave`.
+fn turntable(photos: &Path, behind: Behind, wave: f32) -> Backgrounds {
     fs::create_dir_all(photos).unwrap();
     let scene = SceneName::Demo.build(1).0;
     let mut rng = Rng::new(5, 5);
@@ -27,7 +38,7 @@ fn turntable(photos: &Path, wall: bool) -> Backgrounds {
         .collect();
     let photograph = |i: usize| {
         let azimuth = std::f32::consts::TAU * i as f32 / RING as f32;
-        let away = Vec3::new(azimuth.cos(), azimuth.sin(), 0.45 + 0.1 * (3.0 * azimuth).sin());
+        let away = Vec3::new(azimuth.cos(), azimuth.sin(), 0.45 + wave * (3.0 * azimuth).sin());
         let pose = Pose::look_at(4.0 * away, Vec3::Z * 0.3, Vec3::Z);
         let frame = scene.trace(
             &Camera::new(pose, Intrinsics::from_fov_x(SIZE[0], SIZE[1], 0.9)),
@@ -41,9 +52,14 @@ fn turntable(photos: &Path, wall: bool) -> Backgrounds {
             .map(|depth| *depth > FAR || *depth == 0.0)
             .collect();
         let mut rgb = frame.color.to_u8();
-        for (at, pixel) in rgb.chunks_exact_mut(3).enumerate().filter(|(at, _)| wall && far[*at]) {
+        let light = 1.0 + 0.05 * (2.0 * azimuth).sin();
+        for (at, pixel) in rgb.chunks_exact_mut(3).enumerate().filter(|(at, _)| far[*at]) {
             let [x, y] = [at % SIZE[0] as usize, at / SIZE[0] as usize];
-            pixel.copy_from_slice(&patches[y / 4 * 80 + x / 4]);
+            match behind {
+                Behind::Sky => {}
+                Behind::Wall => pixel.copy_from_slice(&patches[y / 4 * 80 + x / 4]),
+                Behind::Paper => pixel.fill((light * (225.0 - 0.2 * x as f32)) as u8),
+            }
         }
         write_png(&photos.join(format!("{i:02}.png")), SIZE[0], SIZE[1], 3, &rgb).unwrap();
         far
@@ -67,11 +83,27 @@ fn steps(out: &Path) -> Vec<f32> {
     dataset.views.windows(2).map(turn).collect()
 }
 
+/// The fractions of the pixels of the background that are masked, and of the others that are not.
+fn right(masks: &Path, backgrounds: &Backgrounds) -> [f64; 2] {
+    let (mut behind, mut before) = ([0usize; 2], [0usize; 2]);
+    for (i, far) in backgrounds.iter().enumerate() {
+        let mask = read_image(&masks.join(format!("{i:02}.png.png"))).unwrap();
+        assert_eq!([mask.width, mask.height], SIZE);
+        let kept = mask.data.chunks_exact(mask.channels as usize).map(|pixel| pixel[0] > 0);
+        for (kept, far) in kept.zip(far) {
+            let [count, right] = if *far { &mut behind } else { &mut before };
+            *count += 1;
+            *right += usize::from(kept != *far);
+        }
+    }
+    [behind, before].map(|[count, right]| right as f64 / count as f64)
+}
+
 #[test]
 fn what_turns_is_posed_and_what_stands_still_behind_it_is_masked() {
     let folder = tempfile::tempdir().unwrap();
     let [photos, out] = ["photos", "data"].map(|name| folder.path().join(name));
-    let backgrounds = turntable(&photos, true);
+    let backgrounds = turntable(&photos, Behind::Wall, 0.1);
     let report = posed(&photos, &out);
     assert_eq!(report.registered, RING, "{report:?}");
     let told = |kind: &str| report.findings.iter().find(|finding| finding.kind == kind);
@@ -89,18 +121,7 @@ fn what_turns_is_posed_and_what_stands_still_behind_it_is_masked() {
         steps(&out)
     );
     let masks = out.join("masks");
-    let (mut behind, mut before) = ([0usize; 2], [0usize; 2]);
-    for (i, far) in backgrounds.iter().enumerate() {
-        let mask = read_image(&masks.join(format!("{i:02}.png.png"))).unwrap();
-        assert_eq!([mask.width, mask.height], SIZE);
-        let kept = mask.data.chunks_exact(mask.channels as usize).map(|pixel| pixel[0] > 0);
-        for (kept, far) in kept.zip(far) {
-            let [count, right] = if *far { &mut behind } else { &mut before };
-            *count += 1;
-            *right += usize::from(kept != *far);
-        }
-    }
-    let [behind, before] = [behind, before].map(|[count, right]| right as f64 / count as f64);
+    let [behind, before] = right(&masks, &backgrounds);
     assert!(behind > 0.93 && before > 0.93, "{behind} {before}");
 
     // All of it is known the second time.
@@ -119,7 +140,33 @@ fn what_turns_is_posed_and_what_stands_still_behind_it_is_masked() {
     assert!(kept.warnings.is_empty(), "{:?}", kept.warnings);
     assert_eq!(fs::read_dir(folder.path().join("kept/masks")).unwrap().count(), 1);
     // Where nothing stands still any more, nothing is masked any more.
-    turntable(&photos, false);
+    turntable(&photos, Behind::Sky, 0.1);
     assert!(posed(&photos, &out).warnings.is_empty());
+    assert!(!masks.exists());
+}
+
+#[test]
+fn a_plain_backdrop_is_masked_where_the_poses_are_those_of_a_turntable() {
+    let folder = tempfile::tempdir().unwrap();
+    let [photos, out] = ["photos", "data"].map(|name| folder.path().join(name));
+    let masks = out.join("masks");
+    let backgrounds = turntable(&photos, Behind::Paper, 0.0);
+    let report = posed(&photos, &out);
+    assert_eq!(report.registered, RING, "{report:?}");
+    let [behind, before] = right(&masks, &backgrounds);
+    // What shows through the frames is not joined to the border.
+    assert!(behind > 0.87 && before > 0.97, "{behind} {before}");
+    let of = |report: &PoseReport| {
+        report
+            .warnings
+            .iter()
+            .filter(|w| w.contains("backdrop of a turntable"))
+            .count()
+    };
+    assert_eq!(of(&report), 1, "{:?}", report.warnings);
+
+    // By hand, no axis stands still.
+    turntable(&photos, Behind::Paper, 0.3);
+    assert_eq!(of(&posed(&photos, &out)), 0);
     assert!(!masks.exists());
 }

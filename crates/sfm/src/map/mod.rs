@@ -22,6 +22,7 @@ mod seed;
 mod still;
 mod tracks;
 mod triangulation;
+mod turntable;
 mod types;
 mod unfold;
 mod verify;
@@ -37,6 +38,7 @@ pub use metric::{Metric, to_metres};
 pub use observable::determines_focal;
 pub(crate) use still::{AGREES, limits, showing};
 pub use still::{StandsStill, moving, same_place, stands_still};
+pub use turntable::turntable;
 pub(crate) use types::rigs;
 pub use types::{
     Absent, Known, LeftOut, MapOptions, Model, ModelPoint, Mount, PairKind, PhotoInfo, Progress, Reason,

@@ -1,0 +1,204 @@
+//! A plain backdrop behind what turns, in light that changes a little: [`StillScene`](crate::StillScene) needs texture to tell what stands still.
+//!
+//! Only for pictures of a camera that is known to be at rest: white paper looks the same to a camera that moves.
+
+use crate::connected;
+use crate::still_scene::{adjacent, channel, means, variance};
+use rayon::prelude::*;
+
+/// Pictures at most of which the backdrop is found.
+const SAMPLES: usize = 32;
+/// Largest difference of a channel's mean around a pixel, of 255, of the same backdrop in other light: the white balance of a telephone, shadows of what turns.
+const SHADE: f32 = 30.0;
+/// Largest standard deviation of a channel around a pixel of what is plain, of 255.
+const PLAIN: f32 = 3.0;
+/// Rounds in which the light of a picture is found.
+const ROUNDS: usize = 3;
+/// Pixels by which a passage from the border must be wider than twice: what turns touches the backdrop in single ones.
+const PASSAGE: usize = 3;
+/// The largest region that hides the backdrop, by one up to which another is a part of it: the edge of the paper.
+const SPECK: usize = 20;
+
+/// What most pictures of a camera show at each pixel.
+pub struct Backdrop {
+    width: usize,
+    /// `[3][H, W]` of 255.
+    color: [Vec<f32>; 3],
+}
+
+impl Backdrop {
+    /// That of `pictures`, `[H, W, 3]`.
+    ///
+    /// # Panics
+    /// When there is no picture, or one has not `width * height` pixels.
+    pub fn of(width: usize, height: usize, pictures: &[impl AsRef<[u8]>]) -> Self {
+        assert!(!pictures.is_empty() && pictures.iter().all(|p| p.as_ref().len() == 3 * width * height));
+        let count = pictures.len().min(SAMPLES);
+        let samples: Vec<&[u8]> = (0..count)
+            .map(|i| pictures[i * pictures.len() / count].as_ref())
+            .collect();
+        let median = |at: usize| {
+            let mut values: Vec<u8> = samples.iter().map(|sample| sample[at]).collect();
+            *values.select_nth_unstable(count / 2).1
+        };
+        let medians: Vec<u8> = (0..3 * width * height).into_par_iter().map(median).collect();
+        Self {
+            width,
+            color: [0, 1, 2].map(|c| channel(&medians, c)),
+        }
+    }
+
+    /// `[H, W]` where `picture`, `[H, W, 3]`, shows it: what is plain, of its colour and joined to the border.
+    ///
+    /// # Panics
+    /// When the picture has another size.
+    pub fn shown(&self, picture: &[u8]) -> Vec<bool> {
+        assert_eq!(picture.len(), 3 * self.color[0].len());
+        let color = [0, 1, 2].map(|c| channel(picture, c));
+        let light = self.light(&color);
+        let difference = [0, 1, 2].map(|c| -> Vec<f32> {
+            let both = color[c].iter().zip(&self.color[c]);
+            both.map(|(here, behind)| here - light[c] * behind).collect()
+        });
+        let shade = difference.each_ref().map(|d| means(self.width, d));
+        let (varies, texture) = (variance(self.width, &difference), variance(self.width, &color));
+        let plain = 3.0 * PLAIN * PLAIN;
+        let is_shown = |i: usize| shade.iter().all(|s| s[i].abs() < SHADE) && varies[i] < plain && texture[i] < plain;
+        let mut shown: Vec<bool> = (0..texture.len()).map(is_shown).collect();
+        (0..PASSAGE).for_each(|_| shown = self.spread(&shown, false));
+        for region in self.regions(&shown) {
+            let is_joined = region.iter().any(|at| self.is_border(*at));
+            region.into_iter().for_each(|at| shown[at] &= is_joined);
+        }
+        (0..PASSAGE).for_each(|_| shown = self.spread(&shown, true));
+        let mut hidden = self.regions(&shown);
+        hidden.retain(|region| !shown[region[0]]);
+        let largest = hidden.first().map_or(0, Vec::len);
+        for speck in hidden.into_iter().filter(|region| region.len() < largest / SPECK) {
+            speck.into_iter().for_each(|at| shown[at] = true);
+        }
+        shown
+    }
+
+    /// The fraction of the border of a picture that is `shown`.
+    pub fn surrounds(&self, shown: &[bool]) -> f64 {
+        let border = || (0..shown.len()).filter(|at| self.is_border(*at));
+        border().filter(|at| shown[*at]).count() as f64 / border().count().max(1) as f64
+    }
+
+    /// How far its colour ranges where it is `shown`, of 255, without the outermost twentieths: the largest of the channels.
+    pub fn range(&self, shown: &[bool]) -> f32 {
+        let range = |color: &Vec<f32>| {
+            let mut values: Vec<f32> = color.iter().zip(shown).filter(|v| *v.1).map(|v| *v.0).collect();
+            values.sort_by(f32::total_cmp);
+            match values.len() {
+                0 => 0.0,
+                n => values[n - 1 - n / 20] - values[n / 20],
+            }
+        };
+        self.color.iter().map(range).fold(0.0, f32::max)
+    }
+
+    /// How much brighter than here each channel of a picture is.
+    fn light(&self, color: &[Vec<f32>; 3]) -> [f32; 3] {
+        let mut light = [0, 1, 2].map(|c| {
+            let both = color[c].iter().zip(&self.color[c]);
+            let mut ratios: Vec<f32> = both.map(|(here, behind)| here / behind.max(1.0)).collect();
+            let middle = ratios.len() / 2;
+            *ratios.select_nth_unstable_by(middle, f32::total_cmp).1
+        });
+        for _ in 0..ROUNDS {
+            let (mut here, mut behind) = ([0.0f64; 3], [0.0f64; 3]);
+            for i in 0..color[0].len() {
+                if (0..3).all(|c| (color[c][i] - light[c] * self.color[c][i]).abs() < SHADE) {
+                    for c in 0..3 {
+                        here[c] += f64::from(color[c][i]);
+                        behind[c] += f64::from(self.color[c][i]);
+                    }
+                }
+            }
+            if behind.iter().all(|sum| *sum > 0.0) {
+                light = [0, 1, 2].map(|c| (here[c] / behind[c]) as f32);
+            }
+        }
+        light
+    }
+
+    /// Pixels of `shown`, and those beside them if it `grows`; else only those with all beside them.
+    fn spread(&self, shown: &[bool], grows: bool) -> Vec<bool> {
+        let beside = |at: usize| adjacent(self.width, shown.len(), at);
+        let all = 0..shown.len();
+        match grows {
+            true => all.map(|at| shown[at] || beside(at).any(|to| shown[to])).collect(),
+            false => all.map(|at| shown[at] && beside(at).all(|to| shown[to])).collect(),
+        }
+    }
+
+    /// Connected pixels that all are `shown`, or all are not; the largest first.
+    fn regions(&self, shown: &[bool]) -> Vec<Vec<usize>> {
+        let alike = |at: usize| adjacent(self.width, shown.len(), at).filter(move |to| shown[*to] == shown[at]);
+        connected(shown.len(), alike)
+    }
+
+    fn is_border(&self, at: usize) -> bool {
+        let x = at % self.width;
+        x == 0 || x + 1 == self.width || at < self.width || at + self.width >= self.color[0].len()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const SIZE: [usize; 2] = [64, 48];
+
+    /// A striped box whose left edge is at `left`, before paper that gets darker to the right, in a light; its core has the colour of the paper.
+    fn picture(left: usize, light: f32) -> Vec<u8> {
+        let pixel = |i: usize| {
+            let (x, y) = (i % SIZE[0], i / SIZE[0]);
+            let paper = light * (220.0 - x as f32);
+            let is_box = (left..left + 20).contains(&x) && (12..36).contains(&y);
+            let is_core = (left + 7..left + 13).contains(&x) && (20..28).contains(&y);
+            let value = if is_box && !is_core {
+                [60.0, 120.0][y / 2 % 2]
+            } else {
+                paper
+            };
+            [value as u8, (0.9 * value) as u8, (0.8 * value) as u8]
+        };
+        (0..SIZE[0] * SIZE[1]).flat_map(pixel).collect()
+    }
+
+    #[test]
+    fn paper_is_shown_and_what_it_surrounds_is_not() {
+        let pictures: Vec<Vec<u8>> = (0..8).map(|i| picture(8 + 4 * i, 1.0 - 0.02 * i as f32)).collect();
+        let backdrop = Backdrop::of(SIZE[0], SIZE[1], &pictures);
+        let shown = backdrop.shown(&pictures[5]);
+        let at = |x: usize, y: usize| shown[y * SIZE[0] + x];
+        assert!(at(2, 2) && at(10, 24) && at(60, 24) && at(38, 44));
+        assert!(!at(30, 24) && !at(38, 24) && !at(46, 30));
+        assert!(backdrop.surrounds(&shown) > 0.99);
+        let range = backdrop.range(&shown);
+        assert!((40.0..64.0).contains(&range), "{range}");
+    }
+
+    #[test]
+    fn what_has_texture_is_no_backdrop() {
+        let pictures: Vec<Vec<u8>> = (0..6)
+            .map(|i| {
+                let value = |at: usize| {
+                    if ((at / 3 + 7 * i) / 4).is_multiple_of(2) {
+                        90
+                    } else {
+                        160
+                    }
+                };
+                (0..3 * SIZE[0] * SIZE[1]).map(value).collect()
+            })
+            .collect();
+        let backdrop = Backdrop::of(SIZE[0], SIZE[1], &pictures);
+        let shown = backdrop.shown(&pictures[0]);
+        assert_eq!(backdrop.surrounds(&shown), 0.0);
+        assert_eq!(backdrop.range(&shown), 0.0);
+    }
+}

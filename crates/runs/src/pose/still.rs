@@ -27,6 +27,8 @@ const MOVES: f64 = 0.03;
 /// A backdrop surrounds what turns: it is more than this part of the border of half of the pictures. A camera that circles exactly, such as that of a drone, has the plain sky in the
 /// upper half at most.
 const SURROUNDS: f64 = 0.55;
+/// Rings, the largest, whose backdrops each photograph is compared with, for the time it takes.
+const RINGS: usize = 8;
 /// How far the colour of a backdrop must range in half of the pictures, of 255: one colour is the same wherever it is, and no harm.
 const RANGE: f64 = 8.0;
 
@@ -168,8 +170,10 @@ fn behind_turntable(
     rings: &[Vec<usize>],
 ) -> Result<BTreeMap<usize, Mask>, RunError> {
     of_cameras(matched, folder, |[width, height], pictures| {
+        // A photograph in other light, such as with the shadow of what turns, may show more of that behind another ring.
         let backdrops: Vec<Backdrop> = rings
             .iter()
+            .take(RINGS)
             .map(|ring| ring.iter().filter_map(|photo| pictures.get(photo)).collect::<Vec<_>>())
             .filter(|of| of.len() >= LEAST)
             .map(|of| Backdrop::of(width as usize, height as usize, &of))

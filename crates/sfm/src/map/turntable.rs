@@ -47,7 +47,7 @@ impl Axis {
     }
 }
 
-/// The photographs of each ring, if the model is that of a turntable; else none.
+/// The photographs of each ring, the largest first, if the model is that of a turntable; else none.
 pub fn turntable(model: &Model) -> Vec<Vec<usize>> {
     let posed = model.poses.iter().enumerate().filter(|(_, pose)| pose.is_some());
     let mut left: Vec<usize> = posed.map(|(photo, _)| photo).collect();

@@ -3,11 +3,9 @@
 //! Only for pictures of a camera that is known to be at rest: white paper looks the same to a camera that moves.
 
 use crate::connected;
-use crate::still_scene::{adjacent, channel, means, variance};
+use crate::still_scene::{adjacent, channel, means, samples, variance};
 use rayon::prelude::*;
 
-/// Pictures at most of which the backdrop is found.
-const SAMPLES: usize = 32;
 /// Largest difference of a channel's mean around a pixel, of 255, of the same backdrop in other light: the white balance of a telephone, shadows of what turns.
 const SHADE: f32 = 30.0;
 /// Largest standard deviation of a channel around a pixel of what is plain, of 255.
@@ -32,14 +30,10 @@ impl Backdrop {
     /// # Panics
     /// When there is no picture, or one has not `width * height` pixels.
     pub fn of(width: usize, height: usize, pictures: &[impl AsRef<[u8]>]) -> Self {
-        assert!(!pictures.is_empty() && pictures.iter().all(|p| p.as_ref().len() == 3 * width * height));
-        let count = pictures.len().min(SAMPLES);
-        let samples: Vec<&[u8]> = (0..count)
-            .map(|i| pictures[i * pictures.len() / count].as_ref())
-            .collect();
+        let samples = samples(width, height, pictures);
         let median = |at: usize| {
             let mut values: Vec<u8> = samples.iter().map(|sample| sample[at]).collect();
-            *values.select_nth_unstable(count / 2).1
+            *values.select_nth_unstable(samples.len() / 2).1
         };
         let medians: Vec<u8> = (0..3 * width * height).into_par_iter().map(median).collect();
         Self {

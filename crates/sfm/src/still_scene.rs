@@ -59,11 +59,7 @@ impl StillScene {
     /// # Panics
     /// When there is no picture, or one has not `width * height` pixels.
     pub fn of(width: usize, height: usize, pictures: &[impl AsRef<[u8]>]) -> Self {
-        assert!(!pictures.is_empty() && pictures.iter().all(|p| p.as_ref().len() == 3 * width * height));
-        let count = pictures.len().min(SAMPLES);
-        let samples: Vec<&[u8]> = (0..count)
-            .map(|i| pictures[i * pictures.len() / count].as_ref())
-            .collect();
+        let samples = samples(width, height, pictures);
         let at = |pixel: usize| {
             let colors: Vec<[u8; 3]> = (samples.iter().map(|s| [0, 1, 2].map(|c| s[3 * pixel + c]))).collect();
             Mode::of(&colors)
@@ -210,6 +206,17 @@ impl Mode {
             variance,
         }
     }
+}
+
+/// Some of `pictures`, `[H, W, 3]`, evenly over all of them: enough to tell what is behind.
+///
+/// # Panics
+/// When there is no picture, or one has not `width * height` pixels.
+pub(crate) fn samples(width: usize, height: usize, pictures: &[impl AsRef<[u8]>]) -> Vec<&[u8]> {
+    assert!(!pictures.is_empty() && pictures.iter().all(|p| p.as_ref().len() == 3 * width * height));
+    let count = pictures.len().min(SAMPLES);
+    let even = (0..count).map(|i| pictures[i * pictures.len() / count].as_ref());
+    even.collect()
 }
 
 pub(crate) fn channel(picture: &[u8], c: usize) -> Vec<f32> {

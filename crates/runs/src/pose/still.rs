@@ -82,7 +82,7 @@ pub(super) fn mask(
     out: &Path,
     progress: &(dyn Fn(PoseProgress) + Sync),
 ) -> Result<Option<Masked>, RunError> {
-    if !is_free(folder, out)? {
+    if !is_free_once_cleared(folder, out)? {
         return Ok(None);
     }
     let Some(still) = stands_still(&matched.infos, matched.work.features(), &matched.pairs) else {
@@ -120,7 +120,7 @@ pub(super) fn mask_backdrop(
     progress: &(dyn Fn(PoseProgress) + Sync),
 ) -> Result<Option<String>, RunError> {
     let rings = attempt.reconstruction.models.first().map_or(Vec::new(), turntable);
-    if rings.is_empty() || !is_free(folder, out)? {
+    if rings.is_empty() || !is_free_once_cleared(folder, out)? {
         return Ok(None);
     }
     let masks = behind_turntable(&attempt.matched, folder, &rings)?;
@@ -134,7 +134,7 @@ pub(super) fn mask_backdrop(
 }
 
 /// Whether there are no masks, once those of an earlier call are removed.
-fn is_free(folder: &PhotoFolder, out: &Path) -> Result<bool, RunError> {
+fn is_free_once_cleared(folder: &PhotoFolder, out: &Path) -> Result<bool, RunError> {
     let written = out.join(MASKS);
     if written.join(RECORD).exists() {
         fs::remove_dir_all(&written).map_err(RunError::io("clear", &written))?;

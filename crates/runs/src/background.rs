@@ -23,14 +23,37 @@ const BLACK_BACKDROP: u8 = 64;
 const SHADE: u8 = 24;
 /// Share of the outermost pixels that show the backdrop: in the mean of the photographs, and in each.
 const BACKDROP_SHARES: [f64; 2] = [0.8, 0.5];
+/// Pixels beside what a mask leaves out that show what is behind the object, if masks are generous.
+const RIM: usize = 3;
+/// Share of the outermost pixels that masks leave out if they leave out what is around an object, and of the pixels at their rim that have the backdrop's colour,
+/// in the mean of the photographs. Measured: 0.79 and 0.98 for a medal before dark blue, 0.99 and 0.63 for a plush dog before paper, 0.97 and 0.2 for a box cut
+/// out along its outlines; masks of people and of what holds the camera leave out less of the border, and their rim shows the scene.
+const LEFT_OUT: f64 = 0.6;
+const RIM_SHARE: f64 = 0.5;
 
-/// Colours of the outermost pixels of a photograph.
+/// Colours of pixels of a photograph beside which nothing is known: the outermost ones, or those at the rim of what its mask leaves out.
 type Border = Vec<[u8; 3]>;
 
-fn border(photo: &Photo) -> Border {
+fn colors(photo: &Photo, at: impl Iterator<Item = usize>) -> Border {
     let channels = photo.channels as usize;
-    let color = |at: usize| std::array::from_fn(|c| photo.data[at * channels + c]);
-    photo.border().map(color).collect()
+    at.map(|at| std::array::from_fn(|c| photo.data[at * channels + c]))
+        .collect()
+}
+
+fn border(photo: &Photo) -> Border {
+    colors(photo, photo.border())
+}
+
+/// The pixels that `mask` keeps at the rim of what it leaves out.
+fn rim(photo: &Photo, mask: &[u8]) -> Border {
+    let (width, height) = (photo.width as usize, photo.height as usize);
+    let around = |at: usize, end: usize| at.saturating_sub(RIM)..(at + RIM + 1).min(end);
+    let is_rim = |at: &usize| {
+        let (x, y) = (at % width, at / width);
+        let mut near = around(y, height).flat_map(|y| around(x, width).map(move |x| y * width + x));
+        mask[*at] != 0 && near.any(|at| mask[at] == 0)
+    };
+    colors(photo, (0..width * height).filter(is_rim))
 }
 
 /// The share of the pixels that `holds`.
@@ -52,14 +75,40 @@ fn median(colors: &[[u8; 3]]) -> [u8; 3] {
     })
 }
 
+/// The share of `colors` that is near `color`.
+fn share_near(colors: &Border, color: [u8; 3]) -> f64 {
+    share(colors, |other| {
+        other.iter().zip(color).all(|(a, b)| a.abs_diff(b) <= SHADE)
+    })
+}
+
+/// The colour behind the object that masks leave all out but for a rim, if it has one: no splats are needed to show it there. Held-out PSNR, pixels not masked,
+/// 480 pixels, 60 s, over grey and over this: medal 18.3, 23.4 dB; dog 29.7, 30.9.
+fn masked_backdrop(photos: &[Photo]) -> Option<[u8; 3]> {
+    let mean = |shares: &[f64]| shares.iter().sum::<f64>() / photos.len() as f64;
+    let masked: Vec<(&Photo, &[u8])> = photos
+        .iter()
+        .filter_map(|photo| Some((photo, photo.mask.as_deref()?)))
+        .collect();
+    let left_out = |(photo, mask): &(&Photo, &[u8])| {
+        let outermost = photo.border().count().max(1);
+        photo.border().filter(|at| mask[*at] == 0).count() as f64 / outermost as f64
+    };
+    let left_out: Vec<f64> = masked.iter().map(left_out).collect();
+    let rims: Vec<Border> = masked.iter().map(|(photo, mask)| rim(photo, mask)).collect();
+    let medians: Vec<[u8; 3]> = rims.iter().map(|rim| median(rim)).collect();
+    let color = median(&medians);
+    let shares: Vec<f64> = rims.iter().map(|rim| share_near(rim, color)).collect();
+    (mean(&left_out) >= LEFT_OUT && mean(&shares) >= RIM_SHARE).then_some(color)
+}
+
 /// The colour of the white or black cloth, paper or box that all photographs have around their object, if there is one.
 fn backdrop(borders: &[Border]) -> Option<[u8; 3]> {
     let medians: Vec<[u8; 3]> = borders.iter().map(|border| median(border)).collect();
     let color = median(&medians);
     let is_possible =
         color.iter().all(|value| *value >= WHITE_BACKDROP) || color.iter().all(|value| *value <= BLACK_BACKDROP);
-    let is_near = |other: [u8; 3]| other.iter().zip(color).all(|(a, b)| a.abs_diff(b) <= SHADE);
-    let shares: Vec<f64> = borders.iter().map(|border| share(border, is_near)).collect();
+    let shares: Vec<f64> = borders.iter().map(|border| share_near(border, color)).collect();
     let [in_mean, in_each] = BACKDROP_SHARES;
     let is_backdrop = is_possible
         && shares.iter().all(|share| *share >= in_each)
@@ -109,7 +158,7 @@ impl Background {
 
     /// The default for a dataset: white for Blender scenes with transparent photographs, judged by the first one, and for
     /// photographs without alpha of objects cut out on white, judged by eight of them; the colour of the backdrop where photographs without alpha
-    /// have one around their object; grey for others without alpha if the recipe wants surfaces to cover it (`covers`); otherwise the recipe's own.
+    /// have one around their object, or at the rim of what their masks leave out; grey for others without alpha if the recipe wants surfaces to cover it (`covers`); otherwise the recipe's own.
     ///
     /// # Errors
     /// When one of these photographs cannot be read.
@@ -130,16 +179,18 @@ impl Background {
             return Ok(transparent.then_some(Self::White));
         }
         let every = dataset.train.len().div_ceil(SAMPLES);
-        let others = dataset.train.iter().step_by(every).skip(1);
-        let others = others.map(|view| load(view).map(|photo| border(&photo)));
-        let borders: Vec<Border> = std::iter::once(Ok(border(&first)))
-            .chain(others)
-            .collect::<Result<_, _>>()?;
+        let others = dataset.train.iter().step_by(every).skip(1).map(load);
+        let photos: Vec<Photo> = std::iter::once(Ok(first)).chain(others).collect::<Result<_, _>>()?;
+        let borders: Vec<Border> = photos.iter().map(border).collect();
         if borders.iter().all(is_white) {
             return Ok(Some(Self::White));
         }
-        // What masks leave out is no part of the scene.
-        let backdrop = first.mask.is_none().then(|| backdrop(&borders)).flatten();
+        let is_masked = photos.iter().any(|photo| photo.mask.is_some());
+        let backdrop = if is_masked {
+            masked_backdrop(&photos)
+        } else {
+            backdrop(&borders)
+        };
         Ok(backdrop.map(Self::Color).or(covers.then_some(Self::Grey)))
     }
 }
@@ -277,13 +328,13 @@ mod tests {
 
     #[test]
     fn photographs_without_alpha_get_grey_from_recipes_that_cover_it_and_what_they_show_around_objects() {
-        let dataset = |value: &dyn Fn(usize) -> u8, channels: u32| {
+        let masked_dataset = |value: &dyn Fn(usize) -> u8, channels: u32, mask| {
             let photo = Photo {
                 width: 8,
                 height: 8,
                 channels,
                 data: (0..64 * channels as usize).map(value).collect(),
-                mask: None,
+                mask,
             };
             let view = View::new(
                 "a",
@@ -300,7 +351,7 @@ mod tests {
             }
         };
         let usual = |value: &dyn Fn(usize) -> u8, channels, covers| {
-            Background::usual(&dataset(value, channels), covers).unwrap()
+            Background::usual(&masked_dataset(value, channels, None), covers).unwrap()
         };
         let uniform = |value: u8| move |_: usize| value;
         let striped = |i: usize| if (i / 3).is_multiple_of(2) { 20 } else { 160 };
@@ -309,6 +360,24 @@ mod tests {
         assert_eq!(usual(&uniform(255), 3, true), Some(Background::White));
         assert_eq!(usual(&uniform(25), 3, true), Some(Background::Color([25; 3])));
         assert_eq!(usual(&uniform(90), 4, true), None, "alpha shows what is empty");
+
+        // An object of 3 x 3 pixels, its backdrop, and masks of all but both, of all but the object, of a corner.
+        let is_object = |at: usize| [at % 8, at / 8].iter().all(|i| (2..5).contains(i));
+        let object = |i: usize| {
+            if is_object(i / 3) {
+                [90, 60, 20][i % 3] + 50 * ((i / 3) % 8 - 2) as u8
+            } else {
+                140
+            }
+        };
+        let masked = |keeps: &dyn Fn(usize) -> bool| {
+            let mask = (0..64).map(|at| if keeps(at) { 255 } else { 0 }).collect();
+            Background::usual(&masked_dataset(&object, 3, Some(mask)), true).unwrap()
+        };
+        let inside = |at: usize| [at % 8, at / 8].iter().all(|i| (1..7).contains(i));
+        assert_eq!(masked(&inside), Some(Background::Color([140; 3])));
+        assert_eq!(masked(&is_object), Some(Background::Grey), "the rim shows the object");
+        assert_eq!(masked(&|at| at > 2), Some(Background::Grey), "nothing is cut out");
     }
 
     #[test]

@@ -27,8 +27,8 @@ const MOVES: f64 = 0.03;
 /// A backdrop surrounds what turns: it is more than this part of the border of half of the pictures. A camera that circles exactly, such as that of a drone, has the plain sky in the
 /// upper half at most.
 const SURROUNDS: f64 = 0.55;
-/// The part of the pictures that a backdrop is, at least: where masks keep less than half, training leaves nothing beside what they keep. Of a medal before a dark backdrop, 29 % of
-/// which was masked, held-out views lost 5 dB to what filled it.
+/// The part of the pictures that a backdrop is, at least: where masks keep less than half, training leaves nothing beside what they keep. A medal before a dark backdrop, 29 % of
+/// which can be masked, gains nothing by it.
 const COVERS: f64 = 0.5;
 /// Rings, the largest, whose backdrops each photograph is compared with, for the time it takes.
 const RINGS: usize = 8;

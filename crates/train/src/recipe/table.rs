@@ -456,7 +456,7 @@ table! {
         curve: Some("loss.cover"),
         source: "Irradia",
     }
-    /// Weight of the mean |alpha - mask|, if photographs have masks.
+    /// Weight of the mean alpha of pixels that masks leave out, over all pixels: nothing is there. For masks of all but an object.
     MaskWeight {
         name: "mask_weight",
         unit: "",

@@ -417,20 +417,32 @@ fn joined(paths: &[PathBuf]) -> String {
     paths.join(", ")
 }
 
-/// Why nothing could be posed: what the doctor says of the whole, else the first photograph's reason.
+/// Why nothing could be posed, and what to do: too little texture if half of the photographs have it, else what the doctor says of the whole, else the first
+/// photograph's reason.
 fn no_model(paths: &[PathBuf], photos: &[PhotoInfo], found: &Reconstruction, examined: &DoctorReport) -> String {
+    let of = |kind: Kind| {
+        examined
+            .findings
+            .iter()
+            .filter(move |finding| finding.kind == kind.name())
+    };
+    let smooth = of(Kind::FewFeatures).count();
     let of_all = examined
         .findings
         .iter()
         .find(|finding| finding.kind != Kind::LeftOut.name());
-    let first = match (of_all, found.left_out.first()) {
-        (Some(finding), _) => format!("; {}", finding.sentence),
-        (None, Some(left)) => format!("; {}: {}", photos[left.photo].name, left.reason),
-        (None, None) => String::new(),
+    let overlap = "take more photographs that overlap by two thirds, from different places";
+    let reason = match (of_all, found.left_out.first()) {
+        _ if 2 * smooth > photos.len() => format!(
+            "{smooth} show little texture, or are out of focus; put something textured, such as a newspaper, under or around what they show, \
+             or go nearer"
+        ),
+        (Some(finding), _) => format!("{}; {overlap}", finding.sentence),
+        (None, Some(left)) => format!("{}: {}; {overlap}", photos[left.photo].name, left.reason),
+        (None, None) => overlap.to_owned(),
     };
     format!(
-        "{}: no three of {} photographs could be posed together{first}; take more photographs that overlap by two thirds, from \
-         different places",
+        "{}: no three of {} photographs could be posed together; {reason}",
         joined(paths),
         photos.len()
     )

@@ -289,20 +289,31 @@ fn folders_without_enough_photographs_have_one_clear_outcome() {
     refused(&folder.path().join("none"), &["none"]);
     refused(&make("empty"), &["0 readable photographs", "at least 3"]);
     let one = make("one");
+    // Squares of 6 pixels of random greys: corners are features.
     let picture = |seed: u32| -> Vec<u8> {
-        (0..64 * 48u32)
-            .map(|i| ((i ^ (i >> 3)).wrapping_mul(seed) >> 7) as u8)
-            .collect()
+        let grey = |square: u32| ((square.wrapping_mul(seed) ^ (square << 7)).wrapping_mul(0x9e37_79b9) >> 24) as u8;
+        (0..256 * 192).map(|i| grey(i / 256 / 6 * 64 + i % 256 / 6)).collect()
     };
-    write_png(&one.join("a.png"), 64, 48, 1, &picture(977)).unwrap();
+    write_png(&one.join("a.png"), 256, 192, 1, &picture(977)).unwrap();
     fs::copy(one.join("a.png"), one.join("b.png")).unwrap();
     fs::copy(one.join("a.png"), one.join("c.png")).unwrap();
     refused(&one, &["1 readable photographs", "b.png: a copy of a.png"]);
     let apart = make("apart");
     for (name, seed) in [("a.png", 977), ("b.png", 3571), ("c.png", 104_729)] {
-        write_png(&apart.join(name), 64, 48, 1, &picture(seed)).unwrap();
+        write_png(&apart.join(name), 256, 192, 1, &picture(seed)).unwrap();
     }
     refused(&apart, &["no three of 3 photographs", "overlap"]);
+    let smooth = make("smooth");
+    for (name, slope) in [("a.png", 2), ("b.png", 3), ("c.png", 4)] {
+        let ramp: Vec<u8> = (0..160 * 120u32)
+            .map(|i| (i % 160 / slope + i / 160 / 2) as u8)
+            .collect();
+        write_png(&smooth.join(name), 160, 120, 1, &ramp).unwrap();
+    }
+    refused(
+        &smooth,
+        &["no three of 3 photographs", "3 show little texture", "newspaper"],
+    );
     let two = make("two");
     fs::copy(apart.join("a.png"), two.join("a.png")).unwrap();
     fs::copy(apart.join("b.png"), two.join("b.png")).unwrap();

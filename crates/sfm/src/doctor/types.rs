@@ -370,12 +370,14 @@ impl Display for Sentence<'_> {
                 photo,
                 features,
                 median,
-            } => write!(
-                f,
-                "{} has {features} features where half of the photographs have {median} or more: it shows little texture; \
-                 include something textured",
-                name(photo)
-            ),
+            } => {
+                write!(f, "{} has {features} features", name(photo))?;
+                // Where most have few, the others are no measure.
+                if *median >= 10 * features {
+                    write!(f, " where half of the photographs have {median} or more")?;
+                }
+                write!(f, ": it shows little texture; include something textured")
+            }
             Diagnosis::Zoom { photos, ratio } => write!(
                 f,
                 "{} {} taken with {ratio:.2} times the focal length of the others; do not zoom",

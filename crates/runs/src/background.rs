@@ -185,11 +185,14 @@ impl Background {
         if borders.iter().all(is_white) {
             return Ok(Some(Self::White));
         }
-        let is_masked = photos.iter().any(|photo| photo.mask.is_some());
-        let backdrop = if is_masked {
-            masked_backdrop(&photos)
-        } else {
+        // The mask of a wide lens is that of its image circle.
+        let is_wide = |view: &usize| dataset.views[*view].camera.intrinsics.lens.is_wide();
+        let backdrop = if photos.iter().all(|photo| photo.mask.is_none()) {
             backdrop(&borders)
+        } else if dataset.train.iter().any(is_wide) {
+            None
+        } else {
+            masked_backdrop(&photos)
         };
         Ok(backdrop.map(Self::Color).or(covers.then_some(Self::Grey)))
     }

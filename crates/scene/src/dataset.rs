@@ -66,6 +66,12 @@ impl Photo {
         rows.chain(columns)
     }
 
+    /// The share of the outermost pixels that the mask leaves out.
+    pub fn border_left_out(&self) -> f64 {
+        let left_out = |mask: &Vec<u8>| self.border().filter(|at| mask[*at] == 0).count();
+        self.mask.as_ref().map_or(0, left_out) as f64 / self.border().count().max(1) as f64
+    }
+
     /// The alpha channel `[H, W]`, if any.
     pub fn alpha(&self) -> Option<Vec<u8>> {
         (self.channels == 4).then(|| self.data.iter().skip(3).step_by(4).copied().collect())

@@ -61,8 +61,7 @@ const SPARSE: f64 = 8.0;
 fn is_cut_out(photo: &Photo) -> bool {
     let Some(mask) = &photo.mask else { return false };
     let kept = mask.iter().filter(|m| **m != 0).count();
-    let left_out = photo.border().filter(|at| mask[*at] == 0).count();
-    kept as f64 <= KEPT * mask.len() as f64 && left_out as f64 >= BORDER_LEFT_OUT * photo.border().count() as f64
+    kept as f64 <= KEPT * mask.len() as f64 && photo.border_left_out() >= BORDER_LEFT_OUT
 }
 
 /// The mean colour, in \[0, 1\], of the smooth region at the upper edge of `photo`, if it is large enough for a sky.

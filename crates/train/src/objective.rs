@@ -135,8 +135,9 @@ impl Objective {
             }
         }
         let depths = plan.compares_depth();
-        let alpha = photo.alpha.as_ref().filter(|_| plan.value(Param::AlphaWeight) > 0.0);
-        let mask = photo.mask.as_ref().filter(|_| plan.value(Param::MaskWeight) > 0.0);
+        let maps = [(Param::AlphaWeight, &photo.alpha), (Param::MaskWeight, &photo.mask)];
+        let [alpha, mask] =
+            maps.map(|(param, map)| Some((plan.value(param), map.as_ref()?)).filter(|(weight, _)| *weight > 0.0));
         let cover = cover_weight(photo, plan);
         self.has = Has {
             depth: depths,
@@ -156,11 +157,11 @@ impl Objective {
                 None => self.v_alpha.fill(-v),
             }
         }
-        if let Some(wanted) = alpha {
-            total += compare_alpha(frame.alpha, wanted, plan.value(Param::AlphaWeight), &mut self.v_alpha);
+        if let Some((weight, wanted)) = alpha {
+            total += compare_alpha(frame.alpha, wanted, weight, &mut self.v_alpha);
         }
-        if let Some(mask) = mask {
-            total += clear_masked(frame.alpha, mask, plan.value(Param::MaskWeight), &mut self.v_alpha);
+        if let Some((weight, mask)) = mask {
+            total += clear_masked(frame.alpha, mask, weight, &mut self.v_alpha);
         }
         if depths {
             clear(&mut self.v_depth, pixels);

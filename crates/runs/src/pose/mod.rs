@@ -417,16 +417,11 @@ fn joined(paths: &[PathBuf]) -> String {
     paths.join(", ")
 }
 
-/// Why nothing could be posed, and what to do: too little texture if half of the photographs have it, else what the doctor says of the whole, else the first
+/// Why nothing could be posed, and what to do: too little texture if more than half of the photographs have it, else what the doctor says of the whole, else the first
 /// photograph's reason.
 fn no_model(paths: &[PathBuf], photos: &[PhotoInfo], found: &Reconstruction, examined: &DoctorReport) -> String {
-    let of = |kind: Kind| {
-        examined
-            .findings
-            .iter()
-            .filter(move |finding| finding.kind == kind.name())
-    };
-    let smooth = of(Kind::FewFeatures).count();
+    let is_smooth = |finding: &&Finding| finding.kind == Kind::FewFeatures.name();
+    let smooth = examined.findings.iter().filter(is_smooth).count();
     let of_all = examined
         .findings
         .iter()

@@ -23,7 +23,7 @@ const BLACK: f64 = 0.4;
 
 /// Features below which a photograph has too few, and the fraction of the median below which it has.
 const FEATURES: usize = 150;
-const FEATURES_BY_MEDIAN: f64 = 0.1;
+pub(super) const FEATURES_BY_MEDIAN: f64 = 0.1;
 
 /// The photographs that show most of what `photo` shows.
 fn neighbours(evidence: &Evidence, graph: &Graph, photo: usize) -> Vec<usize> {

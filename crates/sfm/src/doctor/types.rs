@@ -1,5 +1,6 @@
 //! What the doctor can find, one variant a diagnosis, each with its evidence and one sentence.
 
+use super::looks::FEATURES_BY_MEDIAN;
 use std::fmt::{self, Display, Formatter};
 
 /// The family of a diagnosis, by which tests and reports count them.
@@ -373,7 +374,7 @@ impl Display for Sentence<'_> {
             } => {
                 write!(f, "{} has {features} features", name(photo))?;
                 // Where most have few, the others are no measure.
-                if *median >= 10 * features {
+                if (*features as f64) < FEATURES_BY_MEDIAN * *median as f64 {
                     write!(f, " where half of the photographs have {median} or more")?;
                 }
                 write!(f, ": it shows little texture; include something textured")

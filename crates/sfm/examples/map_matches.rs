@@ -66,7 +66,6 @@ fn main() {
     if let Ok(photos) = std::env::var("FULL_LENS_PHOTOS") {
         options.full_lens_photos = photos.parse().expect("a number");
     }
-    options.principal_point = std::env::var_os("PRINCIPAL_POINT").is_some();
     let start = Instant::now();
     let verbose = std::env::var_os("VERBOSE").is_some();
     let result = reconstruct(&photos, &features, &pairs, &options, &mut |progress| {

@@ -2,7 +2,7 @@
 
 mod world;
 
-use glam::{DQuat, DVec3};
+use glam::{DQuat, DVec2, DVec3};
 use irradia_scene::Rng;
 use irradia_sfm::geometry::camera::DCamera;
 use irradia_sfm::geometry::pose::DPose;
@@ -30,6 +30,11 @@ fn cameras_return_from_noise_wrong_matches_and_an_unknown_lens() {
     let camera = model.cameras[0].expect("registered");
     assert!((camera.focal() / 870.0 - 1.0).abs() < 0.005, "{camera:?}");
     assert!((camera.parameters[4] - 0.06).abs() < 0.02, "{camera:?}");
+    assert_eq!(
+        camera.parameters[2..4],
+        [500.0, 375.0],
+        "nothing asks for another principal point"
+    );
     // Noise of 0.5 px on both axes has a mean length of 0.63 px.
     assert!((0.5..0.7).contains(&model.mean_error()), "{}", model.mean_error());
     // Wrong matches that happen to agree with the geometry are few.
@@ -46,6 +51,43 @@ fn cameras_return_from_noise_wrong_matches_and_an_unknown_lens() {
     assert!(up > 0.5, "{up}");
     for point in &model.points {
         assert!(point.track.len() >= 2 && point.track.is_sorted() && point.error < 4.0);
+    }
+}
+
+#[test]
+fn principal_points_of_photographs_cut_beside_their_middles_are_found() {
+    let all = World::new(around(24, 1.0), 3000, 0.5, 0.2, 2);
+    let corners = [[0.1, 0.2], [0.8, 0.9], [0.3, 0.7], [0.9, 0.4], [0.2, 0.8]];
+    let alike = |world: World| World {
+        photos: world
+            .photos
+            .into_iter()
+            .map(|photo| PhotoInfo { group: 0, ..photo })
+            .collect(),
+        ..world
+    };
+    let same = |_| [0.1, 0.8];
+    let own = |photo: usize| corners[photo % 5];
+    let shared = alike(all.clone().cut_beside(|_| 0.8, same));
+    // With one photograph a camera, the lens' distortion stays unknown.
+    let each = all.cut_beside(|_| 0.8, own);
+    for (world, before, least, off) in [
+        (shared, &same as &dyn Fn(usize) -> [f64; 2], [95.0, 99.0], 3.0),
+        (each, &own, [10.0, 70.0], 15.0),
+    ] {
+        let result = world.map();
+        let model = &result.models[0];
+        assert_eq!(model.registered(), 24);
+        for (auc, degrees) in least.into_iter().zip([1.0, 5.0]) {
+            assert!(world.auc(model, degrees) > auc, "{}", world.auc(model, degrees));
+        }
+        for (i, photo) in world.photos.iter().enumerate() {
+            let camera = model.cameras[photo.group].expect("registered");
+            let [x, y] = before(i);
+            let truth = DVec2::new(500.0 - 200.0 * x, 375.0 - 150.0 * y);
+            let found = DVec2::new(camera.parameters[2], camera.parameters[3]);
+            assert!(found.distance(truth) < off, "{i}: {found} is not {truth}");
+        }
     }
 }
 

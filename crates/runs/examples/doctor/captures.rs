@@ -91,6 +91,7 @@ pub fn all() -> Vec<Capture> {
         .chain(of("blur", both(&[real[0], real[4], real[5]])))
         .chain(of("exposure", both(&[real[0], real[4], real[5]])))
         .chain(of("zoom", both(&[real[0], real[4]])))
+        .chain(of("cut", both(&[real[0], real[4]])))
         .chain(of("gap", rings.to_vec()))
         .chain(of("loop", rings.to_vec()))
         .chain(of("rotation", (1..5).map(Source::Spot).collect()))
@@ -167,6 +168,10 @@ impl Capture {
                     pictures[i] = pictures[i].zoomed(1.6);
                 }
                 Expected::Capture { kinds: &["zoom"] }
+            }
+            "cut" => {
+                pictures = pictures.iter().map(|picture| picture.cut(0.75)).collect();
+                Expected::Capture { kinds: &["cut"] }
             }
             "gap" => {
                 kept.retain(|i| !(7..7 + 60 * RING / 360).contains(i));
@@ -459,6 +464,18 @@ impl Picture {
             *value = (row(0) * (1.0 - fy) + row(1) * fy) as u8;
         }
         zoomed
+    }
+
+    /// The lower left corner, `keep` of each side.
+    fn cut(&self, keep: f64) -> Self {
+        let [width, height] = [self.width, self.height].map(|side| (keep * side as f64) as usize);
+        let above = self.height - height;
+        let row = |y: usize| &self.rgb[3 * (above + y) * self.width..][..3 * width];
+        Self {
+            width,
+            height,
+            rgb: (0..height).flat_map(row).copied().collect(),
+        }
     }
 
     fn put_behind(&mut self, behind: &Self, background: &[bool]) {

@@ -198,6 +198,8 @@ pub struct CameraReport {
     pub size: [u32; 2],
     /// Mean of both axes, px.
     pub focal_px: f64,
+    /// The principal point, px: the middle, unless photographs were cut out of larger ones.
+    pub principal_px: [f64; 2],
     /// Whether the metadata of its photographs tell the focal length.
     pub focal_known: bool,
     /// Whether the focal length was held, because nothing in the photographs determines it.

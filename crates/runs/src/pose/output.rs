@@ -222,6 +222,7 @@ pub(super) fn report(folder: &PhotoFolder, work: &Work, infos: &[PhotoInfo], fou
                 photos: photos.filter(|(_, pose)| pose.is_some()).count(),
                 size: [camera.width, camera.height],
                 focal_px: camera.focal(),
+                principal_px: [camera.parameters[2], camera.parameters[3]],
                 focal_held: model.focal_held[group],
             })
         })

@@ -54,6 +54,15 @@ impl Freedom {
         tangential: false,
     };
 
+    /// With the principal point, in place of p1 and p2: both do nearly the same, and together they hardly converge.
+    pub fn with_principal(self) -> Self {
+        Self {
+            principal: true,
+            tangential: false,
+            ..self
+        }
+    }
+
     /// Which unknowns of a camera are adjusted. The first scales fx and fy together, the second moves fy alone.
     fn columns(self) -> [bool; PARAMETERS] {
         let focal = self.focal;

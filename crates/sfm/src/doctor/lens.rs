@@ -1,4 +1,4 @@
-//! Focal lengths: several settings, zooms that no metadata tell, and such as cannot be known.
+//! Lenses: several focal lengths, zooms that no metadata tell, focal lengths that cannot be known, principal points beside the middle.
 
 use super::{Diagnosis, Evidence};
 use crate::map::{PairKind, Source, Zoom, determines_focal};
@@ -7,6 +7,8 @@ use crate::map::{PairKind, Source, Zoom, determines_focal};
 const SETTING: f64 = 1.08;
 /// Pairs that show depth, of all, from which on a focal length can be adjusted.
 const GENERAL: f64 = 0.25;
+/// Distance of a principal point from the middle, by the long side, from which on a photograph was cut: those of phones are up to 1 % away.
+const BESIDE: f64 = 0.02;
 
 /// Focal lengths by the metadata.
 pub(super) fn settings(evidence: &Evidence) -> Vec<Diagnosis> {
@@ -59,6 +61,29 @@ pub(super) fn own_focals(evidence: &Evidence) -> Vec<Diagnosis> {
             ratio: most / least,
         }],
         _ => Vec::new(),
+    }
+}
+
+/// Photographs whose principal point the mapper found away from the middle.
+pub(super) fn cut(evidence: &Evidence) -> Vec<Diagnosis> {
+    let Some(model) = evidence.model else { return Vec::new() };
+    let off = |photo: usize| {
+        let camera = model.cameras[evidence.photos[photo].group].as_ref()?;
+        let is_told = evidence.photos[photo].camera.is_some();
+        (!is_told && model.poses[photo].is_some()).then(|| (camera.principal_offset(), camera.long_side()))
+    };
+    let all = (0..evidence.photos.len()).filter_map(|photo| Some((photo, off(photo)?)));
+    let mut cut: Vec<(f64, usize)> = all
+        .filter(|(_, (distance, long_side))| distance > &(BESIDE * long_side))
+        .map(|(photo, (distance, _))| (distance, photo))
+        .collect();
+    cut.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
+    match cut.first() {
+        Some((distance, _)) => vec![Diagnosis::Cut {
+            distance: *distance,
+            photos: cut.iter().map(|c| c.1).collect(),
+        }],
+        None => Vec::new(),
     }
 }
 

@@ -143,6 +143,7 @@ pub fn diagnose(evidence: &Evidence) -> Vec<Diagnosis> {
         lens::settings(evidence),
         lens::zoom(evidence),
         lens::own_focals(evidence),
+        lens::cut(evidence),
         lens::focal_unknown(evidence),
     ]
     .concat();

@@ -14,6 +14,8 @@ pub enum Kind {
     FewFeatures,
     /// [`Diagnosis::Zoom`], [`Diagnosis::OwnFocals`] and [`Diagnosis::ZoomSettings`]
     Zoom,
+    /// [`Diagnosis::Cut`]
+    Cut,
     /// [`Diagnosis::FocalUnknown`]
     FocalUnknown,
     /// [`Diagnosis::SeparateParts`]
@@ -50,6 +52,7 @@ impl Kind {
             Kind::Exposure => "exposure",
             Kind::FewFeatures => "few-features",
             Kind::Zoom => "zoom",
+            Kind::Cut => "cut",
             Kind::FocalUnknown => "focal-unknown",
             Kind::SeparateParts => "separate-parts",
             Kind::WeakLink => "weak-link",
@@ -124,6 +127,13 @@ pub enum Diagnosis {
     ZoomSettings {
         /// Focal lengths in long sides, each with its photographs.
         settings: Vec<(f64, Vec<usize>)>,
+    },
+    /// The principal point is away from the middle.
+    Cut {
+        /// The photographs, those with the largest distance first.
+        photos: Vec<usize>,
+        /// The largest distance, px.
+        distance: f64,
     },
     /// The matches fit all focal lengths alike.
     FocalUnknown {
@@ -241,6 +251,7 @@ impl Diagnosis {
             Diagnosis::ExposureJump { .. } | Diagnosis::Clipped { .. } => Kind::Exposure,
             Diagnosis::FewFeatures { .. } => Kind::FewFeatures,
             Diagnosis::Zoom { .. } | Diagnosis::OwnFocals { .. } | Diagnosis::ZoomSettings { .. } => Kind::Zoom,
+            Diagnosis::Cut { .. } => Kind::Cut,
             Diagnosis::FocalUnknown { .. } => Kind::FocalUnknown,
             Diagnosis::SeparateParts { .. } => Kind::SeparateParts,
             Diagnosis::Bridge { .. } | Diagnosis::CutPoint { .. } => Kind::WeakLink,
@@ -268,6 +279,7 @@ impl Diagnosis {
             | Diagnosis::FewPartners { photo, .. }
             | Diagnosis::LeftOut { photo, .. } => vec![*photo],
             Diagnosis::Zoom { photos, .. }
+            | Diagnosis::Cut { photos, .. }
             | Diagnosis::FocalUnknown { photos }
             | Diagnosis::RotationOnly { photos, .. }
             | Diagnosis::StandsStill { photos, .. }
@@ -406,6 +418,12 @@ impl Display for Sentence<'_> {
                     settings.join(", ")
                 )
             }
+            Diagnosis::Cut { photos, distance } => write!(
+                f,
+                "the lens looks up to {distance:.0} px beside the middle of {}, as of pictures cut out of larger ones; give them as the \
+                 camera took them",
+                self.list(photos)
+            ),
             Diagnosis::FocalUnknown { photos } => write!(
                 f,
                 "the focal length of {} is a guess: all values fit, as for a plane or for turns on the spot; take some from nearer, \

@@ -60,6 +60,20 @@ impl DCamera {
         f64::from(self.width.max(self.height))
     }
 
+    /// Distance of the principal point from the middle, px.
+    pub fn principal_offset(&self) -> f64 {
+        let [_, _, cx, cy, ..] = self.parameters;
+        (cx - 0.5 * f64::from(self.width)).hypot(cy - 0.5 * f64::from(self.height))
+    }
+
+    /// Without tangential distortion, of which a fisheye has none.
+    pub fn without_tangential(mut self) -> Self {
+        if !self.fisheye {
+            self.parameters[6..].fill(0.0);
+        }
+        self
+    }
+
     /// Pixels per unit of the plane z = 1, averaged over both axes.
     pub fn focal(&self) -> f64 {
         0.5 * (self.parameters[0] + self.parameters[1])

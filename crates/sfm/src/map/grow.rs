@@ -168,6 +168,12 @@ impl Working<'_> {
                 points: self.point_count(),
             });
         }
+        self.settle_fully(progress);
+        self.registered() >= self.options.min_model_photos
+    }
+
+    /// Adjusts all with the full lens until hardly an observation changes, then to the end.
+    pub(super) fn settle_fully(&mut self, progress: &mut dyn FnMut(Progress)) {
         for _ in 0..LAST_ROUNDS {
             let changed = self.settle(Extent::Full, progress);
             let observations = self.used_count();
@@ -176,7 +182,6 @@ impl Working<'_> {
             }
         }
         self.settle(Extent::Last, progress);
-        self.registered() >= self.options.min_model_photos
     }
 
     /// Adjusts all, filters, triangulates again and removes photographs that lost their points. Returns the number of

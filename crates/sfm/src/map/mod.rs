@@ -16,6 +16,7 @@ mod guide;
 mod metric;
 mod model;
 mod observable;
+mod principal;
 mod readjust;
 mod refine;
 mod seed;
@@ -130,6 +131,11 @@ pub fn reconstruct(
         let zooms = [std::mem::take(&mut found.zooms), vec![zoom]].concat();
         found = Reconstruction { zooms, ..again };
         grouped = apart;
+    }
+    // Of each photograph's own camera, where it has one.
+    found.regroup(&mut grouped);
+    if let Some(model) = principal::freed(&grouped, features, &found, options, progress) {
+        found.models[0] = model;
     }
     // What the adjustment made of them.
     for zoom in &mut found.zooms {

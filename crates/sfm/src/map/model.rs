@@ -2,7 +2,7 @@
 
 use super::focal::Source;
 use super::tracks::Tracks;
-use super::types::{Known, MapOptions, PhotoInfo, rigs};
+use super::types::{Known, MapOptions, Model, PhotoInfo, rigs};
 use super::verify::Cameras;
 use crate::geometry::camera::DCamera;
 use crate::geometry::pose::DPose;
@@ -23,6 +23,8 @@ pub(super) struct Working<'a> {
     pub sources: Vec<Source>,
     /// `[groups]` focal lengths that are held because no value is better than another.
     pub focal_held: Vec<bool>,
+    /// Whether principal points are adjusted, in place of tangential coefficients.
+    pub principal_free: bool,
     /// `[photos]` the photographs on the same rig, or the photograph alone.
     pub rigs: Vec<Vec<usize>>,
     /// `[photos]` and `[groups]` what was known before mapping: poses and cameras that stay as they are.
@@ -49,6 +51,7 @@ impl<'a> Working<'a> {
             first_focals: cameras.iter().map(|c| c.0.focal()).collect(),
             sources: cameras.iter().map(|c| c.1).collect(),
             focal_held: vec![false; cameras.len()],
+            principal_free: false,
             rigs: rigs(photos),
             held_poses: vec![false; photos.len()],
             held_cameras: vec![false; cameras.len()],
@@ -96,9 +99,34 @@ impl<'a> Working<'a> {
 
     /// Photographs and cameras that are known, with the points that they see.
     pub fn hold(&mut self, known: &Known) {
-        self.poses.clone_from(&known.poses);
         self.held_poses = known.poses.iter().map(Option::is_some).collect();
         self.held_cameras = known.cameras.iter().map(Option::is_some).collect();
+        self.take_poses(&known.poses);
+    }
+
+    /// The photographs and cameras of a finished model, to settle it once more.
+    pub fn resume(&mut self, model: &Model) {
+        for (camera, found) in self.cameras.iter_mut().zip(&model.cameras) {
+            *camera = found.unwrap_or(*camera);
+        }
+        self.focal_held.clone_from(&model.focal_held);
+        self.undistort();
+        self.take_poses(&model.poses);
+    }
+
+    /// Lets later adjustments move principal points, in place of tangential coefficients.
+    pub fn free_principal_points(&mut self) {
+        self.principal_free = true;
+        let held = self.cameras.iter_mut().zip(&self.held_cameras);
+        for (camera, _) in held.filter(|(_, held)| !**held) {
+            *camera = camera.without_tangential();
+        }
+        self.undistort();
+    }
+
+    /// Poses, with the points that their photographs see.
+    fn take_poses(&mut self, poses: &[Option<DPose>]) {
+        self.poses = poses.to_vec();
         let all: Vec<usize> = (0..self.tracks.len()).collect();
         self.triangulate(&all);
         let points = self.with_points();

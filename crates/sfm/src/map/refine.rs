@@ -2,6 +2,7 @@
 
 use super::focal::Source;
 use super::model::Working;
+use super::types::MapOptions;
 use crate::adjust::{
     AdjustOptions, AdjustReport, AdjustedCamera, Belief, Focal, Freedom, Loss, Observation, Problem, View,
 };
@@ -27,9 +28,9 @@ const BELIEF: f64 = 10.0;
 pub(super) enum Extent {
     /// While growing: few points, focal length and one radial coefficient.
     Growing,
-    /// All points, the full lens.
+    /// All points, the full lens, and the principal point where that is free.
     Full,
-    /// All points, the full lens and the principal point.
+    /// As `Full`, to the end.
     Last,
 }
 
@@ -273,20 +274,11 @@ impl Working<'_> {
             Source::Prior => 4,
             Source::Pairs | Source::Guess => 3,
         };
-        Freedom {
-            focal: match (self.focal_held[group] || count < least, full) {
-                (true, _) => Focal::Held,
-                (false, false) => Focal::Tied,
-                (false, true) => Focal::Free,
-            },
-            principal: full && extent == Extent::Last && self.options.principal_point,
-            radial: match count {
-                _ if full => 2,
-                0..=3 => 0,
-                _ => 1,
-            },
-            // Those of a fisheye are its k3 and k4, which stay 0.
-            tangential: full && !self.cameras[group].fisheye,
+        let focal_held = self.focal_held[group] || count < least;
+        let lens = lens_freedom(&self.cameras[group], count, focal_held, full);
+        match self.principal_free && extent != Extent::Growing && !focal_held {
+            true => lens.with_principal(),
+            false => lens,
         }
     }
 
@@ -313,15 +305,40 @@ impl Working<'_> {
     }
 }
 
+/// What of a finished model's camera is adjusted, by the number of its photographs: all but the principal point.
+pub(super) fn finished(camera: &DCamera, count: usize, focal_held: bool, options: &MapOptions) -> Freedom {
+    lens_freedom(camera, count, focal_held, count >= options.full_lens_photos)
+}
+
+/// What of a camera with `count` photographs is adjusted, all that [`DCamera`] has if `full`.
+fn lens_freedom(camera: &DCamera, count: usize, focal_held: bool, full: bool) -> Freedom {
+    Freedom {
+        focal: match (focal_held, full) {
+            (true, _) => Focal::Held,
+            (false, false) => Focal::Tied,
+            (false, true) => Focal::Free,
+        },
+        principal: false,
+        radial: match count {
+            _ if full => 2,
+            0..=3 => 0,
+            _ => 1,
+        },
+        // Those of a fisheye are its k3 and k4, which stay 0.
+        tangential: full && !camera.fisheye,
+    }
+}
+
 /// What is known of cameras in general, so that what a set of photographs does not determine stays where it usually is:
-/// square pixels, a principal point near the centre, a weak lens, a focal length within `focal` of the first one.
-fn belief(camera: &DCamera, first_focal: f64, focal: f64) -> Belief {
+/// square pixels, a weak lens, a focal length within `focal` of the first one, and a principal point within a tenth of the long side of the middle, as of cut
+/// photographs: only where those ask for it is it free.
+pub(super) fn belief(camera: &DCamera, first_focal: f64, focal: f64) -> Belief {
     let long_side = camera.long_side();
     let deviations = [
         focal * first_focal,
         0.002,
-        0.01 * long_side,
-        0.01 * long_side,
+        0.1 * long_side,
+        0.1 * long_side,
         0.1,
         0.1,
         0.002,

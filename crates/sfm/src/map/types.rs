@@ -90,8 +90,6 @@ pub struct MapOptions {
     pub max_models: usize,
     /// Photographs of one camera from which fx and fy, k2 and the tangential coefficients are adjusted, not only f and k1.
     pub full_lens_photos: usize,
-    /// Whether the principal point is adjusted with the full lens, at the end.
-    pub principal_point: bool,
 }
 
 impl Default for MapOptions {
@@ -110,7 +108,6 @@ impl Default for MapOptions {
             min_model_photos: 3,
             max_models: 10,
             full_lens_photos: 15,
-            principal_point: false,
         }
     }
 }

@@ -10,7 +10,7 @@ use irradia_sfm::map::{MapOptions, Model, PhotoInfo, Reconstruction, reconstruct
 use irradia_sfm::{Features, Keypoint, PairMatches};
 
 /// Photographs, features and matches with known cameras.
-#[derive(Default)]
+#[derive(Clone, Default)]
 pub struct World {
     pub photos: Vec<PhotoInfo>,
     pub features: Vec<Features>,
@@ -171,13 +171,19 @@ impl World {
     }
 
     /// With each photograph cut around its middle to a size of its own, of `keep` times the first: each has a camera of its own.
-    pub fn cut(mut self, keep: impl Fn(usize) -> f64) -> Self {
+    pub fn cut(self, keep: impl Fn(usize) -> f64) -> Self {
+        self.cut_beside(keep, |_| [0.5; 2])
+    }
+
+    /// As [`Self::cut`], with the fractions `before` of what is cut away to the left and above.
+    pub fn cut_beside(mut self, keep: impl Fn(usize) -> f64, before: impl Fn(usize) -> [f64; 2]) -> Self {
         for (i, (photo, features)) in self.photos.iter_mut().zip(&mut self.features).enumerate() {
             let side = |side: u32| (f64::from(side) * keep(i) / 2.0).round() as u32 * 2;
             (photo.width, photo.height, photo.group) = (side(CAMERA.width), side(CAMERA.height), i);
+            let [left, above] = before(i).map(|fraction| fraction as f32);
             for k in &mut features.keypoints {
-                k.x -= 0.5 * (CAMERA.width - photo.width) as f32;
-                k.y -= 0.5 * (CAMERA.height - photo.height) as f32;
+                k.x -= left * (CAMERA.width - photo.width) as f32;
+                k.y -= above * (CAMERA.height - photo.height) as f32;
             }
         }
         self.without_what_left()

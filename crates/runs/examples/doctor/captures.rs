@@ -117,7 +117,7 @@ impl Capture {
     pub fn tolerates(&self, kind: &str) -> bool {
         match (self.injury, kind) {
             // Photographs that were left out leave gaps.
-            ("blur" | "exposure" | "zoom" | "moving", "gap" | "open-loop") => true,
+            ("blur" | "exposure" | "zoom" | "cut" | "moving", "gap" | "open-loop") => true,
             ("gap", "open-loop") | ("loop", "gap") | ("turntable", "moving" | "contradiction" | "rotation-only") => {
                 true
             }

@@ -76,6 +76,17 @@ pub(super) fn model<'a>(
         if !grown.start(&pairs[seed]) || !grown.grow(taken, &mut failures, progress) {
             continue;
         }
+        // Where photographs were cut beside their middles, no seed explains more while principal points are held there: fox, each photograph cut at a place
+        // of its own, took all seeds and 88 s to be mapped, and takes 9.
+        if open && grown.explained_fraction() <= EXPLAINED {
+            let mut free = grown.clone();
+            free.free_principal_points();
+            free.settle_fully(progress);
+            free.grow(taken, &mut failures, progress);
+            if free.explained_fraction() > EXPLAINED && free.registered() >= grown.registered() {
+                grown = free;
+            }
+        }
         for (pair, held) in pairs.iter().zip(&mut held) {
             *held += usize::from(pair.photos.iter().all(|photo| grown.poses[*photo as usize].is_some()));
         }

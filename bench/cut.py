@@ -2,10 +2,11 @@
 """Makes photographs of many cameras out of those of one: each is cut around its middle to 65 to 100 % of its sides and scaled.
 
     python3 -m venv venv && venv/bin/pip install pillow
-    venv/bin/python bench/cut.py PHOTOS OUT [--same-size] [--seed 1]
+    venv/bin/python bench/cut.py PHOTOS OUT [--same-size | --beside each|alike] [--seed 1]
 
-Each gets a size of its own, or with --same-size all get 80 % of their first size, so that sizes do not tell cameras apart. The pictures
-have no metadata; their places are those of PHOTOS.
+Each gets a size of its own, or with --same-size all get 80 % of their first size, so that sizes do not tell cameras apart. With --beside they
+are cut beside their middles and not scaled: each at a place of its own, or all alike to the lower left corner, 75 % of each side. The
+pictures have no metadata; their places are those of PHOTOS.
 """
 
 import argparse
@@ -17,7 +18,9 @@ from PIL import Image
 options = argparse.ArgumentParser()
 options.add_argument("photos", type=pathlib.Path)
 options.add_argument("out", type=pathlib.Path)
-options.add_argument("--same-size", action="store_true")
+kind = options.add_mutually_exclusive_group()
+kind.add_argument("--same-size", action="store_true")
+kind.add_argument("--beside", choices=["each", "alike"])
 options.add_argument("--seed", type=int, default=1)
 options = options.parse_args()
 
@@ -27,11 +30,17 @@ taken = set()
 for path in sorted(options.photos.iterdir()):
     image = Image.open(path).convert("RGB")
     width, height = image.size
-    keep = rng.uniform(0.65, 1)
+    keep, before = rng.uniform(0.65, 1), (0.5, 0.5)
+    if options.beside == "each":
+        before = rng.random(), rng.random()
+    elif options.beside == "alike":
+        keep, before = 0.75, (0, 1)
     cut = [round(width * keep), round(height * keep)]
-    left, top = (width - cut[0]) // 2, (height - cut[1]) // 2
+    left, top = int((width - cut[0]) * before[0]), int((height - cut[1]) * before[1])
     image = image.crop((left, top, left + cut[0], top + cut[1]))
-    if options.same_size:
+    if options.beside:
+        size = cut
+    elif options.same_size:
         size = [round(0.8 * width), round(0.8 * height)]
     else:
         scale = min(rng.uniform(0.6, 1) / keep, 1)

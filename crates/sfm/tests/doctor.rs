@@ -283,6 +283,27 @@ fn focal_lengths_that_differ_from_photograph_to_photograph_make_as_many_cameras(
 }
 
 #[test]
+fn photographs_cut_beside_their_middles_are_named() {
+    let all = ring(24, 2500, 0..0);
+    let corner = all.clone().cut_beside(|_| 0.8, |_| [0.0, 1.0]);
+    for (world, beside) in [(all.cut(|_| 0.8), None), (corner, Some(100.0f64.hypot(75.0)))] {
+        let [mapped, alone] = plainly(&world);
+        let cut = |found: &[Diagnosis]| {
+            found.iter().find_map(|d| match d {
+                Diagnosis::Cut { photos, distance } => Some((photos.len(), *distance)),
+                _ => None,
+            })
+        };
+        assert_eq!(cut(&alone), None);
+        match (cut(&mapped), beside) {
+            (None, None) => (),
+            (Some((24, found)), Some(truth)) => assert!((found - truth).abs() < 20.0, "{found}"),
+            (found, truth) => panic!("{found:?} is not {truth:?}"),
+        }
+    }
+}
+
+#[test]
 fn a_zoom_so_far_that_nothing_matches_is_named_from_both_models() {
     let mut world = ring(24, 2500, 0..0).zoomed(14, 1.6);
     world

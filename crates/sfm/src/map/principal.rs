@@ -64,6 +64,9 @@ fn gain(photos: &[PhotoInfo], features: &[Features], model: &Model, options: &Ma
             belief: belief(camera, camera.focal(), 0.5),
         });
     }
+    if cameras.iter().all(|camera| camera.freedom.focal == Focal::Held) {
+        return 0.0;
+    }
     let mut problem = readjust::problem(photos, features, model, cameras, |photo| number[photos[photo].group]);
     let held = problem.solve(&readjust::OPTIONS);
     for camera in &mut problem.cameras {

@@ -7,6 +7,7 @@
 
 pub mod adjust;
 mod backdrop;
+mod bars;
 mod connected;
 pub mod doctor;
 pub mod features;
@@ -18,6 +19,7 @@ mod median;
 mod still_scene;
 
 pub use backdrop::Backdrop;
+pub use bars::bars;
 pub(crate) use connected::connected;
 pub use keypoints::{DESCRIPTOR_BYTES, Features, Keypoint, PairMatches};
 pub(crate) use median::median;

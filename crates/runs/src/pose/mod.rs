@@ -329,7 +329,10 @@ pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Resu
     }
     let told = match &masked {
         Some(masked) => Some(masked.told.clone()),
-        None if is_new && !capture.has_panoramas() => still::mask_backdrop(&attempt, folder, out, progress)?,
+        None if is_new && !capture.has_panoramas() => match still::mask_backdrop(&attempt, folder, out, progress)? {
+            None => still::mask_bars(&attempt, folder, out, progress)?,
+            told => told,
+        },
         None => None,
     };
     if masked.is_none() && told.is_some() {

@@ -7,7 +7,7 @@ use super::stages::in_rgb;
 use crate::RunError;
 use irradia_formats::{PhotoEntry, PhotoFolder, write_png};
 use irradia_sfm::map::{StandsStill, stands_still, turntable};
-use irradia_sfm::{Backdrop, StillScene};
+use irradia_sfm::{Backdrop, StillScene, bars};
 use rayon::prelude::*;
 use std::collections::BTreeMap;
 use std::fs;
@@ -32,6 +32,8 @@ const SURROUNDS: f64 = 0.55;
 const COVERS: f64 = 0.5;
 /// Rings, the largest, whose backdrops each photograph is compared with, for the time it takes.
 const RINGS: usize = 8;
+/// Photographs of each camera that are searched for bars.
+const LOOKED_AT: usize = 8;
 /// How far the colour of a backdrop must range in half of the pictures, of 255: one colour is the same wherever it is, and no harm.
 const RANGE: f64 = 8.0;
 
@@ -133,6 +135,80 @@ pub(super) fn mask_backdrop(
     Ok(Some(told))
 }
 
+/// Writes masks of bars around the pictures into `out`, if there are such and no photograph has a mask of its own; what the user should know. Poses are right without, since bars show
+/// nothing, but splats would be hung before the cameras for them.
+pub(super) fn mask_bars(
+    attempt: &Attempt,
+    folder: &PhotoFolder,
+    out: &Path,
+    progress: &(dyn Fn(PoseProgress) + Sync),
+) -> Result<Option<String>, RunError> {
+    if !is_free_once_cleared(folder, out)? {
+        return Ok(None);
+    }
+    let photos = |photos: &[usize]| {
+        photos
+            .iter()
+            .copied()
+            .step_by(photos.len().div_ceil(LOOKED_AT))
+            .collect()
+    };
+    let mut masks = BTreeMap::new();
+    let found = of_cameras(&attempt.matched, folder, photos, |[width, height], pictures| {
+        if pictures.len() < LEAST {
+            return BTreeMap::new();
+        }
+        let [w, h] = [width as usize, height as usize];
+        let bars = bars(w, h, &pictures.values().collect::<Vec<_>>());
+        // The lines at the edge are of both.
+        let [left, above, right, below] = bars.map(|bar| if bar > 0 { bar + 2 } else { 0 });
+        let is_bar = |at: usize| {
+            let (x, y) = (at % w, at / w);
+            x < left || y < above || x >= w - right || y >= h - below
+        };
+        let mask: Vec<bool> = (0..w * h).map(is_bar).collect();
+        pictures
+            .keys()
+            .map(|photo| (*photo, mask.clone()))
+            .filter(|_| bars != [0; 4])
+            .collect()
+    })?;
+    let info = |photo: usize| &attempt.matched.infos[photo];
+    let of_folder = attempt.matched.work.photos();
+    for (photo, entry) in of_folder.iter().enumerate() {
+        let same = (0..of_folder.len())
+            .find(|other| info(*other).group == info(photo).group && found.contains_key(&of_folder[*other]));
+        if let Some(mask) = same.map(|other| &found[&of_folder[other]]) {
+            masks.insert(
+                *entry,
+                Mask {
+                    size: mask.size,
+                    still: mask.still.clone(),
+                },
+            );
+        }
+    }
+    let Some(most) = masks
+        .values()
+        .map(|mask| share(&mask.still) as f64 / mask.still.len() as f64)
+        .max_by(f64::total_cmp)
+    else {
+        return Ok(None);
+    };
+    if most > COVERS {
+        let told = format!(
+            "{:.0} % of the pictures are bars around them, too much to be masked: cut them off, or splats are hung before the cameras for them",
+            100.0 * most
+        );
+        progress(PoseProgress::Warned(told.clone()));
+        return Ok(Some(told));
+    }
+    let written = write(out, folder, &masks)?;
+    let told = told(&masks, "are bars around the pictures", &written);
+    progress(PoseProgress::Warned(told.clone()));
+    Ok(Some(told))
+}
+
 /// Whether there are no masks, once those of an earlier call are removed.
 fn is_free_once_cleared(folder: &PhotoFolder, out: &Path) -> Result<bool, RunError> {
     let written = out.join(MASKS);
@@ -157,7 +233,7 @@ fn told(masks: &BTreeMap<usize, Mask>, what: &str, written: &Path) -> String {
 /// Masks by index of the folder's photographs.
 fn find(matched: &Matched, folder: &PhotoFolder, still: &StandsStill) -> Result<BTreeMap<usize, Mask>, RunError> {
     let groups = still.groups(matched.infos.len());
-    of_cameras(matched, folder, |size, pictures| {
+    of_cameras(matched, folder, <[usize]>::to_vec, |size, pictures| {
         let scenes: Vec<Behind> = groups
             .iter()
             .filter_map(|group| Behind::of(group, size, pictures))
@@ -172,7 +248,7 @@ fn behind_turntable(
     folder: &PhotoFolder,
     rings: &[Vec<usize>],
 ) -> Result<BTreeMap<usize, Mask>, RunError> {
-    of_cameras(matched, folder, |[width, height], pictures| {
+    of_cameras(matched, folder, <[usize]>::to_vec, |[width, height], pictures| {
         // A photograph in other light, such as with the shadow of what turns, may show more of that behind another ring.
         let backdrops: Vec<Backdrop> = rings
             .iter()
@@ -209,10 +285,11 @@ fn share(mask: &[bool]) -> usize {
     mask.iter().filter(|still| **still).count()
 }
 
-/// Masks by index of the folder's photographs, from those that `of` finds in the small pictures, `[H, W, 3]`, of each camera.
+/// Masks by index of the folder's photographs, from those that `of` finds in the small pictures, `[H, W, 3]`, of each camera's photographs that `among` selects.
 fn of_cameras(
     matched: &Matched,
     folder: &PhotoFolder,
+    among: impl Fn(&[usize]) -> Vec<usize>,
     of: impl Fn([u32; 2], &BTreeMap<usize, Vec<u8>>) -> BTreeMap<usize, Vec<bool>>,
 ) -> Result<BTreeMap<usize, Mask>, RunError> {
     let mut cameras: BTreeMap<usize, Vec<usize>> = BTreeMap::new();
@@ -223,7 +300,7 @@ fn of_cameras(
     for photos in cameras.values() {
         let entry = |photo: usize| &folder.photos[matched.work.photos()[photo]];
         let size = small(entry(photos[0]));
-        let pictures = photos
+        let pictures = among(photos)
             .par_iter()
             .map(|photo| Ok((*photo, in_rgb(&entry(*photo).read(SIDE)?, size))))
             .collect::<Result<BTreeMap<usize, Vec<u8>>, RunError>>()?;

@@ -37,6 +37,9 @@ const LOOKED_AT: usize = 8;
 /// How far the colour of a backdrop must range in half of the pictures, of 255: one colour is the same wherever it is, and no harm.
 const RANGE: f64 = 8.0;
 
+/// Small pictures, `[H, W, 3]`, by photograph.
+type Pictures = BTreeMap<usize, Vec<u8>>;
+
 /// What was masked.
 pub(super) struct Masked {
     /// The photographs with their masks.
@@ -55,7 +58,7 @@ struct Behind {
 
 impl Behind {
     /// From those of `pictures` that are of `group`, if there are enough.
-    fn of(group: &[usize], [width, height]: [u32; 2], pictures: &BTreeMap<usize, Vec<u8>>) -> Option<Self> {
+    fn of(group: &[usize], [width, height]: [u32; 2], pictures: &Pictures) -> Option<Self> {
         let of: Vec<&Vec<u8>> = group.iter().filter_map(|photo| pictures.get(photo)).collect();
         (of.len() >= LEAST).then(|| {
             let scene = StillScene::of(width as usize, height as usize, &of);
@@ -94,15 +97,15 @@ pub(super) fn mask(
     if masks.is_empty() {
         return Ok(None);
     }
-    let written = write(out, folder, &masks)?;
-    let with_mask = |photo: &PhotoEntry| photo.with_mask(written.join(file_name(photo)));
-    let photos = folder.photos.iter().map(with_mask).collect::<Result<_, _>>()?;
-    let told = told(
+    let (written, told) = write_and_tell(
+        out,
+        folder,
         &masks,
         "stand still while the rest moves (the background of a turntable, or what carries the camera)",
-        &written,
-    );
-    progress(PoseProgress::Warned(told.clone()));
+        progress,
+    )?;
+    let with_mask = |photo: &PhotoEntry| photo.with_mask(written.join(file_name(photo)));
+    let photos = folder.photos.iter().map(with_mask).collect::<Result<_, _>>()?;
     Ok(Some(Masked {
         folder: PhotoFolder {
             photos,
@@ -129,9 +132,7 @@ pub(super) fn mask_backdrop(
     if masks.is_empty() {
         return Ok(None);
     }
-    let written = write(out, folder, &masks)?;
-    let told = told(&masks, "are the backdrop of a turntable", &written);
-    progress(PoseProgress::Warned(told.clone()));
+    let (_, told) = write_and_tell(out, folder, &masks, "are the backdrop of a turntable", progress)?;
     Ok(Some(told))
 }
 
@@ -146,55 +147,30 @@ pub(super) fn mask_bars(
     if !is_free_once_cleared(folder, out)? {
         return Ok(None);
     }
-    let photos = |photos: &[usize]| {
-        photos
+    let mut masks = BTreeMap::new();
+    let mut most = 0.0f64;
+    for photos in cameras(&attempt.matched) {
+        let some = photos
             .iter()
             .copied()
             .step_by(photos.len().div_ceil(LOOKED_AT))
-            .collect()
-    };
-    let mut masks = BTreeMap::new();
-    let found = of_cameras(&attempt.matched, folder, photos, |[width, height], pictures| {
-        if pictures.len() < LEAST {
-            return BTreeMap::new();
+            .collect::<Vec<_>>();
+        if some.len() < LEAST {
+            continue;
         }
-        let [w, h] = [width as usize, height as usize];
-        let bars = bars(w, h, &pictures.values().collect::<Vec<_>>());
-        // The lines at the edge are of both.
-        let [left, above, right, below] = bars.map(|bar| if bar > 0 { bar + 2 } else { 0 });
-        let is_bar = |at: usize| {
-            let (x, y) = (at % w, at / w);
-            x < left || y < above || x >= w - right || y >= h - below
+        let (size, pictures) = pictures(&attempt.matched, folder, &some)?;
+        let Some(still) = bars_in(size, &pictures) else {
+            continue;
         };
-        let mask: Vec<bool> = (0..w * h).map(is_bar).collect();
-        pictures
-            .keys()
-            .map(|photo| (*photo, mask.clone()))
-            .filter(|_| bars != [0; 4])
-            .collect()
-    })?;
-    let info = |photo: usize| &attempt.matched.infos[photo];
-    let of_folder = attempt.matched.work.photos();
-    for (photo, entry) in of_folder.iter().enumerate() {
-        let same = (0..of_folder.len())
-            .find(|other| info(*other).group == info(photo).group && found.contains_key(&of_folder[*other]));
-        if let Some(mask) = same.map(|other| &found[&of_folder[other]]) {
-            masks.insert(
-                *entry,
-                Mask {
-                    size: mask.size,
-                    still: mask.still.clone(),
-                },
-            );
+        most = most.max(share(&still) as f64 / still.len() as f64);
+        for photo in photos {
+            let still = still.clone();
+            masks.insert(attempt.matched.work.photos()[photo], Mask { size, still });
         }
     }
-    let Some(most) = masks
-        .values()
-        .map(|mask| share(&mask.still) as f64 / mask.still.len() as f64)
-        .max_by(f64::total_cmp)
-    else {
+    if masks.is_empty() {
         return Ok(None);
-    };
+    }
     if most > COVERS {
         let told = format!(
             "{:.0} % of the pictures are bars around them, too much to be masked: cut them off, or splats are hung before the cameras for them",
@@ -203,10 +179,21 @@ pub(super) fn mask_bars(
         progress(PoseProgress::Warned(told.clone()));
         return Ok(Some(told));
     }
-    let written = write(out, folder, &masks)?;
-    let told = told(&masks, "are bars around the pictures", &written);
-    progress(PoseProgress::Warned(told.clone()));
+    let (_, told) = write_and_tell(out, folder, &masks, "are bars around the pictures", progress)?;
     Ok(Some(told))
+}
+
+/// Where `pictures` have bars around them, the same in all; `None` if they have none.
+fn bars_in(size: [u32; 2], pictures: &Pictures) -> Option<Vec<bool>> {
+    let [width, height] = size.map(|side| side as usize);
+    let bars = bars(width, height, &pictures.values().collect::<Vec<_>>());
+    // The lines at the edge are of both.
+    let [left, above, right, below] = bars.map(|bar| if bar > 0 { bar + 2 } else { 0 });
+    let is_bar = |at: usize| {
+        let (x, y) = (at % width, at / width);
+        x < left || y < above || x >= width - right || y >= height - below
+    };
+    (bars != [0; 4]).then(|| (0..width * height).map(is_bar).collect())
 }
 
 /// Whether there are no masks, once those of an earlier call are removed.
@@ -219,21 +206,31 @@ fn is_free_once_cleared(folder: &PhotoFolder, out: &Path) -> Result<bool, RunErr
     Ok(!written.exists() && folder.photos.iter().all(|photo| photo.mask.is_none()))
 }
 
-fn told(masks: &BTreeMap<usize, Mask>, what: &str, written: &Path) -> String {
+/// Writes masks of `what` some photographs show; their folder, and what the user was told.
+fn write_and_tell(
+    out: &Path,
+    folder: &PhotoFolder,
+    masks: &BTreeMap<usize, Mask>,
+    what: &str,
+    progress: &(dyn Fn(PoseProgress) + Sync),
+) -> Result<(PathBuf, String), RunError> {
+    let written = write(out, folder, masks)?;
     let masked: usize = (masks.values()).map(|mask| share(&mask.still)).sum();
     let of: usize = masks.values().map(|mask| mask.still.len()).sum();
-    format!(
+    let told = format!(
         "{:.0} % of {} photographs {what}: masked in {}; give masks of your own, in a folder masks beside the photographs, to decide otherwise",
         100.0 * masked as f64 / of as f64,
         masks.len(),
         written.display()
-    )
+    );
+    progress(PoseProgress::Warned(told.clone()));
+    Ok((written, told))
 }
 
 /// Masks by index of the folder's photographs.
 fn find(matched: &Matched, folder: &PhotoFolder, still: &StandsStill) -> Result<BTreeMap<usize, Mask>, RunError> {
     let groups = still.groups(matched.infos.len());
-    of_cameras(matched, folder, <[usize]>::to_vec, |size, pictures| {
+    of_cameras(matched, folder, |size, pictures| {
         let scenes: Vec<Behind> = groups
             .iter()
             .filter_map(|group| Behind::of(group, size, pictures))
@@ -248,7 +245,7 @@ fn behind_turntable(
     folder: &PhotoFolder,
     rings: &[Vec<usize>],
 ) -> Result<BTreeMap<usize, Mask>, RunError> {
-    of_cameras(matched, folder, <[usize]>::to_vec, |[width, height], pictures| {
+    of_cameras(matched, folder, |[width, height], pictures| {
         // A photograph in other light, such as with the shadow of what turns, may show more of that behind another ring.
         let backdrops: Vec<Backdrop> = rings
             .iter()
@@ -285,25 +282,15 @@ fn share(mask: &[bool]) -> usize {
     mask.iter().filter(|still| **still).count()
 }
 
-/// Masks by index of the folder's photographs, from those that `of` finds in the small pictures, `[H, W, 3]`, of each camera's photographs that `among` selects.
+/// Masks by index of the folder's photographs, from those that `of` finds in the small pictures, `[H, W, 3]`, of each camera.
 fn of_cameras(
     matched: &Matched,
     folder: &PhotoFolder,
-    among: impl Fn(&[usize]) -> Vec<usize>,
-    of: impl Fn([u32; 2], &BTreeMap<usize, Vec<u8>>) -> BTreeMap<usize, Vec<bool>>,
+    of: impl Fn([u32; 2], &Pictures) -> BTreeMap<usize, Vec<bool>>,
 ) -> Result<BTreeMap<usize, Mask>, RunError> {
-    let mut cameras: BTreeMap<usize, Vec<usize>> = BTreeMap::new();
-    for (photo, info) in matched.infos.iter().enumerate() {
-        cameras.entry(info.group).or_default().push(photo);
-    }
     let mut masks = BTreeMap::new();
-    for photos in cameras.values() {
-        let entry = |photo: usize| &folder.photos[matched.work.photos()[photo]];
-        let size = small(entry(photos[0]));
-        let pictures = among(photos)
-            .par_iter()
-            .map(|photo| Ok((*photo, in_rgb(&entry(*photo).read(SIDE)?, size))))
-            .collect::<Result<BTreeMap<usize, Vec<u8>>, RunError>>()?;
+    for photos in cameras(matched) {
+        let (size, pictures) = pictures(matched, folder, &photos)?;
         for (photo, still) in of(size, &pictures) {
             masks.insert(matched.work.photos()[photo], Mask { size, still });
         }
@@ -311,8 +298,28 @@ fn of_cameras(
     Ok(masks)
 }
 
+/// The photographs of each camera.
+fn cameras(matched: &Matched) -> Vec<Vec<usize>> {
+    let mut cameras: BTreeMap<usize, Vec<usize>> = BTreeMap::new();
+    for (photo, info) in matched.infos.iter().enumerate() {
+        cameras.entry(info.group).or_default().push(photo);
+    }
+    cameras.into_values().collect()
+}
+
+/// The pictures of `photos` of one camera, and their size.
+fn pictures(matched: &Matched, folder: &PhotoFolder, photos: &[usize]) -> Result<([u32; 2], Pictures), RunError> {
+    let entry = |photo: usize| &folder.photos[matched.work.photos()[photo]];
+    let size = small(entry(photos[0]));
+    let pictures = photos
+        .par_iter()
+        .map(|photo| Ok((*photo, in_rgb(&entry(*photo).read(SIDE)?, size))))
+        .collect::<Result<_, RunError>>()?;
+    Ok((size, pictures))
+}
+
 /// Where `pictures` show what is behind them, by photograph. Of several `scenes`, such as those of rings of different height, each shows the one it has most of.
-fn shown(scenes: &[Behind], pictures: &BTreeMap<usize, Vec<u8>>) -> BTreeMap<usize, Vec<bool>> {
+fn shown(scenes: &[Behind], pictures: &Pictures) -> BTreeMap<usize, Vec<bool>> {
     let most = |picture: &[u8]| {
         let all = scenes.iter().enumerate().map(|(i, behind)| {
             let shown = behind.scene.shown(picture);

@@ -191,12 +191,7 @@ fn narrow(photos: &[PhotoInfo], cameras: &Cameras) -> Option<Vec<Option<(DCamera
 /// Photographs of the largest model, and what its points explain of them.
 fn explained(found: &Reconstruction) -> (usize, usize) {
     let model = found.models.first();
-    model.map_or((0, 0), |model| {
-        (
-            model.registered(),
-            model.points.iter().map(|point| point.track.len()).sum(),
-        )
-    })
+    model.map_or((0, 0), |model| (model.registered(), model.observations()))
 }
 
 /// `[groups]` the cameras that are known exactly.

@@ -36,9 +36,8 @@ pub(super) fn freed(
     working.resume(model);
     working.free_principal_points();
     working.settle_fully(progress);
-    let explained = |model: &Model| model.points.iter().map(|point| point.track.len()).sum::<usize>();
     let free = finish::finish(&working, photos);
-    (free.registered() >= model.registered() && explained(&free) >= explained(model)).then_some(free)
+    (free.registered() >= model.registered() && free.observations() >= model.observations()).then_some(free)
 }
 
 /// The fraction by which the cost of `model` falls with free principal points.

@@ -260,10 +260,14 @@ impl Model {
         self.poses.iter().flatten().count()
     }
 
+    /// Number of observations that points explain.
+    pub fn observations(&self) -> usize {
+        self.points.iter().map(|point| point.track.len()).sum()
+    }
+
     /// Mean reprojection error, px.
     pub fn mean_error(&self) -> f64 {
-        let observations: usize = self.points.iter().map(|p| p.track.len()).sum();
-        self.points.iter().map(|p| p.error * p.track.len() as f64).sum::<f64>() / observations.max(1) as f64
+        self.points.iter().map(|p| p.error * p.track.len() as f64).sum::<f64>() / self.observations().max(1) as f64
     }
 }
 

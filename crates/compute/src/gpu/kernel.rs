@@ -1,4 +1,4 @@
-use super::{Array, Gpu, Shader};
+use super::{Array, DRIVER, Gpu, Shader};
 use std::borrow::Cow;
 use std::sync::{Mutex, PoisonError};
 
@@ -37,7 +37,7 @@ impl Kernel {
             label: Some(shader.name),
             source: wgpu::ShaderSource::Wgsl(Cow::Owned(format!("{constants}{}", shader.source()))),
         };
-        let pipeline = with_stack(|| compile(gpu, shader.name, descriptor));
+        let pipeline = DRIVER.install(|| compile(gpu, shader.name, descriptor));
         Self {
             name: shader.name,
             layout: pipeline.get_bind_group_layout(0),
@@ -104,18 +104,6 @@ fn compile(gpu: &Gpu, name: &str, descriptor: wgpu::ShaderModuleDescriptor) -> w
             ..Default::default()
         },
         cache: None,
-    })
-}
-
-/// Bytes of stack for a driver's compiler, which may recurse as deep as a shader is large: threads of servers and tests have 2 MB.
-const STACK: usize = 32 << 20;
-
-/// What `work` returns, on a thread with [`STACK`].
-fn with_stack<T: Send>(work: impl FnOnce() -> T + Send) -> T {
-    std::thread::scope(|scope| {
-        let builder = std::thread::Builder::new().stack_size(STACK);
-        let thread = builder.spawn_scoped(scope, work).expect("a thread can be started");
-        thread.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))
     })
 }
 

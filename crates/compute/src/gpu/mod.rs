@@ -108,12 +108,23 @@ const SHARED: u32 = 22 << 10;
 /// Storage arrays that a kernel binds at most.
 const BINDINGS: u32 = 12;
 
-/// The drivers of this machine: loaded once, and never while another thread uses them.
+/// The drivers of this machine, loaded once.
 static INSTANCE: LazyLock<wgpu::Instance> = LazyLock::new(|| {
     wgpu::Instance::new(wgpu::InstanceDescriptor {
         backends: wgpu::Backends::PRIMARY,
         ..wgpu::InstanceDescriptor::new_without_display_handle()
     })
+});
+
+/// Bytes of stack for a driver's compiler, which may recurse as deep as a shader is large: threads of servers and tests have 2 MB.
+const STACK: usize = 32 << 20;
+
+/// The thread on which drivers are loaded, devices opened and shaders compiled, one after another, until the process ends. NVIDIA's driver
+/// does not stand these at once on several threads (wgpu issue 10234), and may wait forever on a thread that ends after them (8365).
+static DRIVER: LazyLock<rayon::ThreadPool> = LazyLock::new(|| {
+    let builder = rayon::ThreadPoolBuilder::new().num_threads(1).stack_size(STACK);
+    let builder = builder.thread_name(|_| "gpu driver".to_owned());
+    builder.build().expect("a thread can be started")
 });
 
 /// The adapters of this machine, graphics cards first.
@@ -161,7 +172,7 @@ fn describe(adapter: &wgpu::Adapter) -> AdapterInfo {
 impl Gpu {
     /// The adapters of this machine, graphics cards first.
     pub fn adapters() -> Vec<AdapterInfo> {
-        list().into_iter().map(|(_, info)| info).collect()
+        DRIVER.install(|| list().into_iter().map(|(_, info)| info).collect())
     }
 
     /// Opens an adapter.
@@ -169,6 +180,10 @@ impl Gpu {
     /// # Errors
     /// When there is none of the wanted kind, or its driver refuses.
     pub fn open(wanted: &Wanted) -> Result<Arc<Self>, DeviceError> {
+        DRIVER.install(|| Self::open_here(wanted))
+    }
+
+    fn open_here(wanted: &Wanted) -> Result<Arc<Self>, DeviceError> {
         let is_wanted = |info: &AdapterInfo| match wanted {
             Wanted::Real => info.is_usable && info.kind != AdapterKind::Software,
             Wanted::Any => info.is_usable,

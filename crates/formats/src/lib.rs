@@ -41,7 +41,7 @@ pub use error::{FormatError, Malformed};
 pub use image_file::{Pixels, read_image, write_png, write_png_16};
 pub use pack::gzip;
 pub use photos::{
-    CameraTags, PanoramaFace, PhotoEntry, PhotoFolder, find_panoramas, has_photos, read_photo_folder,
+    CameraTags, PanoramaFace, PhotoEntry, PhotoFolder, find_panoramas, photo_files, read_photo_folder,
     read_photo_folders,
 };
 pub use points_ply::{read_points_ply, write_points_ply};

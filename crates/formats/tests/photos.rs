@@ -2,7 +2,7 @@
 
 use irradia_formats::{ColmapCamera, ColmapImage, ColmapModel, PosedImage, write_colmap};
 use irradia_formats::{
-    DatasetOptions, find_panoramas, has_photos, read_dataset, read_photo_folder, read_photo_folders,
+    DatasetOptions, find_panoramas, photo_files, read_dataset, read_photo_folder, read_photo_folders,
 };
 use std::fs;
 use std::path::Path;
@@ -26,7 +26,7 @@ fn save_turned(path: &Path, picture: &image::RgbImage, orientation: u8) {
 fn what_is_no_photograph_or_a_copy_is_named_with_its_reason() {
     let folder = tempfile::tempdir().unwrap();
     let root = folder.path();
-    assert!(!has_photos(root));
+    assert!(photo_files(root).is_empty());
     picture(40, 30, 10).save(root.join("b.jpg")).unwrap();
     picture(40, 30, 20).save(root.join("a.png")).unwrap();
     fs::copy(root.join("b.jpg"), root.join("c.jpg")).unwrap();
@@ -34,15 +34,23 @@ fn what_is_no_photograph_or_a_copy_is_named_with_its_reason() {
     fs::write(root.join("e.jpg"), &fs::read(root.join("b.jpg")).unwrap()[..400]).unwrap();
     fs::write(root.join("f.HEIC"), "\0\0\0\x10ftypheic\0\0\0\0").unwrap();
     fs::write(root.join("g.dng"), "II*").unwrap();
+    fs::write(root.join("b.CR3"), "what b.jpg was made of").unwrap();
     fs::write(root.join("notes.txt"), "ignored").unwrap();
     fs::write(root.join(".hidden.jpg"), "ignored").unwrap();
     let found = read_photo_folder(root).unwrap();
     let names: Vec<&str> = found.photos.iter().map(|photo| photo.name.as_str()).collect();
     assert_eq!(names, ["a.png", "b.jpg"]);
+    let repeated = [
+        ("b.CR3", "another form of a photograph that is read"),
+        ("c.jpg", "a copy of b.jpg, byte for byte"),
+    ];
+    assert_eq!(
+        found.repeated,
+        repeated.map(|(name, what)| (name.to_owned(), what.to_owned()))
+    );
     let reasons: Vec<(&str, &str)> = found.left_out.iter().map(|(a, b)| (a.as_str(), b.as_str())).collect();
-    assert_eq!(reasons.len(), 5, "{reasons:?}");
+    assert_eq!(reasons.len(), 4, "{reasons:?}");
     for ((name, reason), (expected, word)) in reasons.iter().zip([
-        ("c.jpg", "copy of b.jpg"),
         ("d.jpg", "not a readable"),
         ("e.jpg", "truncated"),
         ("f.HEIC", "not a readable"),
@@ -50,12 +58,12 @@ fn what_is_no_photograph_or_a_copy_is_named_with_its_reason() {
     ]) {
         assert!(*name == expected && reason.contains(word), "{name}: {reason}");
     }
-    assert!(has_photos(root));
+    assert_eq!(photo_files(root).len(), 6);
     // Photographs in `images` are found from the folder above.
     let below = tempfile::tempdir().unwrap();
     fs::create_dir(below.path().join("images")).unwrap();
     fs::copy(root.join("a.png"), below.path().join("images/a.png")).unwrap();
-    assert!(has_photos(below.path()));
+    assert_eq!(photo_files(below.path()).len(), 1);
     assert_eq!(read_photo_folder(below.path()).unwrap().photos.len(), 1);
     assert!(read_photo_folder(&root.join("none")).is_err());
 }
@@ -297,8 +305,8 @@ fn folders_are_read_together_and_names_stay_apart() {
     let found = read_photo_folders(&[first, second]).unwrap();
     let names: Vec<&str> = found.photos.iter().map(|photo| photo.name.as_str()).collect();
     assert_eq!(names, ["2.png", "3.png", "second_1.png"]);
-    assert_eq!(found.left_out.len(), 1);
-    assert!(found.left_out[0].0 == "first_1.png" && found.left_out[0].1.contains("copy of 3.png"));
+    assert!(found.left_out.is_empty());
+    assert!(found.repeated[0].0 == "first_1.png" && found.repeated[0].1.contains("copy of 3.png"));
 }
 
 #[test]

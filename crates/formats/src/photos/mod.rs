@@ -12,11 +12,13 @@ use image::metadata::Orientation;
 use irradia_scene::resize_area;
 pub use panorama::{PanoramaFace, find_panoramas};
 use rayon::prelude::*;
-use std::collections::{BTreeMap, HashMap};
+use std::collections::{BTreeMap, HashMap, HashSet};
 use std::path::{Path, PathBuf};
 
-/// Extensions of photographs that are not read.
-const UNREAD: [&str; 5] = ["avif", "dng", "cr2", "nef", "arw"];
+/// Extensions of pictures that are not read: of cameras' raw files, and others.
+const UNREAD: [&str; 15] = [
+    "dng", "cr2", "cr3", "nef", "arw", "orf", "rw2", "raf", "srw", "pef", "avif", "jxl", "bmp", "gif", "jp2",
+];
 
 /// A photograph on disk.
 #[derive(Clone, Debug, PartialEq)]
@@ -104,6 +106,8 @@ pub struct PhotoFolder {
     pub photos: Vec<PhotoEntry>,
     /// Names of the other pictures, and why they are not used.
     pub left_out: Vec<(String, String)>,
+    /// Names of files that show what a photograph shows already, such as copies and cameras' raw files beside their JPEG, and what they are: nothing is lost with them.
+    pub repeated: Vec<(String, String)>,
 }
 
 impl PhotoFolder {
@@ -129,7 +133,7 @@ impl PhotoFolder {
 
 /// The photographs in `folder` itself, or in its folder `images` or, without one, the first of `images_2`, `images_4` and so on that has some, with their masks in
 /// `masks` or `masks_4` beside them. Hidden files and those that are not pictures by their extension
-/// are ignored; pictures that cannot be read, and copies, are left out.
+/// are ignored; pictures that cannot be read are left out, and so is what repeats another.
 ///
 /// # Errors
 /// When the folder cannot be read.
@@ -169,6 +173,15 @@ pub fn read_photo_folders(folders: &[impl AsRef<Path>]) -> Result<PhotoFolder, F
             }
         }));
     }
+    let mut found = PhotoFolder::default();
+    let read: HashSet<PathBuf> = (files.iter().map(|file| &file.path))
+        .filter(|path| is_unread(path).is_none())
+        .map(|path| path.with_extension(""))
+        .collect();
+    let is_other_form = |file: &Found| is_unread(&file.path).is_some() && read.contains(&file.path.with_extension(""));
+    let (forms, mut files): (Vec<Found>, Vec<Found>) = files.into_iter().partition(is_other_form);
+    let repeats = |file: Found| (file.name, "another form of a photograph that is read".to_owned());
+    found.repeated.extend(forms.into_iter().map(repeats));
     let mut known: HashMap<String, usize> = HashMap::new();
     for file in &files {
         *known.entry(file.name.clone()).or_default() += 1;
@@ -189,12 +202,11 @@ pub fn read_photo_folders(folders: &[impl AsRef<Path>]) -> Result<PhotoFolder, F
             (file.name.clone(), entry)
         })
         .collect();
-    let mut found = PhotoFolder::default();
     let mut first_with: BTreeMap<u64, String> = BTreeMap::new();
     for (name, entry) in entries {
         match entry {
             Ok(photo) => match first_with.get(&photo.hash) {
-                Some(first) => found.left_out.push((name, format!("a copy of {first}, byte for byte"))),
+                Some(first) => found.repeated.push((name, format!("a copy of {first}, byte for byte"))),
                 None => {
                     first_with.insert(photo.hash, name);
                     found.photos.push(photo);
@@ -206,9 +218,11 @@ pub fn read_photo_folders(folders: &[impl AsRef<Path>]) -> Result<PhotoFolder, F
     Ok(found)
 }
 
-/// Whether `path` is a folder with at least one picture that can be read by its extension, itself or in `images`.
-pub fn has_photos(path: &Path) -> bool {
-    pictures_of(path).is_ok_and(|pictures| pictures.files.iter().any(|file| is_image_name(file)))
+/// The pictures that can be read by their extension in the folder `path` or its `images`; none where it is no folder.
+pub fn photo_files(path: &Path) -> Vec<PathBuf> {
+    let mut files = pictures_of(path).map_or(Vec::new(), |pictures| pictures.files);
+    files.retain(|file| is_image_name(file));
+    files
 }
 
 /// Folders of photographs below that of a capture: as they are, or at a fraction of their size, as benchmarks have them.

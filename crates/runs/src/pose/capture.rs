@@ -1,11 +1,11 @@
 //! What is posed: photographs of one or several folders, frames of films, faces of panoramas.
 
 use super::output::link_panorama;
-use super::{PoseProgress, film, is_film};
+use super::{MIN_PHOTOS, PoseProgress, film, is_film};
 use crate::RunError;
 use glam::{DQuat, DVec3};
 use irradia_formats::{
-    DatasetFormat, PanoramaFace, PhotoEntry, PhotoFolder, find_panoramas, has_photos, read_photo_folder,
+    DatasetFormat, PanoramaFace, PhotoEntry, PhotoFolder, find_panoramas, photo_files, read_photo_folder,
     read_photo_folders, write_atomic,
 };
 use irradia_sfm::geometry::camera::DCamera;
@@ -27,7 +27,12 @@ const DEPTH: usize = 2;
 #[derive(Debug, Default, PartialEq)]
 struct Sources {
     folders: Vec<PathBuf>,
+    /// Films that were named.
     films: Vec<PathBuf>,
+    /// Films in the folders.
+    beside: Vec<PathBuf>,
+    /// Those of them that a phone takes with a photograph of the same name.
+    live: Vec<PathBuf>,
 }
 
 impl Sources {
@@ -48,9 +53,17 @@ impl Sources {
                 .is_some_and(|name| name.to_string_lossy().starts_with('.'))
         });
         entries.sort();
-        self.films
-            .extend(entries.iter().filter(|entry| is_film(entry)).cloned());
-        if has_photos(path) {
+        let (photos, films) = (photo_files(path), entries.iter().filter(|entry| is_film(entry)));
+        let is_live = |film: &PathBuf| {
+            photos.len() >= MIN_PHOTOS
+                && photos
+                    .iter()
+                    .any(|photo| photo.with_extension("") == film.with_extension(""))
+        };
+        let (live, films): (Vec<_>, Vec<_>) = films.cloned().partition(is_live);
+        self.live.extend(live);
+        self.beside.extend(films);
+        if !photos.is_empty() {
             self.folders.push(path.to_owned());
         } else if depth > 0 {
             let is_beside = |entry: &Path| {
@@ -121,6 +134,19 @@ impl Capture {
         for path in paths {
             sources.add(path, DEPTH)?;
         }
+        let mut repeated: Vec<(String, String)> = Vec::new();
+        let mut unused = |films: Vec<PathBuf>, why: &str| {
+            let name = |film: PathBuf| film.file_name().unwrap_or_default().to_string_lossy().into_owned();
+            repeated.extend(films.into_iter().map(|film| (name(film), why.to_owned())));
+        };
+        unused(sources.live, "a film that was taken with the photograph of its name");
+        match sources.folders.is_empty() || film::can_be_read() {
+            true => sources.films.append(&mut sources.beside),
+            false => unused(
+                sources.beside,
+                "a film, which needs ffmpeg: install it to use its frames",
+            ),
+        }
         let needs_out = |what: &str| {
             let path = paths.first().map(|path| path.display().to_string()).unwrap_or_default();
             RunError::Refused(format!("{path}: {what} need a folder to be written to: give --out"))
@@ -135,6 +161,7 @@ impl Capture {
             has_films: !sources.films.is_empty(),
             faces: HashMap::new(),
         };
+        capture.folder.repeated.append(&mut repeated);
         let panoramas = capture.take_panoramas();
         if !panoramas.is_empty() {
             let out = out.ok_or_else(|| needs_out("faces of panoramas"))?;
@@ -185,6 +212,7 @@ impl Capture {
             .collect();
         let written = read_photo_folder(folder)?;
         self.folder.left_out.extend(written.left_out);
+        self.folder.repeated.extend(written.repeated);
         for mut photo in written.photos {
             let (rig, face) = &of[&photo.name];
             let tags = &panoramas[*rig].tags;
@@ -257,6 +285,31 @@ mod tests {
     }
 
     #[test]
+    fn a_phones_film_of_a_photograph_is_none_of_the_capture() {
+        let root = tempfile::tempdir().unwrap();
+        let write = |names: &[&str]| {
+            names
+                .iter()
+                .for_each(|name| fs::write(root.path().join(name), "by its name").unwrap())
+        };
+        let live = |expected: &[&str]| {
+            let mut sources = Sources::default();
+            sources.add(root.path(), DEPTH).unwrap();
+            let [live, beside] = [sources.live, sources.beside];
+            assert_eq!(
+                live,
+                expected.iter().map(|name| root.path().join(name)).collect::<Vec<_>>()
+            );
+            assert_eq!(live.len() + beside.len(), 2);
+        };
+        write(&["IMG_1.MOV", "walk.mp4", "walk.jpg"]);
+        // A picture of a film is no capture beside it.
+        live(&[]);
+        write(&["IMG_1.HEIC", "IMG_2.JPG"]);
+        live(&["IMG_1.MOV", "walk.mp4"]);
+    }
+
+    #[test]
     fn folders_in_folders_are_a_capture_and_datasets_are_none() {
         let root = tempfile::tempdir().unwrap();
         let photo = |path: &str| {
@@ -276,7 +329,8 @@ mod tests {
             sources.folders,
             ["monday", "tuesday/morning"].map(|name| days.join(name))
         );
-        assert_eq!(sources.films, [days.join("walk.mp4")]);
+        assert_eq!(sources.beside, [days.join("walk.mp4")]);
+        assert!(sources.films.is_empty() && sources.live.is_empty());
         assert!(is_capture(&days) && is_capture(&days.join("walk.mp4")));
         // One of several folders has poses: whatever the others are, they are not one capture with it.
         photo("sets/posed/images/1.png");

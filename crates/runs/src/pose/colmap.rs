@@ -96,6 +96,7 @@ fn report(out: &Path, folder: &PhotoFolder) -> Result<PoseReport, RunError> {
     let mut left_out: Vec<LeftOutPhoto> = folder
         .left_out
         .iter()
+        .chain(&folder.repeated)
         .cloned()
         .chain(absent)
         .map(|(name, reason)| LeftOutPhoto { name, reason })

@@ -194,20 +194,32 @@ fn finding(diagnosis: &Diagnosis, names: &[String], model: Option<&Model>) -> Fi
     }
 }
 
-/// Pictures that cannot be read have no other faults.
+/// Pictures that cannot be read have no other faults; those with the same reason are one finding.
 fn add_unreadable(report: &mut DoctorReport, folder: &PhotoFolder, work: &Work) {
-    let unreadable: Vec<&(String, String)> = folder.left_out.iter().chain(work.undecodable()).collect();
     report.photos += folder.left_out.len();
-    report
-        .findings
-        .extend(unreadable.into_iter().map(|(name, reason)| Finding {
+    let unused = folder.left_out.iter().chain(&folder.repeated).chain(work.undecodable());
+    let mut by_reason: Vec<(&str, Vec<String>)> = Vec::new();
+    for (name, reason) in unused {
+        match by_reason.iter_mut().find(|(other, _)| other == reason) {
+            Some((_, names)) => names.push(name.clone()),
+            None => by_reason.push((reason, vec![name.clone()])),
+        }
+    }
+    report.findings.extend(by_reason.into_iter().map(|(reason, names)| {
+        let who = match &names[..] {
+            [one] => format!("{one} is"),
+            [first, others @ ..] => format!("{first} and {} more are", others.len()),
+            [] => unreachable!("a reason has a name"),
+        };
+        Finding {
             kind: irradia_sfm::doctor::Kind::LeftOut.name(),
-            sentence: format!("{name} is left out: {reason}"),
-            photos: vec![name.clone()],
+            sentence: format!("{who} left out: {reason}"),
+            photos: names,
             sides: Vec::new(),
             shoot: Vec::new(),
             pictured: Vec::new(),
-        }));
+        }
+    }));
 }
 
 fn plan(model: &Model, infos: &[PhotoInfo]) -> Plan {

@@ -37,6 +37,17 @@ pub(super) fn is_film(path: &Path) -> bool {
     extension.is_some_and(|e| FILMS.contains(&e.as_str())) && path.is_file()
 }
 
+/// Whether ffmpeg is installed.
+pub(super) fn can_be_read() -> bool {
+    let mut ffmpeg = Command::new("ffmpeg");
+    let silent = ffmpeg
+        .arg("-version")
+        .stdin(Stdio::null())
+        .stdout(Stdio::null())
+        .stderr(Stdio::null());
+    silent.status().is_ok_and(|status| status.success())
+}
+
 /// The record of what was chosen, beside the frames; it begins empty.
 const RECORD: &str = "frames.json";
 

@@ -39,13 +39,14 @@ impl KnownPoses {
         }
         let before = folder.photos.len();
         folder.left_out.extend(more.left_out);
+        folder.repeated.extend(more.repeated);
         for photo in more.photos {
             let reason = |other: &&irradia_formats::PhotoEntry| other.hash == photo.hash || other.name == photo.name;
             match folder.photos.iter().find(reason) {
                 None => folder.photos.push(photo),
                 Some(other) if other.hash == photo.hash => {
                     folder
-                        .left_out
+                        .repeated
                         .push((photo.name, format!("in the dataset already, as {}", other.name)));
                 }
                 Some(_) => {

@@ -406,6 +406,7 @@ fn check_enough(paths: &[PathBuf], folder: &PhotoFolder) -> Result<(), RunError>
     let reasons: String = folder
         .left_out
         .iter()
+        .chain(&folder.repeated)
         .take(3)
         .map(|(name, reason)| format!("; {name}: {reason}"))
         .collect();

@@ -190,7 +190,8 @@ fn colmap_camera(id: u32, camera: &DCamera) -> ColmapCamera {
 /// All but the times and warnings.
 pub(super) fn report(folder: &PhotoFolder, work: &Work, infos: &[PhotoInfo], found: &Reconstruction) -> PoseReport {
     let model = &found.models[0];
-    let mut left_out: Vec<(String, String)> = folder.left_out.iter().chain(work.undecodable()).cloned().collect();
+    let unused = folder.left_out.iter().chain(&folder.repeated).chain(work.undecodable());
+    let mut left_out: Vec<(String, String)> = unused.cloned().collect();
     left_out.extend(
         found
             .left_out

@@ -109,7 +109,7 @@ pub(super) fn mask(
     Ok(Some(Masked {
         folder: PhotoFolder {
             photos,
-            left_out: folder.left_out.clone(),
+            ..folder.clone()
         },
         still,
         told,

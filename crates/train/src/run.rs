@@ -22,6 +22,9 @@ pub struct RunLimits {
     pub paces: Option<Paces>,
 }
 
+/// The share of its budget that a run uses up, unless it ends early.
+const EARLY: f64 = 0.9;
+
 /// Steps between evaluations of the held-out views for `until_psnr`.
 const UNTIL_PSNR_EVERY: u64 = 50;
 
@@ -150,6 +153,7 @@ pub fn run(
     trainer.read_back()?;
     events.extend(fewer_than_at_first(trainer));
     events.extend(read_for_losses(trainer));
+    events.extend(limits.budget.and_then(|budget| ended_early(trainer, budget)));
     let stopped = if requests.stop { "stopped" } else { "recipe complete" };
     let reason = reason.unwrap_or(stopped).to_owned();
     events.push(Event::Finished {
@@ -176,6 +180,18 @@ fn fewer_than_at_first(trainer: &Trainer) -> Option<Event> {
         }
     } else {
         Event::Decided { message: left }
+    })
+}
+
+/// Why a run ended before its budget of so many seconds was used up.
+fn ended_early(trainer: &Trainer, budget: f64) -> Option<Event> {
+    let (steps, seconds) = (trainer.clock.step, trainer.seconds);
+    let is_limited = trainer.finished() && trainer.pace == trainer.least_pace();
+    (is_limited && seconds < EARLY * budget).then(|| Event::Decided {
+        message: format!(
+            "{seconds:.0} s of {budget:.0} were needed: more than {steps} steps would fit single photographs, which are this far apart (--steps for \
+             another number)"
+        ),
     })
 }
 

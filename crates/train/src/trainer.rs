@@ -316,7 +316,7 @@ impl Trainer {
         Ok(self.photos.get(&self.dataset.train[..1], 1.0)?.alpha.is_some())
     }
 
-    /// The least pace of a run without a given number of steps: the recipe's limit on visits, where photographs are sparse.
+    /// The least pace of a run without a given number of steps: the recipe's limit on visits.
     pub(crate) fn least_pace(&self) -> f64 {
         match self.recipe.sparse_visits {
             0 => 0.0,

@@ -148,7 +148,6 @@ pub(super) fn mask_bars(
         return Ok(None);
     }
     let mut masks = BTreeMap::new();
-    let mut most = 0.0f64;
     for photos in cameras(&attempt.matched) {
         let some = photos
             .iter()
@@ -162,7 +161,6 @@ pub(super) fn mask_bars(
         let Some(still) = bars_in(size, &pictures) else {
             continue;
         };
-        most = most.max(share(&still) as f64 / still.len() as f64);
         for photo in photos {
             let still = still.clone();
             masks.insert(attempt.matched.work.photos()[photo], Mask { size, still });
@@ -170,14 +168,6 @@ pub(super) fn mask_bars(
     }
     if masks.is_empty() {
         return Ok(None);
-    }
-    if most > COVERS {
-        let told = format!(
-            "{:.0} % of the pictures are bars around them, too much to be masked: cut them off, or splats are hung before the cameras for them",
-            100.0 * most
-        );
-        progress(PoseProgress::Warned(told.clone()));
-        return Ok(Some(told));
     }
     let (_, told) = write_and_tell(out, folder, &masks, "are bars around the pictures", progress)?;
     Ok(Some(told))

@@ -94,8 +94,9 @@ documented! {
         /// length; 0: it always has its own length.
         #[serde(default, skip_serializing_if = "is_default")]
         pub visits: u64,
-        /// Steps for each training photograph that a run without a number of steps has at most, if adjacent photographs are more than 8 degrees apart, as
-        /// seen from what they show, but at least a fifth of the recipe's own length; a budget that allows more is not used up. 0: no limit.
+        /// Steps for each training photograph that a run without a number of steps has at most, if adjacent photographs are 8 degrees apart or more, as
+        /// seen from what they show, but at least a fifth of the recipe's own length. Where they are closer, a run with a budget has more in inverse proportion, and
+        /// at least the recipe's own length. A budget that allows more is not used up. 0: no limit.
         #[serde(default, skip_serializing_if = "is_default")]
         pub sparse_visits: u64,
         /// Changes, each as of `--set`, for runs that have neither a number of steps nor a budget: what pays only in runs of the recipe's length.

@@ -16,6 +16,7 @@ mod keypoints;
 pub mod map;
 pub mod matching;
 mod median;
+mod overlay;
 mod still_scene;
 
 pub use backdrop::Backdrop;
@@ -23,4 +24,5 @@ pub use bars::bars;
 pub(crate) use connected::connected;
 pub use keypoints::{DESCRIPTOR_BYTES, Features, Keypoint, PairMatches};
 pub(crate) use median::median;
+pub use overlay::overlay;
 pub use still_scene::{Shown, StillScene};

@@ -7,7 +7,7 @@ use super::stages::in_rgb;
 use crate::RunError;
 use irradia_formats::{PhotoEntry, PhotoFolder, write_png};
 use irradia_sfm::map::{StandsStill, stands_still, turntable};
-use irradia_sfm::{Backdrop, StillScene, bars};
+use irradia_sfm::{Backdrop, StillScene, bars, overlay};
 use rayon::prelude::*;
 use std::collections::BTreeMap;
 use std::fs;
@@ -34,6 +34,8 @@ const COVERS: f64 = 0.5;
 const RINGS: usize = 8;
 /// Photographs of each camera that are searched for bars.
 const LOOKED_AT: usize = 8;
+/// The part of the pictures that lies over the scene in all of them, at most: more is behind it, such as the background of a turntable, and hidden by it in some.
+const LIES_OVER: f64 = 0.25;
 /// How far the colour of a backdrop must range in half of the pictures, of 255: one colour is the same wherever it is, and no harm.
 const RANGE: f64 = 8.0;
 
@@ -225,8 +227,26 @@ fn find(matched: &Matched, folder: &PhotoFolder, still: &StandsStill) -> Result<
             .iter()
             .filter_map(|group| Behind::of(group, size, pictures))
             .collect();
-        shown(&scenes, pictures)
+        let mut masks = shown(&scenes, pictures);
+        add_overlay(size, pictures, &mut masks);
+        masks
     })
+}
+
+/// Adds what lies over all of `pictures` to the masks of each: unlike what is behind, it is hidden in none.
+fn add_overlay([width, height]: [u32; 2], pictures: &Pictures, masks: &mut BTreeMap<usize, Vec<bool>>) {
+    let mut lies = overlay(width as usize, height as usize, &pictures.values().collect::<Vec<_>>());
+    for (at, lies) in lies.iter_mut().enumerate() {
+        let still = masks.values().filter(|mask| mask[at]).count();
+        *lies |= still > 0 && 2 * still >= masks.len();
+    }
+    let covers = share(&lies) as f64 / lies.len() as f64;
+    if covers > 0.0 && covers <= LIES_OVER {
+        for photo in pictures.keys() {
+            let mask = masks.entry(*photo).or_insert_with(|| vec![false; lies.len()]);
+            mask.iter_mut().zip(&lies).for_each(|(still, lies)| *still |= *lies);
+        }
+    }
 }
 
 /// As [`find`], of a plain backdrop behind what turns in `rings`.

@@ -24,5 +24,5 @@ pub use bars::bars;
 pub(crate) use connected::connected;
 pub use keypoints::{DESCRIPTOR_BYTES, Features, Keypoint, PairMatches};
 pub(crate) use median::median;
-pub use overlay::overlay;
+pub use overlay::Overlay;
 pub use still_scene::{Shown, StillScene};

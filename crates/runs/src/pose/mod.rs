@@ -330,7 +330,7 @@ pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Resu
     let told = match &masked {
         Some(masked) => Some(masked.told.clone()),
         None if is_new && !capture.has_panoramas() => match still::mask_backdrop(&attempt, folder, out, progress)? {
-            None => still::mask_bars(&attempt, folder, out, progress)?,
+            None => still::mask_edited(&attempt, folder, out, progress)?,
             told => told,
         },
         None => None,

@@ -7,7 +7,7 @@ use super::stages::in_rgb;
 use crate::RunError;
 use irradia_formats::{PhotoEntry, PhotoFolder, write_png};
 use irradia_sfm::map::{StandsStill, stands_still, turntable};
-use irradia_sfm::{Backdrop, StillScene, bars, overlay};
+use irradia_sfm::{Backdrop, Overlay, StillScene, bars};
 use rayon::prelude::*;
 use std::collections::BTreeMap;
 use std::fs;
@@ -32,8 +32,8 @@ const SURROUNDS: f64 = 0.55;
 const COVERS: f64 = 0.5;
 /// Rings, the largest, whose backdrops each photograph is compared with, for the time it takes.
 const RINGS: usize = 8;
-/// Photographs of each camera that are searched for bars.
-const LOOKED_AT: usize = 8;
+/// Photographs of each camera that are searched for bars and writing.
+const EXAMINED: usize = 24;
 /// The part of the pictures that writing lies over, at most. More may be behind the scene, such as the background of a turntable, and hidden by it in some: of a tankard
 /// that has 86 % of the pictures, 7 % would be masked with it.
 const LIES_OVER: f64 = 0.06;
@@ -139,9 +139,9 @@ pub(super) fn mask_backdrop(
     Ok(Some(told))
 }
 
-/// Writes masks of bars around the pictures into `out`, if there are such and no photograph has a mask of its own; what the user should know. Poses are right without, since bars show
-/// nothing, but splats would be hung before the cameras for them.
-pub(super) fn mask_bars(
+/// Writes masks of bars around the pictures and of writing over them into `out`, if there are such and no photograph has a mask of its own; what the user should know. Poses are right
+/// without, since bars show nothing and writing little, but splats would be hung before the cameras for them.
+pub(super) fn mask_edited(
     attempt: &Attempt,
     folder: &PhotoFolder,
     out: &Path,
@@ -155,13 +155,13 @@ pub(super) fn mask_bars(
         let some = photos
             .iter()
             .copied()
-            .step_by(photos.len().div_ceil(LOOKED_AT))
+            .step_by(photos.len().div_ceil(EXAMINED))
             .collect::<Vec<_>>();
         if some.len() < LEAST {
             continue;
         }
         let (size, pictures) = pictures(&attempt.matched, folder, &some)?;
-        let Some(still) = bars_in(size, &pictures) else {
+        let Some(still) = bars_in(size, &pictures).or_else(|| writing_over(size, &pictures)) else {
             continue;
         };
         for photo in photos {
@@ -172,7 +172,13 @@ pub(super) fn mask_bars(
     if masks.is_empty() {
         return Ok(None);
     }
-    let (_, told) = write_and_tell(out, folder, &masks, "are bars around the pictures", progress)?;
+    let (_, told) = write_and_tell(
+        out,
+        folder,
+        &masks,
+        "are bars around the pictures or writing over them",
+        progress,
+    )?;
     Ok(Some(told))
 }
 
@@ -187,6 +193,13 @@ fn bars_in(size: [u32; 2], pictures: &Pictures) -> Option<Vec<bool>> {
         x < left || y < above || x >= width - right || y >= height - below
     };
     (bars != [0; 4]).then(|| (0..width * height).map(is_bar).collect())
+}
+
+/// What lies over `pictures`, if that is sure and little.
+fn writing_over([width, height]: [u32; 2], pictures: &Pictures) -> Option<Vec<bool>> {
+    let overlay = Overlay::of(width as usize, height as usize, &pictures.values().collect::<Vec<_>>());
+    let lies = overlay.is_sure().then(|| overlay.pixels())?;
+    (share(&lies) as f64 <= LIES_OVER * lies.len() as f64).then_some(lies)
 }
 
 /// Whether there are no masks, once those of an earlier call are removed.
@@ -236,7 +249,8 @@ fn find(matched: &Matched, folder: &PhotoFolder, still: &StandsStill) -> Result<
 
 /// Adds what lies over all of `pictures` to the masks of each: unlike what is behind, it is hidden in none.
 fn add_overlay([width, height]: [u32; 2], pictures: &Pictures, masks: &mut BTreeMap<usize, Vec<bool>>) {
-    let mut lies = overlay(width as usize, height as usize, &pictures.values().collect::<Vec<_>>());
+    let overlay = Overlay::of(width as usize, height as usize, &pictures.values().collect::<Vec<_>>());
+    let mut lies = overlay.pixels();
     for (at, lies) in lies.iter_mut().enumerate() {
         let still = masks.values().filter(|mask| mask[at]).count();
         *lies |= still > 0 && 2 * still >= masks.len();

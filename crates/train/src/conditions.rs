@@ -285,7 +285,7 @@ impl Trainer {
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use super::*;
     use crate::Recipe;
     use crate::recipe::Knob;
@@ -297,7 +297,7 @@ mod tests {
     use std::sync::Arc;
 
     /// One grey photograph of `channels` channels, with or without points.
-    fn dataset(channels: u32, points: bool) -> Arc<Dataset> {
+    pub(crate) fn dataset(channels: u32, points: bool) -> Arc<Dataset> {
         let view = View::new(
             "a",
             Camera::new(

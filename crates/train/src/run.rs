@@ -294,6 +294,39 @@ fn held_out_psnr(trainer: &Trainer, views: &[usize], observers: &[&mut dyn Obser
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::conditions::tests::dataset;
+    use crate::{Recipe, TrainOptions};
+
+    /// What was decided.
+    #[derive(Default)]
+    struct Told(Vec<String>);
+
+    impl Observer for Told {
+        fn on_event(&mut self, event: &Event, _: &Trainer) -> Signal {
+            if let Event::Decided { message } = event {
+                self.0.push(message.clone());
+            }
+            Signal::Continue
+        }
+    }
+
+    #[test]
+    fn a_budget_for_more_steps_than_photographs_determine_is_not_used_up() {
+        let recipe = Recipe::parse("fast", Recipe::built_in("fast").unwrap(), &[]).unwrap();
+        let mut trainer = Trainer::new(dataset(3, true), recipe, TrainOptions::default()).unwrap();
+        let limits = RunLimits {
+            budget: Some(3600.0),
+            ..RunLimits::default()
+        };
+        let mut told = Told::default();
+        let reason = run(&mut trainer, &limits, &mut [&mut told]).unwrap();
+        assert_eq!((trainer.clock.step, reason.as_str()), (600, "recipe complete"));
+        assert!(
+            told.0.iter().any(|line| line.contains("of 3600 were needed")),
+            "{:?}",
+            told.0
+        );
+    }
 
     #[test]
     fn an_evaluation_during_training_has_few_views_from_all_over() {

@@ -60,7 +60,7 @@ const MANY: usize = 50;
 const SPARSE: f64 = 8.0;
 /// Of closer photographs, the steps of each are limited in inverse proportion to the degrees between them, beyond the usual number of steps. `fast` at 320 pixels with 1,000, 2,000, 4,000
 /// and 8,000 steps: a bust, 22 photographs 6.5 degrees apart, 25.77, 25.46, 24.35, 23.83; a locomotive, 18, 4.5 degrees, 23.86, 24.23, 24.10, 23.45; a toy, 17, 3.3 degrees,
-/// 30.27, 31.42, 31.16, 30.93; fern, 17, 2.1 degrees, 30.20, 30.65, 30.52, 30.23; but a figure, 17, 0.56 degrees, 26.38, 26.62, 26.74, 26.79; a corridor, 16, 0.06 degrees, 37.41, 38.44 with
+/// 30.27, 31.42, 31.16, 30.93; fern, 17, 2.1 degrees, 30.20, 30.65, 30.52, 30.23; but a drone's film, 17, 0.56 degrees, 26.38, 26.62, 26.74, 26.79; a corridor, 16, 0.06 degrees, 37.41, 38.44 with
 /// the last two. This is the angle from which on there is no limit worth having.
 const CLOSEST: f64 = 0.01;
 
@@ -75,11 +75,11 @@ fn is_cut_out(photo: &Photo) -> bool {
         (left, right) = (left.min(x), right.max(x + 1));
         (top, bottom) = (top.min(y), bottom.max(y + 1));
     }
-    let is_object = |kept: f64| kept < RECTANGLE * ((right - left) * (bottom - top)) as f64;
-    kept > 0
-        && is_object(f64::from(kept))
-        && f64::from(kept) <= KEPT * mask.len() as f64
-        && photo.border_left_out() >= BORDER_LEFT_OUT
+    if kept == 0 {
+        return false;
+    }
+    let (kept, rectangle) = (f64::from(kept), ((right - left) * (bottom - top)) as f64);
+    kept < RECTANGLE * rectangle && kept <= KEPT * mask.len() as f64 && photo.border_left_out() >= BORDER_LEFT_OUT
 }
 
 /// The mean colour, in \[0, 1\], of the smooth region at the upper edge of `photo`, if it is large enough for a sky.

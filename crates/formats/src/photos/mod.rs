@@ -111,6 +111,11 @@ pub struct PhotoFolder {
 }
 
 impl PhotoFolder {
+    /// Names of all files that are not used, and why.
+    pub fn unused(&self) -> impl Iterator<Item = &(String, String)> {
+        self.left_out.iter().chain(&self.repeated)
+    }
+
     /// The number of each photograph's group: those of a group have the same make, model, focal length and size.
     pub fn groups(&self) -> Vec<usize> {
         let mut known = Vec::new();

@@ -54,12 +54,8 @@ impl Sources {
         });
         entries.sort();
         let (photos, films) = (photo_files(path), entries.iter().filter(|entry| is_film(entry)));
-        let is_live = |film: &PathBuf| {
-            photos.len() >= MIN_PHOTOS
-                && photos
-                    .iter()
-                    .any(|photo| photo.with_extension("") == film.with_extension(""))
-        };
+        let stems: HashSet<PathBuf> = photos.iter().map(|photo| photo.with_extension("")).collect();
+        let is_live = |film: &PathBuf| photos.len() >= MIN_PHOTOS && stems.contains(&film.with_extension(""));
         let (live, films): (Vec<_>, Vec<_>) = films.cloned().partition(is_live);
         self.live.extend(live);
         self.beside.extend(films);
@@ -140,7 +136,7 @@ impl Capture {
             repeated.extend(films.into_iter().map(|film| (name(film), why.to_owned())));
         };
         unused(sources.live, "a film that was taken with the photograph of its name");
-        match sources.folders.is_empty() || film::can_be_read() {
+        match sources.beside.is_empty() || sources.folders.is_empty() || film::can_be_read() {
             true => sources.films.append(&mut sources.beside),
             false => unused(
                 sources.beside,

@@ -94,9 +94,7 @@ fn report(out: &Path, folder: &PhotoFolder) -> Result<PoseReport, RunError> {
         .filter(|photo| !images.iter().any(|image| image.name == photo.name));
     let absent = absent.map(|photo| (photo.name.clone(), reason.clone()));
     let mut left_out: Vec<LeftOutPhoto> = folder
-        .left_out
-        .iter()
-        .chain(&folder.repeated)
+        .unused()
         .cloned()
         .chain(absent)
         .map(|(name, reason)| LeftOutPhoto { name, reason })

@@ -197,7 +197,7 @@ fn finding(diagnosis: &Diagnosis, names: &[String], model: Option<&Model>) -> Fi
 /// Pictures that cannot be read have no other faults; those with the same reason are one finding.
 fn add_unreadable(report: &mut DoctorReport, folder: &PhotoFolder, work: &Work) {
     report.photos += folder.left_out.len();
-    let unused = folder.left_out.iter().chain(&folder.repeated).chain(work.undecodable());
+    let unused = folder.unused().chain(work.undecodable());
     let mut by_reason: Vec<(&str, Vec<String>)> = Vec::new();
     for (name, reason) in unused {
         match by_reason.iter_mut().find(|(other, _)| other == reason) {

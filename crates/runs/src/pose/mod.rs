@@ -404,9 +404,7 @@ fn check_enough(paths: &[PathBuf], folder: &PhotoFolder) -> Result<(), RunError>
         return Ok(());
     }
     let reasons: String = folder
-        .left_out
-        .iter()
-        .chain(&folder.repeated)
+        .unused()
         .take(3)
         .map(|(name, reason)| format!("; {name}: {reason}"))
         .collect();

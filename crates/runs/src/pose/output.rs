@@ -190,7 +190,7 @@ fn colmap_camera(id: u32, camera: &DCamera) -> ColmapCamera {
 /// All but the times and warnings.
 pub(super) fn report(folder: &PhotoFolder, work: &Work, infos: &[PhotoInfo], found: &Reconstruction) -> PoseReport {
     let model = &found.models[0];
-    let unused = folder.left_out.iter().chain(&folder.repeated).chain(work.undecodable());
+    let unused = folder.unused().chain(work.undecodable());
     let mut left_out: Vec<(String, String)> = unused.cloned().collect();
     left_out.extend(
         found

@@ -195,9 +195,14 @@ fn bars_in(size: [u32; 2], pictures: &Pictures) -> Option<Vec<bool>> {
     (bars != [0; 4]).then(|| (0..width * height).map(is_bar).collect())
 }
 
+/// What may lie over `pictures`.
+fn overlay([width, height]: [u32; 2], pictures: &Pictures) -> Overlay<'_> {
+    Overlay::of(width as usize, height as usize, &pictures.values().collect::<Vec<_>>())
+}
+
 /// What lies over `pictures`, if that is sure and little.
-fn writing_over([width, height]: [u32; 2], pictures: &Pictures) -> Option<Vec<bool>> {
-    let overlay = Overlay::of(width as usize, height as usize, &pictures.values().collect::<Vec<_>>());
+fn writing_over(size: [u32; 2], pictures: &Pictures) -> Option<Vec<bool>> {
+    let overlay = overlay(size, pictures);
     let lies = overlay.is_sure().then(|| overlay.pixels())?;
     (share(&lies) as f64 <= LIES_OVER * lies.len() as f64).then_some(lies)
 }
@@ -248,9 +253,8 @@ fn find(matched: &Matched, folder: &PhotoFolder, still: &StandsStill) -> Result<
 }
 
 /// Adds what lies over all of `pictures` to the masks of each: unlike what is behind, it is hidden in none.
-fn add_overlay([width, height]: [u32; 2], pictures: &Pictures, masks: &mut BTreeMap<usize, Vec<bool>>) {
-    let overlay = Overlay::of(width as usize, height as usize, &pictures.values().collect::<Vec<_>>());
-    let mut lies = overlay.pixels();
+fn add_overlay(size: [u32; 2], pictures: &Pictures, masks: &mut BTreeMap<usize, Vec<bool>>) {
+    let mut lies = overlay(size, pictures).pixels();
     for (at, lies) in lies.iter_mut().enumerate() {
         let still = masks.values().filter(|mask| mask[at]).count();
         *lies |= still > 0 && 2 * still >= masks.len();

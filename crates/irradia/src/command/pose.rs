@@ -9,7 +9,8 @@ use indicatif::{ProgressBar, ProgressStyle};
 use irradia_runs::formats::DatasetFormat;
 use irradia_runs::scene::Dataset;
 use irradia_runs::{
-    ENOUGH_POSED, Finding, KnownDistance, Mapper, PoseInput, PoseProgress, PoseReport, TrainInput, is_capture, pose,
+    ENOUGH_POSED, Finding, KnownDistance, Mapper, PoseInput, PoseProgress, PoseReport, TrainInput, by_reason,
+    is_capture, pose,
 };
 use std::collections::HashSet;
 use std::io::IsTerminal;
@@ -194,18 +195,13 @@ fn pose_with_progress(input: &PoseInput) -> Result<PoseReport> {
             .any(|f| f.kind == "left-out" && f.photos == [name])
     };
     // One line a reason.
-    let mut left_out: Vec<(&str, &str, usize)> = Vec::new();
-    for left in report.left_out.iter().filter(|left| unread(&left.name)) {
-        match left_out.iter_mut().find(|(_, reason, _)| *reason == left.reason) {
-            Some((_, _, others)) => *others += 1,
-            None => left_out.push((&left.name, &left.reason, 0)),
-        }
-    }
-    for (first, reason, others) in left_out {
-        match others {
+    let told = report.left_out.iter().filter(|left| unread(&left.name));
+    for (reason, names) in by_reason(told.map(|left| (&left.name[..], &left.reason[..]))) {
+        let first = names[0];
+        match names.len() - 1 {
             0 => note(format_args!("left out: {first}: {reason}")),
             1 => note(format_args!("left out: {first} and 1 other: {reason}")),
-            _ => note(format_args!("left out: {first} and {others} others: {reason}")),
+            others => note(format_args!("left out: {first} and {others} others: {reason}")),
         }
     }
     tell_findings(&report.findings, |line| {

@@ -2,7 +2,7 @@
 
 use super::capture::Capture;
 use super::stages::{Work, in_rgb};
-use super::{PoseProgress, check_enough};
+use super::{PoseProgress, by_reason, check_enough};
 use crate::RunError;
 use crate::folder::to_json;
 use irradia_formats::{PhotoFolder, write_atomic, write_png};
@@ -198,28 +198,24 @@ fn finding(diagnosis: &Diagnosis, names: &[String], model: Option<&Model>) -> Fi
 fn add_unreadable(report: &mut DoctorReport, folder: &PhotoFolder, work: &Work) {
     report.photos += folder.left_out.len();
     let unused = folder.unused().chain(work.undecodable());
-    let mut by_reason: Vec<(&str, Vec<String>)> = Vec::new();
-    for (name, reason) in unused {
-        match by_reason.iter_mut().find(|(other, _)| other == reason) {
-            Some((_, names)) => names.push(name.clone()),
-            None => by_reason.push((reason, vec![name.clone()])),
-        }
-    }
-    report.findings.extend(by_reason.into_iter().map(|(reason, names)| {
-        let who = match &names[..] {
-            [one] => format!("{one} is"),
-            [first, others @ ..] => format!("{first} and {} more are", others.len()),
-            [] => unreachable!("a reason has a name"),
-        };
-        Finding {
-            kind: irradia_sfm::doctor::Kind::LeftOut.name(),
-            sentence: format!("{who} left out: {reason}"),
-            photos: names,
-            sides: Vec::new(),
-            shoot: Vec::new(),
-            pictured: Vec::new(),
-        }
-    }));
+    let unused = unused.map(|(name, reason)| (name.as_str(), reason.as_str()));
+    report
+        .findings
+        .extend(by_reason(unused).into_iter().map(|(reason, names)| {
+            let who = match &names[..] {
+                [one] => format!("{one} is"),
+                [first, others @ ..] => format!("{first} and {} more are", others.len()),
+                [] => unreachable!("a reason has a name"),
+            };
+            Finding {
+                kind: irradia_sfm::doctor::Kind::LeftOut.name(),
+                sentence: format!("{who} left out: {reason}"),
+                photos: names.into_iter().map(str::to_owned).collect(),
+                sides: Vec::new(),
+                shoot: Vec::new(),
+                pictured: Vec::new(),
+            }
+        }));
 }
 
 fn plan(model: &Model, infos: &[PhotoInfo]) -> Plan {

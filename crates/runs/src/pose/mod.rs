@@ -189,6 +189,18 @@ pub struct LeftOutPhoto {
     pub reason: String,
 }
 
+/// Names with the same reason together, each `(name, reason)` of `named`; in the order of the first of each.
+pub fn by_reason<'a>(named: impl Iterator<Item = (&'a str, &'a str)>) -> Vec<(&'a str, Vec<&'a str>)> {
+    let mut reasons: Vec<(&str, Vec<&str>)> = Vec::new();
+    for (name, reason) in named {
+        match reasons.iter_mut().find(|(other, _)| *other == reason) {
+            Some((_, names)) => names.push(name),
+            None => reasons.push((reason, vec![name])),
+        }
+    }
+    reasons
+}
+
 /// A camera of the largest model.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct CameraReport {

@@ -14,12 +14,54 @@ fn picture(width: u32, height: u32, red: u8) -> image::RgbImage {
 /// A JPEG whose EXIF block holds nothing but its orientation.
 fn save_turned(path: &Path, picture: &image::RgbImage, orientation: u8) {
     picture.save(path).unwrap();
-    let mut exif = b"\xff\xe1\x00\x22Exif\0\0II\x2a\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0".to_vec();
-    exif.extend([orientation, 0, 0, 0, 0, 0, 0, 0]);
+    let mut block = b"II\x2a\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0".to_vec();
+    block.extend([orientation, 0, 0, 0, 0, 0, 0, 0]);
+    add_exif(path, &block);
+}
+
+/// Writes `block` as EXIF into the JPEG at `path`.
+fn add_exif(path: &Path, block: &[u8]) {
+    let length = (block.len() + 8) as u16;
+    let mut exif = [&b"\xff\xe1"[..], &length.to_be_bytes(), b"Exif\0\0", block].concat();
     let mut bytes = fs::read(path).unwrap();
     exif.extend(bytes.split_off(2));
     bytes.extend(exif);
     fs::write(path, bytes).unwrap();
+}
+
+#[test]
+fn two_forms_of_one_photograph_count_once() {
+    use exif::{Field, In, Tag, Value};
+    let folder = tempfile::tempdir().unwrap();
+    let save = |name: &str, red: u8, time: &str| {
+        let path = folder.path().join(name);
+        picture(40, 30, red).save(&path).unwrap();
+        let field = Field {
+            tag: Tag::DateTimeOriginal,
+            ifd_num: In::PRIMARY,
+            value: Value::Ascii(vec![time.into()]),
+        };
+        let mut writer = exif::experimental::Writer::new();
+        writer.push_field(&field);
+        let mut block = std::io::Cursor::new(Vec::new());
+        writer.write(&mut block, false).unwrap();
+        add_exif(&path, &block.into_inner());
+    };
+    save("1.jpeg", 10, "2026:05:31 12:00:00");
+    save("1.jpg", 11, "2026:05:31 12:00:00");
+    // The same name at another time, and another name at the same time.
+    save("2.jpeg", 12, "2026:05:31 12:00:00");
+    save("2.jpg", 13, "2026:05:31 12:00:01");
+    // Nothing tells that these are one.
+    picture(40, 30, 14).save(folder.path().join("3.jpg")).unwrap();
+    picture(40, 30, 15).save(folder.path().join("3.png")).unwrap();
+    let found = read_photo_folder(folder.path()).unwrap();
+    let names: Vec<&str> = found.photos.iter().map(|photo| photo.name.as_str()).collect();
+    assert_eq!(names, ["1.jpeg", "2.jpeg", "2.jpg", "3.jpg", "3.png"]);
+    assert_eq!(
+        found.repeated,
+        [("1.jpg".to_owned(), "another form of 1.jpeg".to_owned())]
+    );
 }
 
 #[test]

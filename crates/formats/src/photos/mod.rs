@@ -106,7 +106,8 @@ pub struct PhotoFolder {
     pub photos: Vec<PhotoEntry>,
     /// Names of the other pictures, and why they are not used.
     pub left_out: Vec<(String, String)>,
-    /// Names of files that show what a photograph shows already, such as copies and cameras' raw files beside their JPEG, and what they are: nothing is lost with them.
+    /// Names of files that show what a photograph shows already, such as copies, cameras' raw files beside their JPEG and a HEIC beside the JPEG
+    /// made of it, and what they are: nothing is lost with them.
     pub repeated: Vec<(String, String)>,
 }
 
@@ -208,16 +209,25 @@ pub fn read_photo_folders(folders: &[impl AsRef<Path>]) -> Result<PhotoFolder, F
         })
         .collect();
     let mut first_with: BTreeMap<u64, String> = BTreeMap::new();
+    let mut first_taken: HashMap<(PathBuf, String), String> = HashMap::new();
     for (name, entry) in entries {
-        match entry {
-            Ok(photo) => match first_with.get(&photo.hash) {
-                Some(first) => found.repeated.push((name, format!("a copy of {first}, byte for byte"))),
-                None => {
-                    first_with.insert(photo.hash, name);
-                    found.photos.push(photo);
-                }
-            },
-            Err(reason) => found.left_out.push((name, reason)),
+        let photo = match entry {
+            Ok(photo) => photo,
+            Err(reason) => {
+                found.left_out.push((name, reason));
+                continue;
+            }
+        };
+        let time = photo.tags.time.clone();
+        let taken = time.map(|time| (photo.path.with_extension(""), time));
+        if let Some(first) = first_with.get(&photo.hash) {
+            found.repeated.push((name, format!("a copy of {first}, byte for byte")));
+        } else if let Some(first) = taken.as_ref().and_then(|taken| first_taken.get(taken)) {
+            found.repeated.push((name, format!("another form of {first}")));
+        } else {
+            first_with.insert(photo.hash, name.clone());
+            first_taken.extend(taken.map(|taken| (taken, name)));
+            found.photos.push(photo);
         }
     }
     Ok(found)

@@ -81,9 +81,12 @@ pub fn reconstruct(
     let pairs = &still::without(photos, features, pairs)[..];
     let mut known = known_cameras(photos);
     let mut found = mapped(photos, features, pairs, &known, options, progress);
-    let in_doubt = found.apart.is_some() || (found.registered() as f64) < IN_DOUBT * photos.len() as f64;
+    let in_doubt = found.apart.is_some()
+        || (found.registered() as f64) < IN_DOUBT * photos.len() as f64
+        || is_far_from_first_focals(&found);
     if options.narrow
         && in_doubt
+        && !zoom::is_confirmed(photos, features, &found.models)
         && let Some(narrow) = narrow(photos, &found.cameras)
     {
         let again = mapped(photos, features, pairs, &narrow, options, progress);
@@ -186,6 +189,13 @@ fn narrow(photos: &[PhotoInfo], cameras: &Cameras) -> Option<Vec<Option<(DCamera
         Some((DCamera::centered(camera.width, camera.height, focal), Source::Guess))
     };
     Some(cameras.iter().map(camera).collect())
+}
+
+/// Whether the largest model found a focal length far from where it began.
+fn is_far_from_first_focals(found: &Reconstruction) -> bool {
+    let first = found.models.first().map_or(&[][..], |model| &model.cameras);
+    let mut of_both = first.iter().zip(&found.cameras);
+    of_both.any(|(camera, (began, _))| camera.is_some_and(|c| refine::are_far([c.focal(), began.focal()])))
 }
 
 /// Photographs of the largest model, and what its points explain of them.

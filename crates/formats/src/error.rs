@@ -41,6 +41,12 @@ pub enum FormatError {
         /// The known extensions.
         known: String,
     },
+    /// A file, where a folder is needed.
+    #[error(
+        "{} is a file: name the folder of a dataset or of photographs; an archive must be unpacked first",
+        .0.display()
+    )]
+    NotAFolder(PathBuf),
     /// The folder is not a dataset, or not of the requested kind.
     #[error("{}: no dataset found there; expected {expected}", path.display())]
     NotADataset {

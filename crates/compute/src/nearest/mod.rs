@@ -94,16 +94,20 @@ trait Lanes: Copy {
 /// Words of `vectors`, `[group][step][member]`, each group padded to `members` with zeros.
 fn pack<L: Lanes>(vectors: &[[u8; BYTES]], members: usize, offset: bool) -> Vec<u32> {
     let flip = if offset { 0x80 } else { 0 };
-    let mut words = Vec::with_capacity(vectors.len().next_multiple_of(members) * BYTES / L::STEP);
-    for group in vectors.chunks(members) {
-        for step in (0..BYTES).step_by(L::STEP) {
-            words.extend((0..members).map(|member| {
-                let byte = |i: usize| u32::from(group.get(member).map_or(0, |vector| vector[step + i]) ^ flip);
-                match L::STEP {
-                    4 => byte(0) | byte(1) << 8 | byte(2) << 16 | byte(3) << 24,
-                    _ => byte(0) | byte(1) << 16,
-                }
-            }));
+    // Of whole words: byte by byte, this took half as long as the search among a thousand.
+    let word = |bytes: &[u8]| match *bytes {
+        [a, b] => u32::from(a ^ flip) | u32::from(b ^ flip) << 16,
+        [a, b, c, d] => u32::from_le_bytes([a, b, c, d]) ^ u32::from_le_bytes([flip; 4]),
+        _ => unreachable!("a step has 2 or 4 bytes"),
+    };
+    let of_group = members * BYTES / L::STEP;
+    let mut words = vec![word(&[0; BYTES][..L::STEP]); vectors.len().div_ceil(members) * of_group];
+    for (group, words) in vectors.chunks(members).zip(words.chunks_exact_mut(of_group)) {
+        for (member, vector) in group.iter().enumerate() {
+            let of_member = words[member..].iter_mut().step_by(members);
+            for (to, bytes) in of_member.zip(vector.chunks_exact(L::STEP)) {
+                *to = word(bytes);
+            }
         }
     }
     words

@@ -285,10 +285,13 @@ pub fn read_dataset(path: &Path, options: &DatasetOptions) -> Result<Dataset, Fo
     };
     let Some(format) = format else {
         // For a missing folder, report the system's error.
-        std::fs::metadata(path).map_err(|source| FormatError::Read {
+        let found = std::fs::metadata(path).map_err(|source| FormatError::Read {
             path: path.to_owned(),
             source,
         })?;
+        if found.is_file() {
+            return Err(FormatError::NotAFolder(path.to_owned()));
+        }
         let asked = options
             .format
             .map_or(DatasetFormat::ALL.to_vec(), |format| vec![format]);

@@ -112,10 +112,14 @@ fn what_cannot_be_posed_is_refused_in_one_line() {
         fs::write(here("text").join(name), "no picture").expect("written");
     }
     fs::write(here("film.mp4"), "no film").expect("written");
+    fs::write(here("film.zip"), "PK").expect("written");
     irradia(folder.path(), "pose none --out x").refused(1, &["none"]);
     irradia(folder.path(), "pose empty --out x").refused(2, &["0 readable photographs"]);
     irradia(folder.path(), "pose text --out x").refused(2, &["a.jpg", "not a readable"]);
     irradia(folder.path(), "pose film.mp4 --out x").refused(2, &["film.mp4", "ffmpeg"]);
+    for command in ["pose film.zip --out x", "doctor film.zip", "train film.zip --out run"] {
+        irradia(folder.path(), command).refused(1, &["film.zip is a file", "unpacked"]);
+    }
     irradia(folder.path(), "pose text --out x --max-features 0").refused(2, &["--max-features"]);
     irradia(folder.path(), "train text --out run").refused(2, &["a.jpg"]);
     irradia(folder.path(), "train empty --out run").refused(1, &["no dataset found", "COLMAP"]);

@@ -5,7 +5,7 @@ use super::{MIN_PHOTOS, PoseProgress, film, is_film};
 use crate::RunError;
 use glam::{DQuat, DVec3};
 use irradia_formats::{
-    DatasetFormat, PanoramaFace, PhotoEntry, PhotoFolder, find_panoramas, photo_files, read_photo_folder,
+    DatasetFormat, FormatError, PanoramaFace, PhotoEntry, PhotoFolder, find_panoramas, photo_files, read_photo_folder,
     read_photo_folders, write_atomic,
 };
 use irradia_sfm::geometry::camera::DCamera;
@@ -41,6 +41,9 @@ impl Sources {
         if is_film(path) {
             self.films.push(path.to_owned());
             return Ok(());
+        }
+        if path.is_file() {
+            return Err(FormatError::NotAFolder(path.to_owned()).into());
         }
         let read = RunError::io("read", path);
         let mut entries: Vec<PathBuf> = match fs::read_dir(path) {

@@ -61,10 +61,9 @@ impl<'a> Matched<'a> {
         progress: &(dyn Fn(PoseProgress) + Sync),
     ) -> Result<Attempt<'a>, RunError> {
         let Self { work, infos, pairs } = &mut self;
-        progress(PoseProgress::Stage {
-            name: "poses",
-            of: work.photos().len(),
-        });
+        let of = work.photos().len();
+        let begin = || progress(PoseProgress::Stage { name: "poses", of });
+        begin();
         let mut tell = |event| {
             if let Progress::Registered { photos, .. } = event {
                 progress(PoseProgress::Done(photos));
@@ -85,6 +84,7 @@ impl<'a> Matched<'a> {
             let mut all: Vec<[u32; 2]> = pairs.iter().map(|pair| pair.photos).chain(unmatched).collect();
             all.sort_unstable();
             *pairs = work.matches_of(all)?;
+            begin();
             reconstruction = reconstruct(infos, work.features(), pairs, &options, &mut tell);
         }
         clock.end("poses");

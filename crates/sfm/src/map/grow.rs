@@ -93,7 +93,7 @@ pub(super) fn model<'a>(
                 grown = free;
             }
         }
-        outcomes.push(Outcome::of(&grown, open));
+        outcomes.push(Outcome::of(&grown, is_doubtful(&grown)));
         in_doubt |= is_doubtful(&grown);
         let size = |model: &Working| match in_doubt {
             true => model.used_count(),
@@ -122,13 +122,13 @@ pub(super) fn model<'a>(
 struct Outcome {
     /// `[photos]` which have a pose.
     posed: Vec<bool>,
-    /// `[groups]` of cameras with photographs; none where all focal lengths are known beforehand.
+    /// `[groups]` of cameras with photographs; none where they leave no doubt.
     focals: Vec<Option<f64>>,
 }
 
 impl Outcome {
-    fn of(model: &Working, open: bool) -> Self {
-        let groups = 0..if open { model.cameras.len() } else { 0 };
+    fn of(model: &Working, in_doubt: bool) -> Self {
+        let groups = 0..if in_doubt { model.cameras.len() } else { 0 };
         let focal = |group| (model.registered_of(group) > 0).then(|| model.cameras[group].focal());
         Self {
             posed: model.poses.iter().map(Option::is_some).collect(),
@@ -377,7 +377,6 @@ mod tests {
         assert!(model.is_like(&of(&[Some(1160.0), Some(1239.0), Some(900.0)])));
         assert!(!model.is_like(&of(&[Some(1160.0), Some(1300.0), None])));
         assert!(!of(&[Some(9300.0)]).is_like(&of(&[Some(8446.0)])));
-        // Known beforehand.
-        assert!(of(&[]).is_like(&of(&[])));
+        assert!(of(&[]).is_like(&of(&[])), "no doubt");
     }
 }

@@ -1,5 +1,6 @@
 //! Folders of photographs without poses.
 
+use exif::{Field, In, Tag, Value};
 use irradia_formats::{ColmapCamera, ColmapImage, ColmapModel, PosedImage, write_colmap};
 use irradia_formats::{
     DatasetOptions, find_panoramas, photo_files, read_dataset, read_photo_folder, read_photo_folders,
@@ -14,9 +15,25 @@ fn picture(width: u32, height: u32, red: u8) -> image::RgbImage {
 /// A JPEG whose EXIF block holds nothing but its orientation.
 fn save_turned(path: &Path, picture: &image::RgbImage, orientation: u8) {
     picture.save(path).unwrap();
-    let mut block = b"II\x2a\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0".to_vec();
-    block.extend([orientation, 0, 0, 0, 0, 0, 0, 0]);
-    add_exif(path, &block);
+    add_exif(
+        path,
+        &exif_block(&[(Tag::Orientation, Value::Short(vec![orientation.into()]))]),
+    );
+}
+
+/// An EXIF block with these tags.
+fn exif_block(tags: &[(Tag, Value)]) -> Vec<u8> {
+    let field = |(tag, value): &(Tag, Value)| Field {
+        tag: *tag,
+        ifd_num: In::PRIMARY,
+        value: value.clone(),
+    };
+    let fields: Vec<Field> = tags.iter().map(field).collect();
+    let mut writer = exif::experimental::Writer::new();
+    fields.iter().for_each(|field| writer.push_field(field));
+    let mut block = std::io::Cursor::new(Vec::new());
+    writer.write(&mut block, false).unwrap();
+    block.into_inner()
 }
 
 /// Writes `block` as EXIF into the JPEG at `path`.
@@ -31,21 +48,12 @@ fn add_exif(path: &Path, block: &[u8]) {
 
 #[test]
 fn two_forms_of_one_photograph_count_once() {
-    use exif::{Field, In, Tag, Value};
     let folder = tempfile::tempdir().unwrap();
     let save = |name: &str, red: u8, time: &str| {
         let path = folder.path().join(name);
         picture(40, 30, red).save(&path).unwrap();
-        let field = Field {
-            tag: Tag::DateTimeOriginal,
-            ifd_num: In::PRIMARY,
-            value: Value::Ascii(vec![time.into()]),
-        };
-        let mut writer = exif::experimental::Writer::new();
-        writer.push_field(&field);
-        let mut block = std::io::Cursor::new(Vec::new());
-        writer.write(&mut block, false).unwrap();
-        add_exif(&path, &block.into_inner());
+        let taken = (Tag::DateTimeOriginal, Value::Ascii(vec![time.into()]));
+        add_exif(&path, &exif_block(&[taken]));
     };
     save("1.jpeg", 10, "2026:05:31 12:00:00");
     save("1.jpg", 11, "2026:05:31 12:00:00");
@@ -145,25 +153,17 @@ fn other_kinds_of_pictures_and_masks_are_read() {
 
 #[test]
 fn phones_photographs_are_read_with_what_the_camera_wrote() {
-    use exif::{Field, In, Tag, Value};
     let folder = tempfile::tempdir().unwrap();
-    let mut writer = exif::experimental::Writer::new();
     // The turn stands in the container as well: what EXIF says must not turn the picture once more.
-    let tags = [(Tag::FocalLengthIn35mmFilm, 27), (Tag::Orientation, 6)].map(|(tag, value)| Field {
-        tag,
-        ifd_num: In::PRIMARY,
-        value: Value::Short(vec![value]),
-    });
-    tags.iter().for_each(|tag| writer.push_field(tag));
-    let mut block = std::io::Cursor::new(Vec::new());
-    writer.write(&mut block, false).unwrap();
+    let tags = [(Tag::FocalLengthIn35mmFilm, 27), (Tag::Orientation, 6)];
+    let block = exif_block(&tags.map(|(tag, value)| (tag, Value::Short(vec![value]))));
     let seen = picture(40, 30, 10);
     let mut pixels = heifer::Image::filled(40, 30, 8, [0, 0, 0, 255]);
     for (to, from) in pixels.data.chunks_exact_mut(4).zip(seen.pixels()) {
         (0..3).for_each(|channel| to[channel] = from.0[channel].into());
     }
     let metadata = heifer::Metadata {
-        exif: Some(block.into_inner()),
+        exif: Some(block),
         ..heifer::Metadata::default()
     };
     let bytes = heifer::encode_with_metadata(&pixels, &metadata, &heifer::EncodeOptions::default()).unwrap();

@@ -7,6 +7,7 @@ use rayon::prelude::*;
 /// Pictures from which on it can be told, and those that are examined, at most, evenly chosen.
 const FEWEST: usize = 8;
 const EXAMINED: usize = 48;
+
 /// An edge of what lies over the pictures.
 #[derive(Clone, Copy)]
 struct Edge {
@@ -15,6 +16,7 @@ struct Edge {
     /// Part of the pictures that have this edge, at least half as steep.
     agree: f64,
 }
+
 /// Half-transparent white writing across a bright wall has slopes of 8 to 50.
 const EDGE: Edge = Edge { slope: 6.0, agree: 0.8 };
 /// An edge that is hardly one of the scene, and the part of the pixels that have one where something lies over them: 0.2 to 1.3 % with a watermark, a date or a logo, 0.65 %

@@ -52,9 +52,6 @@ pub(crate) fn list_files(folder: &Path, keep: impl Fn(&Path) -> bool) -> Result<
         path: folder.to_owned(),
         source,
     };
-    if folder.is_file() {
-        return Err(FormatError::NotAFolder(folder.to_owned()));
-    }
     let mut files = Vec::new();
     for entry in std::fs::read_dir(folder).map_err(read_error)? {
         let path = entry.map_err(read_error)?.path();

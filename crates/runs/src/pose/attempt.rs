@@ -17,7 +17,7 @@ const FEW: usize = 25;
 
 /// Up to so many photographs, as many as are chosen of a film, are matched along epipolar lines: of 984 frames of two films, that took seven minutes for a model of 454 in place
 /// of 507, since what joins their parts was not filmed.
-pub(super) const MOST_GUIDED: usize = 300;
+const MOST_GUIDED: usize = 300;
 
 /// Photographs with features and matches.
 pub(super) struct Matched<'a> {
@@ -131,6 +131,11 @@ impl<'a> Attempt<'a> {
     }
 }
 
+/// Whether so many photographs are matched along epipolar lines in a second attempt.
+pub(super) fn may_be_guided(photos: usize) -> bool {
+    photos <= MOST_GUIDED
+}
+
 /// How many of so many photographs should have a pose.
 fn enough(photos: usize) -> usize {
     match photos {
@@ -154,7 +159,7 @@ fn models(
         ..*options
     };
     let found = reconstruct(infos, work.features(), pairs, &usual, tell);
-    if !is_second || found.registered() >= enough(infos.len()) || infos.len() > MOST_GUIDED {
+    if !is_second || found.registered() >= enough(infos.len()) || !may_be_guided(infos.len()) {
         return (found, usual);
     }
     let guided = MapOptions { guided: true, ..usual };

@@ -327,10 +327,9 @@ pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Resu
     let mut attempts = vec![attempt.report()];
     if is_new && let Some(work) = attempt.again(input.max_features, out) {
         let most = work.sift().max_features;
-        let guided = if folder.photos.len() > attempt::MOST_GUIDED {
-            ""
-        } else {
-            " and along epipolar lines"
+        let guided = match attempt::may_be_guided(folder.photos.len()) {
+            true => " and along epipolar lines",
+            false => "",
         };
         progress(PoseProgress::Warned(format!(
             "{} of {} photographs have a pose: trying again with up to {most} features of each, matched from the front{guided}",

@@ -28,11 +28,26 @@ const STEP: f64 = 1.07;
 const CANDIDATES: usize = 40;
 /// The cost at which metadata are still believed, by the lowest.
 const PRIOR: f64 = 1.25;
+/// Ratio up to which focal lengths of one camera in two models are alike. Two films of a car of bricks, models of 507 and 218 frames: 1.0001 and 1.009.
+const ALIKE: f64 = 1.02;
+/// Ratio between a focal length and its first value from which on they are far apart. Frames of a car of bricks: the pairs say 0.6 long sides; right models end at 1.0, wrong
+/// ones, flat and far away, at 3 to 8.
+const FAR: f64 = 3.0;
 /// Pairs that vote, those with most inliers, and points of each.
 const VOTERS: usize = 40;
 /// Pairs among which voters are found when all photographs have metadata.
 pub(super) const ENOUGH: usize = 120;
 const POINTS: usize = 300;
+
+/// Whether two models found one focal length, px, for a camera.
+pub(super) fn are_alike(a: f64, b: f64) -> bool {
+    a.max(b) < ALIKE * a.min(b)
+}
+
+/// Whether a focal length, px, ended far from where it began.
+pub(super) fn are_far(a: f64, b: f64) -> bool {
+    a.max(b) > FAR * a.min(b)
+}
 
 /// The camera of each group.
 pub(super) fn cameras(

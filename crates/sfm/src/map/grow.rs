@@ -1,6 +1,6 @@
 //! The growth of a model from a seed, photograph by photograph.
 
-use super::focal::Source;
+use super::focal::{Source, are_alike};
 use super::model::Working;
 use super::refine::Extent;
 use super::seed::seeds;
@@ -15,9 +15,6 @@ use glam::{DVec2, DVec3};
 /// Seeds tried for one model, and those among which they are selected.
 const SEEDS: usize = 12;
 const CANDIDATES: usize = 20 * SEEDS;
-/// Ratio of focal lengths up to which two models of the same search are alike: another seed of which both hold both photographs is skipped, since it would lead
-/// to the same once more. 984 frames of two films of a car of bricks, whose models explain 0.74 of what they show, took all seeds, a minute each, to end as the second.
-const ALIKE: f64 = 1.02;
 /// Fraction of what its photographs show that a model explains, where focal lengths are open. Those that are right explain 0.88 to
 /// 1.00 of six captures cut in ten ways, and 0.74 of a clock with three models; wrong ones 0.06 to 0.67.
 const EXPLAINED: f64 = 0.8;
@@ -63,6 +60,8 @@ pub(super) fn model<'a>(
         if left == 0 {
             break;
         }
+        // It would lead to the same once more. 984 frames of two films of a car of bricks, whose models explain 0.74 of what they show, took all seeds, a minute each, to end as the
+        // second.
         let holding: Vec<&Outcome> = (outcomes.iter())
             .filter(|outcome| outcome.holds(&pairs[seed]))
             .collect();
@@ -93,8 +92,9 @@ pub(super) fn model<'a>(
                 grown = free;
             }
         }
-        outcomes.push(Outcome::of(&grown, is_doubtful(&grown)));
-        in_doubt |= is_doubtful(&grown);
+        let doubtful = is_doubtful(&grown);
+        outcomes.push(Outcome::of(&grown, doubtful));
+        in_doubt |= doubtful;
         let size = |model: &Working| match in_doubt {
             true => model.used_count(),
             false => model.registered(),
@@ -142,7 +142,7 @@ impl Outcome {
 
     fn is_like(&self, other: &Self) -> bool {
         let both = self.focals.iter().zip(&other.focals).filter_map(|(a, b)| (*a).zip(*b));
-        both.into_iter().all(|(a, b)| a.max(b) < ALIKE * a.min(b))
+        both.into_iter().all(|(a, b)| are_alike(a, b))
     }
 }
 

@@ -195,7 +195,7 @@ fn narrow(photos: &[PhotoInfo], cameras: &Cameras) -> Option<Vec<Option<(DCamera
 fn is_far_from_first_focals(found: &Reconstruction) -> bool {
     let first = found.models.first().map_or(&[][..], |model| &model.cameras);
     let mut of_both = first.iter().zip(&found.cameras);
-    of_both.any(|(camera, (began, _))| camera.is_some_and(|c| refine::are_far([c.focal(), began.focal()])))
+    of_both.any(|(camera, (began, _))| camera.is_some_and(|c| focal::are_far(c.focal(), began.focal())))
 }
 
 /// Photographs of the largest model, and what its points explain of them.

@@ -1,6 +1,6 @@
 //! Bundle adjustments of a growing model.
 
-use super::focal::Source;
+use super::focal::{Source, are_far};
 use super::model::Working;
 use super::types::MapOptions;
 use crate::adjust::{
@@ -18,15 +18,6 @@ const ENOUGH: usize = 300;
 
 /// Registered photographs from which on the focal length of each camera is adjusted, even of one with a single photograph.
 const ANCHORED: usize = 5;
-
-/// Ratio between a focal length and its first value from which on they are far apart. Frames of a car of bricks: the pairs say 0.6 long sides; right models end at 1.0, wrong
-/// ones, flat and far away, at 3 to 8.
-const FAR: f64 = 3.0;
-
-/// Whether two focal lengths, px, of one camera are far apart.
-pub(super) fn are_far(focals: [f64; 2]) -> bool {
-    (focals[0] / focals[1]).ln().abs() > FAR.ln()
-}
 
 /// Squared error, px^2, that one deviation of an intrinsic parameter is worth: that of ten observations off by a
 /// pixel.
@@ -168,8 +159,10 @@ impl Working<'_> {
 
     /// Whether the focal length of a camera is far from where it began.
     pub(super) fn is_far_from_first_focals(&self) -> bool {
-        let focals = |group: usize| [self.cameras[group].focal(), self.first_focals[group]];
-        (0..self.cameras.len()).any(|group| are_far(focals(group)) && self.registered_of(group) > 0)
+        let far = |group: &usize| are_far(self.cameras[*group].focal(), self.first_focals[*group]);
+        (0..self.cameras.len())
+            .filter(far)
+            .any(|group| self.registered_of(group) > 0)
     }
 
     /// Multiplies the focal length of a group.

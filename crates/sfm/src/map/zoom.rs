@@ -11,6 +11,7 @@
 //! the focal lengths are 8 to 14 % from their median; in twenty captures as they are,
 //! by at most 8 % and 2.3 %.
 
+use super::focal::are_alike;
 use super::observable::determines_focal;
 use super::readjust::{self, posed};
 use super::types::{Model, PhotoInfo, Zoom};
@@ -26,8 +27,6 @@ const FARTHEST: f64 = 2.5;
 const ALONE: usize = 8;
 /// The same, by those of the largest model: for fewer the scene is not mapped again.
 const PART: f64 = 0.1;
-/// Ratio of the focal lengths of two models up to which one confirms the other. Two films of a car of bricks, models of 507 and 218 frames: 1.0001 and 1.009.
-const SAME: f64 = 1.02;
 /// Ratio of the focal lengths of two clusters, at least.
 const APART: f64 = 1.2;
 /// Distance between the two clusters, by that of their medians, at least. Along a drone's film of 90 frames without a zoom, focal lengths drift from 590 to 946 px, and the cost
@@ -132,7 +131,7 @@ pub(super) fn is_confirmed(photos: &[PhotoInfo], features: &[Features], models: 
         let found = free_focal(first, *group);
         let large = others.iter().filter(|other| other.registered() >= ALONE);
         let others = large.filter_map(|other| free_focal(other, *group));
-        found.is_some_and(|a| others.into_iter().any(|b| (b / a).ln().abs() < SAME.ln()))
+        found.is_some_and(|focal| others.into_iter().any(|other| are_alike(focal, other)))
     };
     let mut groups = 0..first.cameras.len();
     groups.any(|group| agrees(&group) && determines_focal(photos, features, first, group))

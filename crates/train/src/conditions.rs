@@ -57,7 +57,7 @@ const MANY: usize = 50;
 /// steps: fox, 24 photographs 7 degrees apart, 32.7 and 31.6; lund_door, 6 photographs 5 degrees apart, 35.3 and 34.3; fern, 6 photographs 2 degrees apart, 27.7
 /// and 26.7. With 90 steps for each photograph, 480 pixels: a book on a table, 6 photographs 9.4 degrees apart, 18.4 and 21.3; toys, 7 photographs 8.1 degrees
 /// apart, 24.0 and 24.2.
-const SPARSE: f64 = 8.0;
+pub(crate) const SPARSE: f64 = 8.0;
 /// Of closer photographs, the steps of each are limited in inverse proportion to the degrees between them, beyond the usual number of steps. `fast` at 320 pixels with 1,000, 2,000, 4,000
 /// and 8,000 steps: a bust, 22 photographs 6.5 degrees apart, 25.77, 25.46, 24.35, 23.83; a locomotive, 18, 4.5 degrees, 23.86, 24.23, 24.10, 23.45; a toy, 17, 3.3 degrees,
 /// 30.27, 31.42, 31.16, 30.93; fern, 17, 2.1 degrees, 30.20, 30.65, 30.52, 30.23; but a drone's film, 17, 0.56 degrees, 26.38, 26.62, 26.74, 26.79; a corridor, 16, 0.06 degrees, 37.41, 38.44 with

@@ -36,6 +36,7 @@ pub mod schedule;
 pub mod socket;
 mod spacing;
 mod splat_step;
+mod surroundings;
 pub mod tensor_file;
 pub mod times;
 mod trainer;

@@ -222,6 +222,9 @@ impl Trainer {
         let mut rng = Rng::new(self.options.seed ^ self.clock.step << 20, STREAM_DENSIFY);
         self.engine.edit_density(|state| {
             let cleared = self.free_space.clear(state);
+            if let Some(surroundings) = &self.surroundings {
+                surroundings.move_away(state);
+            }
             let limit = limit.min(self.memory.splats_at(intersections, state.len(), pixels));
             let change = match round.density {
                 DensityControl::Classic(knobs) => {

@@ -18,6 +18,7 @@ use crate::pixel_size::pixel_size;
 use crate::recipe::{Choice, Recipe};
 use crate::schedule::{Clock, StepMetrics, StepPlan, upcoming_views};
 use crate::socket::{Residual, Sky, Sockets};
+use crate::surroundings::Surroundings;
 use crate::times::Times;
 use crate::transients::Hidden;
 use cpu_time::ProcessTime;
@@ -165,6 +166,8 @@ pub struct Trainer {
     /// Steps of this process whose frames were read back from a GPU for their losses.
     pub(crate) read_for_losses: u64,
     pub(crate) free_space: FreeSpace,
+    /// Absent if the recipe has no free space.
+    pub(crate) surroundings: Option<Surroundings>,
 }
 
 impl Trainer {
@@ -263,6 +266,7 @@ impl Trainer {
             device_loss: DeviceLoss::new(&options.device)?,
             read_for_losses: 0,
             free_space: FreeSpace::new(&dataset, recipe.free_space),
+            surroundings: (recipe.free_space > 0.0).then(|| Surroundings::new(&dataset)).flatten(),
             engine,
             field: None,
             sockets: Sockets::default(),

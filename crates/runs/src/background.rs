@@ -95,7 +95,7 @@ fn shares_near(borders: &[Border], color: [u8; 3]) -> Vec<f64> {
 
 /// The colour behind the object that masks leave all out but for a rim, if it has one: no splats are needed to show it there. Held-out PSNR, pixels not masked,
 /// 480 pixels, 60 s, over grey and over the rim's colour: medal 18.3, 23.4 dB; dog 29.7, 30.9. The rim has the object's shadow; what masks leave out is the backdrop itself where
-/// it goes on beyond the rim. With the colour of the rim and with that, 1,500 steps: dog 30.26, 30.65 dB; medal 24.32, 24.75; a temple, part of whose rim is cloth before black,
+/// it goes on beyond the rim. With the colour of the rim and with that, 1,500 steps: dog 30.26, 30.81 dB; medal 24.32, 24.97; a temple, part of whose rim is cloth before black,
 /// 2,000 steps, 32.12, 36.41.
 fn masked_backdrop(photos: &[Photo]) -> Option<[u8; 3]> {
     let left_out = photos.iter().map(Photo::border_left_out).sum::<f64>() / photos.len() as f64;

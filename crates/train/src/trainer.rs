@@ -166,7 +166,7 @@ pub struct Trainer {
     /// Steps of this process whose frames were read back from a GPU for their losses.
     pub(crate) read_for_losses: u64,
     pub(crate) free_space: FreeSpace,
-    /// Absent if the recipe has no free space.
+    /// What sparse photographs show; absent if the recipe has no free space.
     pub(crate) surroundings: Option<Surroundings>,
 }
 

@@ -18,7 +18,6 @@ use crate::first_splats::has_points;
 use crate::normal_maps::NormalMaps;
 use crate::recipe::{Param, Params};
 use crate::robust::median;
-use crate::spacing::spacing;
 use crate::trainer::{TrainError, Trainer};
 use glam::Vec3;
 use irradia_scene::{Photo, View};
@@ -256,7 +255,7 @@ impl Trainer {
         if self.recipe.sparse_visits == 0 {
             return;
         }
-        let spacing = spacing(&self.dataset).to_degrees();
+        let spacing = self.spacing.to_degrees();
         if spacing < SPARSE {
             let visits = self.recipe.sparse_visits as f64 * SPARSE / spacing.max(CLOSEST);
             let own = self.recipe.total_steps().div_ceil(self.dataset.train.len() as u64);

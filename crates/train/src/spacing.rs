@@ -32,25 +32,29 @@ pub(crate) fn spacing(dataset: &Dataset) -> f64 {
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use super::*;
     use crate::free_space::tests::dataset;
     use irradia_scene::Pose;
     use std::f32::consts::TAU;
 
-    /// `count` cameras on a circle around the origin, evenly over `turn`, each looking across it.
-    fn around(count: usize, turn: f32) -> Dataset {
+    /// `count` cameras on a circle of this radius around the origin, evenly over `turn`, each looking across it.
+    pub(crate) fn around_at(radius: f32, count: usize, turn: f32) -> Dataset {
         let mut data = dataset(0, None);
         let view = data.views[0].clone();
         let place = |i: usize| {
             let angle = turn * i as f32 / count as f32;
             let mut view = view.clone();
-            view.camera.pose = Pose::look_at(3.0 * Vec3::new(angle.cos(), angle.sin(), 0.0), Vec3::ZERO, Vec3::Z);
+            view.camera.pose = Pose::look_at(radius * Vec3::new(angle.cos(), angle.sin(), 0.0), Vec3::ZERO, Vec3::Z);
             view
         };
         data.views = (0..count).map(place).collect();
         data.train = (0..count).collect();
         data
+    }
+
+    fn around(count: usize, turn: f32) -> Dataset {
+        around_at(3.0, count, turn)
     }
 
     #[test]

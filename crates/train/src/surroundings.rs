@@ -8,7 +8,6 @@
 
 use crate::conditions::SPARSE;
 use crate::robust::median;
-use crate::spacing::spacing;
 use crate::trainer::train_cameras;
 use glam::Vec3;
 use irradia_scene::{Camera, Dataset};
@@ -36,10 +35,10 @@ pub(crate) struct Surroundings {
 }
 
 impl Surroundings {
-    /// `None` if adjacent photographs are close, or no points are known.
-    pub(crate) fn new(dataset: &Dataset) -> Option<Self> {
+    /// Of photographs `spacing` radians apart; `None` if that is close, or no points are known.
+    pub(crate) fn new(dataset: &Dataset, spacing: f64) -> Option<Self> {
         let points = dataset.points.as_ref()?.positions.clone();
-        if points.is_empty() || spacing(dataset).to_degrees() < SPARSE {
+        if points.is_empty() || spacing.to_degrees() < SPARSE {
             return None;
         }
         let cameras = train_cameras(dataset);
@@ -55,23 +54,21 @@ impl Surroundings {
 
     /// Moves the splats far away that only one photograph shows, beyond the focus and among other cameras. Returns their number.
     pub(crate) fn move_away(&self, state: &mut SplatState) -> usize {
-        let n = state.len();
-        let means = &state.splats.means;
-        let [x, y, z] = [0, 1, 2].map(|c| &means.plane(c)[..n]);
-        let moved: Vec<(usize, Vec3, f32)> = (0..n)
+        let splats = &mut state.splats;
+        let moved: Vec<(usize, Vec3, f32)> = (0..splats.len())
             .into_par_iter()
             .with_min_len(1024)
             .filter_map(|i| {
-                let position = Vec3::new(x[i], y[i], z[i]);
+                let position = Vec3::from_array(splats.mean(i));
                 let (eye, times) = self.unknown(position)?;
                 Some((i, eye + times * (position - eye), times.ln()))
             })
             .collect();
         for (i, position, grown) in &moved {
             for c in 0..3 {
-                state.splats.means.set(c, *i, position[c]);
-                let log_scale = state.splats.log_scales.get(c, *i);
-                state.splats.log_scales.set(c, *i, log_scale + grown);
+                splats.means.set(c, *i, position[c]);
+                let log_scale = splats.log_scales.get(c, *i);
+                splats.log_scales.set(c, *i, log_scale + grown);
             }
         }
         moved.len()
@@ -113,24 +110,17 @@ impl Surroundings {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::free_space::tests::dataset;
-    use irradia_scene::{Intrinsics, PointCloud, Pose};
+    use crate::spacing::{spacing, tests::around_at};
+    use irradia_scene::{Intrinsics, PointCloud};
     use irradia_splat::Splats;
     use std::f32::consts::TAU;
 
     /// `count` cameras on a circle of radius 1 around the origin, which look across it and see 30 degrees, and a point at the origin.
     fn around(count: usize) -> Dataset {
-        let mut data = dataset(0, None);
-        let view = data.views[0].clone();
-        let place = |i: usize| {
-            let angle = TAU * i as f32 / count as f32;
-            let mut view = view.clone();
+        let mut data = around_at(1.0, count, TAU);
+        for view in &mut data.views {
             view.camera.intrinsics = Intrinsics::from_fov_x(100, 100, TAU / 12.0);
-            view.camera.pose = Pose::look_at(Vec3::new(angle.cos(), angle.sin(), 0.0), Vec3::ZERO, Vec3::Z);
-            view
-        };
-        data.views = (0..count).map(place).collect();
-        data.train = (0..count).collect();
+        }
         data.points = Some(PointCloud {
             positions: vec![Vec3::ZERO],
             colors: vec![[0; 3]],
@@ -149,11 +139,11 @@ mod tests {
     #[test]
     fn what_one_photograph_shows_among_the_cameras_goes_far_away_and_looks_the_same() {
         let data = around(5);
-        let surroundings = Surroundings::new(&data).unwrap();
+        let surroundings = Surroundings::new(&data, spacing(&data)).unwrap();
         // Opposite to the first camera, between the third and the fourth one.
         let mut state = state(&[Vec3::new(-1.0, 0.05, 0.02)]);
         assert_eq!(surroundings.move_away(&mut state), 1);
-        let moved = Vec3::from_array([0, 1, 2].map(|c| state.splats.means.get(c, 0)));
+        let moved = Vec3::from_array(state.splats.mean(0));
         assert!((moved.length() - 3.0).abs() < 1e-3, "{moved}");
         let camera = &data.views[0].camera;
         let (before, depth) = camera.sees(Vec3::new(-1.0, 0.05, 0.02)).unwrap();
@@ -170,7 +160,7 @@ mod tests {
         let mut data = around(5);
         let opposite = Vec3::new(-1.0, 0.05, 0.02);
         let moved = |data: &Dataset, place: Vec3| {
-            let surroundings = Surroundings::new(data)?;
+            let surroundings = Surroundings::new(data, spacing(data))?;
             Some(surroundings.move_away(&mut state(&[place])))
         };
         assert_eq!(moved(&data, opposite), Some(1));

@@ -18,6 +18,7 @@ use crate::pixel_size::pixel_size;
 use crate::recipe::{Choice, Recipe};
 use crate::schedule::{Clock, StepMetrics, StepPlan, upcoming_views};
 use crate::socket::{Residual, Sky, Sockets};
+use crate::spacing::spacing;
 use crate::surroundings::Surroundings;
 use crate::times::Times;
 use crate::transients::Hidden;
@@ -166,6 +167,8 @@ pub struct Trainer {
     /// Steps of this process whose frames were read back from a GPU for their losses.
     pub(crate) read_for_losses: u64,
     pub(crate) free_space: FreeSpace,
+    /// Angle between adjacent training photographs, radians.
+    pub(crate) spacing: f64,
     /// What sparse photographs show; absent if the recipe has no free space.
     pub(crate) surroundings: Option<Surroundings>,
 }
@@ -243,6 +246,7 @@ impl Trainer {
         let mut engine = Engine::new(SplatState::new(Splats::zeros(0, sh::MAX_DEGREE)));
         let decisions = use_device(&mut engine, &options.device, &recipe, first_splats, &cameras)?;
         let extent = init::camera_extent(&cameras);
+        let spacing = spacing(&dataset);
         Ok(Self {
             clock: Clock::new(&recipe),
             pace: options.steps.map_or(1.0, |steps| total / steps.max(1) as f64),
@@ -266,7 +270,10 @@ impl Trainer {
             device_loss: DeviceLoss::new(&options.device)?,
             read_for_losses: 0,
             free_space: FreeSpace::new(&dataset, recipe.free_space),
-            surroundings: (recipe.free_space > 0.0).then(|| Surroundings::new(&dataset)).flatten(),
+            spacing,
+            surroundings: (recipe.free_space > 0.0)
+                .then(|| Surroundings::new(&dataset, spacing))
+                .flatten(),
             engine,
             field: None,
             sockets: Sockets::default(),

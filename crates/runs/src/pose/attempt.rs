@@ -6,14 +6,14 @@ use super::stages::Work;
 use super::{AttemptReport, Clock, ENOUGH_POSED, PoseProgress};
 use crate::RunError;
 use irradia_sfm::PairMatches;
-use irradia_sfm::map::{MapOptions, PhotoInfo, Progress, Reconstruction, extend, moving, reconstruct};
+use irradia_sfm::map::{FEW_PHOTOS, MapOptions, PhotoInfo, Progress, Reconstruction, extend, moving, reconstruct};
 use irradia_sfm::matching::PairOptions;
 use std::path::Path;
 
 /// Frames after each frame of a film that it is matched with in any case.
 const FILM_SUCCESSORS: usize = 10;
-/// Up to so many photographs each should have a pose: every one is missed, and a second attempt takes seconds.
-const FEW: usize = 25;
+/// Neighbours that contradict the model of few photographs, from which on it may be wrong.
+const CONTRADICTED: usize = 2;
 
 /// Up to so many photographs, as many as are chosen of a film, are matched along epipolar lines: of 984 frames of two films, that took seven minutes for a model of 454 in place
 /// of 507, since what joins their parts was not filmed.
@@ -101,6 +101,15 @@ impl<'a> Attempt<'a> {
         self.reconstruction.registered()
     }
 
+    /// Neighbours that contradict the model, where photographs are so few that it is asked; else 0.
+    fn contradictions(&self) -> usize {
+        let Matched { work, infos, .. } = &self.matched;
+        match infos.len() {
+            ..=FEW_PHOTOS => self.reconstruction.contradictions(infos, work.features()),
+            _ => 0,
+        }
+    }
+
     /// For the report.
     pub fn report(&self) -> AttemptReport {
         AttemptReport {
@@ -111,23 +120,36 @@ impl<'a> Attempt<'a> {
         }
     }
 
-    /// The same photographs, to be matched with frontal descriptors and along epipolar lines, if too few of them have a pose. Parts that look alike and are
+    /// Why a second attempt is made: too few photographs have a pose, or few photographs contradict their model. Parts that look alike and are
     /// mapped apart would only be taken for one another again.
-    pub fn again(&self, wanted: Option<usize>, out: &Path) -> Option<Work<'a>> {
+    pub fn falls_short(&self) -> Option<String> {
         let photos = self.matched.work.photos().len();
-        if self.registered() >= enough(photos) || self.reconstruction.apart.is_some() {
+        if self.reconstruction.apart.is_some() {
             return None;
         }
+        if self.registered() < enough(photos) {
+            return Some(format!("{} of {photos} photographs have a pose", self.registered()));
+        }
+        let pairs = self.contradictions();
+        (pairs >= CONTRADICTED).then(|| format!("{pairs} pairs of photographs contradict the others"))
+    }
+
+    /// The same photographs, to be matched with frontal descriptors and along epipolar lines.
+    pub fn again(&self, wanted: Option<usize>, out: &Path) -> Work<'a> {
+        let photos = self.matched.work.photos().len();
         let posed = self.reconstruction.models.first().map(|model| &model.poses);
         let left_out = (0..photos).filter(|i| posed.is_none_or(|poses| poses[*i].is_none()));
-        Some(self.matched.work.again(wanted, &left_out.collect::<Vec<_>>(), out))
+        self.matched.work.again(wanted, &left_out.collect::<Vec<_>>(), out)
     }
 
     /// Whether this second attempt is to be preferred to the `first`. Its weak matches make wrong models of few photographs (3 of 20 of a room that was seen from
     /// one place, two opposite walls of a house as one) and add single ones of what looks alike.
     pub fn replaces(&self, first: &Self) -> bool {
         let photos = self.matched.work.photos().len();
-        self.registered() >= photos.div_ceil(2).max(first.registered() + photos.div_ceil(20))
+        let [contradict, contradicted] = [self, first].map(Self::contradictions);
+        let more = self.registered() >= photos.div_ceil(2).max(first.registered() + photos.div_ceil(20));
+        let agrees = contradicted >= CONTRADICTED && 2 * contradict <= contradicted;
+        more || agrees && self.registered() >= first.registered()
     }
 }
 
@@ -139,7 +161,7 @@ pub(super) fn may_be_guided(photos: usize) -> bool {
 /// How many of so many photographs should have a pose.
 fn enough(photos: usize) -> usize {
     match photos {
-        ..=FEW => photos,
+        ..=FEW_PHOTOS => photos,
         _ => (ENOUGH_POSED * photos as f64).ceil() as usize,
     }
 }

@@ -325,16 +325,15 @@ pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Resu
     }
     let mut attempt = matched.map(&input.mapping, known, &mut clock, progress)?;
     let mut attempts = vec![attempt.report()];
-    if is_new && let Some(work) = attempt.again(input.max_features, out) {
+    if is_new && let Some(why) = attempt.falls_short() {
+        let work = attempt.again(input.max_features, out);
         let most = work.sift().max_features;
         let guided = match attempt::may_be_guided(folder.photos.len()) {
             true => " and along epipolar lines",
             false => "",
         };
         progress(PoseProgress::Warned(format!(
-            "{} of {} photographs have a pose: trying again with up to {most} features of each, matched from the front{guided}",
-            attempt.registered(),
-            folder.photos.len(),
+            "{why}: trying again with up to {most} features of each, matched from the front{guided}",
         )));
         let again = Matched::find(work, &capture, masked.is_some(), &mut clock)?;
         let again = again.map(&input.mapping, None, &mut clock, progress)?;

@@ -21,8 +21,6 @@ const BASELINE: f64 = 0.003;
 const NEIGHBOURS: usize = 3;
 /// Cells along the long side of a picture in which matches are counted once.
 const CELLS: f32 = 16.0;
-/// Steps along the tree of the strongest pairs within which pairs are used first.
-const HOPS: usize = 4;
 /// Matches of neighbours that tell.
 const TELLS: usize = 30;
 
@@ -148,10 +146,10 @@ pub fn spanning_tree(photos: usize, pairs: &[VerifiedPair], strengths: &[f64]) -
     order
 }
 
-/// `[pairs]` whether at most [`HOPS`] pairs of `tree` join both photographs of each pair.
-pub fn near_in_tree(photos: usize, pairs: &[VerifiedPair], tree: &[usize]) -> Vec<bool> {
+/// `[pairs]` whether at most `hops` pairs of `tree` join both photographs of each pair.
+pub fn near_in_tree(photos: usize, pairs: &[VerifiedPair], tree: &[usize], hops: usize) -> Vec<bool> {
     let mut near: Vec<BTreeSet<usize>> = (0..photos).map(|photo| BTreeSet::from([photo])).collect();
-    for _ in 0..HOPS {
+    for _ in 0..hops {
         let before = near.clone();
         for i in tree {
             let [a, b] = pairs[*i].photos.map(|p| p as usize);

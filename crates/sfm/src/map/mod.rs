@@ -42,7 +42,7 @@ pub use still::{StandsStill, moving, same_place, stands_still};
 pub use turntable::turntable;
 pub(crate) use types::rigs;
 pub use types::{
-    Absent, Known, LeftOut, MapOptions, Model, ModelPoint, Mount, PairKind, PhotoInfo, Progress, Reason,
+    Absent, FEW_PHOTOS, Known, LeftOut, MapOptions, Model, ModelPoint, Mount, PairKind, PhotoInfo, Progress, Reason,
     Reconstruction, VerifiedPair, Zoom,
 };
 pub(crate) use verify::centered_points;
@@ -90,7 +90,13 @@ pub fn reconstruct(
         && let Some(narrow) = narrow(photos, &found.cameras)
     {
         let again = mapped(photos, features, pairs, &narrow, options, progress);
-        if again.apart.is_none() && explained(&again) > explained(&found) {
+        // Parts that look alike join at any focal length.
+        let contradicted = |found: &Reconstruction| match photos.len() {
+            ..=FEW_PHOTOS => found.contradictions(photos, features),
+            _ => 0,
+        };
+        let more = explained(&again) > explained(&found);
+        if again.apart.is_none() && more && contradicted(&again) <= contradicted(&found) {
             found = again;
             known = narrow;
         }

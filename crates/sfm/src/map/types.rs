@@ -1,11 +1,15 @@
 use super::absent::ABSENT_PAIRS;
+use super::agree::{agreement, contradictions, strengths};
 use super::focal::Source;
-use crate::PairMatches;
 use crate::geometry::camera::DCamera;
 use crate::geometry::essential::Motion;
 use crate::geometry::pose::DPose;
+use crate::{Features, PairMatches};
 use glam::{DQuat, DVec3};
 use std::collections::{BTreeMap, BTreeSet};
+
+/// Photographs up to which each is missed, pairs that contradict a model are few, and a mapping takes a fraction of a second.
+pub const FEW_PHOTOS: usize = 25;
 
 /// What is known of a photograph beside its features.
 #[derive(Clone, Debug, PartialEq)]
@@ -194,6 +198,13 @@ impl Reconstruction {
     /// Photographs with a pose in the largest model.
     pub fn registered(&self) -> usize {
         self.models.first().map_or(0, Model::registered)
+    }
+
+    /// Neighbours whose matches contradict the largest model.
+    pub fn contradictions(&self, photos: &[PhotoInfo], features: &[Features]) -> usize {
+        let Some(model) = self.models.first() else { return 0 };
+        let agreement = agreement(photos, features, &self.pairs, model);
+        contradictions(&self.pairs, &strengths(photos, features, &self.pairs), &agreement).len()
     }
 
     /// Pairs of photographs that should share points and do not, where they are too many to be chance, and that are not among `matched`.

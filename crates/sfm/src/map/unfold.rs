@@ -3,19 +3,61 @@
 //! What looks alike shares less of the pictures than what is the same: a label that occurs twice has many matches, but not the
 //! background around it. So the strongest pairs, those whose matches cover most, must agree with the model. Where some do not, the
 //! scene is mapped again from pairs close to one another in their spanning tree, then from all pairs that agree with the outcome.
+//!
+//! The tree of few photographs has few pairs across a fold, often a single one, and no pair of them is far: all neighbours tell there,
+//! and closer and closer pairs are tried.
 
-use super::agree::{CONTRADICTS, agreement, near_in_tree, spanning_tree, strengths};
-use super::types::{Model, Progress, VerifiedPair};
+use super::agree::{CONTRADICTS, agreement, contradictions, near_in_tree, spanning_tree, strengths};
+use super::types::{FEW_PHOTOS, Model, Progress, VerifiedPair};
 use super::{Grown, Input, grown};
 
-/// Pairs of the tree that contradict a model from which on it is folded.
-const FOLDED: usize = 2;
+/// What differs between few photographs and many.
+struct Rules {
+    /// Pairs that contradict a model from which on it is folded.
+    folded: usize,
+    /// Fraction of the photographs of the first model that another must hold. Few photographs without a pose get a second attempt.
+    keeps: f64,
+    /// Steps along the tree within which pairs are used first: one mapping for each.
+    hops: &'static [usize],
+}
+
+const OF_FEW: Rules = Rules {
+    folded: 1,
+    keeps: 0.75,
+    hops: &[4, 3, 2, 1],
+};
+const OF_MANY: Rules = Rules {
+    folded: 2,
+    keeps: 0.9,
+    hops: &[4],
+};
 /// Fraction of the matches of a pair that agree with the model of the tree, from which on it is used.
 const AGREES: f64 = 0.8;
-/// Photographs that another model must hold, of those of the first.
-const KEEPS: f64 = 0.9;
 
-/// Models that the strongest pairs contradict at most half as often, where `found` is folded and there are such; else `found`.
+/// Models, and how the pairs fit the largest.
+struct Judged {
+    grown: Grown,
+    /// `[pairs]` the fraction of the matches that agree.
+    agreement: Vec<Option<f64>>,
+    /// Pairs that tell and contradict it.
+    folds: usize,
+}
+
+impl Judged {
+    fn registered(&self) -> usize {
+        self.grown.models.first().map_or(0, Model::registered)
+    }
+
+    /// Matches that agree with it, of the pairs on which `other` tells as well.
+    fn support(&self, pairs: &[VerifiedPair], other: &Self) -> f64 {
+        let both = self.agreement.iter().zip(&other.agreement).zip(pairs);
+        let agreeing = both.filter_map(|((own, other), pair)| Some((own.as_ref()?, other.as_ref()?, pair)));
+        agreeing.map(|(own, _, pair)| own * pair.matches.len() as f64).sum()
+    }
+}
+
+/// Of the models that pairs contradict at most half as often, and with which no fewer matches agree, the one with which most do, where `found` is folded and there
+/// are such; else `found`.
 pub(super) fn unfolded(input: &Input, found: Grown, progress: &mut dyn FnMut(Progress)) -> Grown {
     let Input {
         photos,
@@ -23,36 +65,51 @@ pub(super) fn unfolded(input: &Input, found: Grown, progress: &mut dyn FnMut(Pro
         pairs,
         ..
     } = *input;
-    let tree = spanning_tree(photos.len(), pairs, &strengths(photos, features, pairs));
-    let agreement = |found: &Grown| {
-        let model = found.models.first();
-        model.map_or(Vec::new(), |model| agreement(photos, features, pairs, model))
-    };
-    let folds = |found: &Grown| {
-        let agreement = agreement(found);
+    let few = photos.len() <= FEW_PHOTOS;
+    let rules = if few { OF_FEW } else { OF_MANY };
+    let strengths = strengths(photos, features, pairs);
+    let tree = spanning_tree(photos.len(), pairs, &strengths);
+    let judged = |grown: Grown| {
+        let model = grown.models.first();
+        let agreement = model.map_or(Vec::new(), |model| agreement(photos, features, pairs, model));
         let contradicts = |i: &&usize| agreement.get(**i).is_some_and(|a| a.is_some_and(|a| a < CONTRADICTS));
-        tree.iter().filter(contradicts).count()
+        let folds = match few && !agreement.is_empty() {
+            true => contradictions(pairs, &strengths, &agreement).len(),
+            false => tree.iter().filter(contradicts).count(),
+        };
+        Judged {
+            grown,
+            agreement,
+            folds,
+        }
     };
-    let folded = folds(&found);
-    if folded < FOLDED {
-        return found;
+    let found = judged(found);
+    if found.folds < rules.folded {
+        return found.grown;
     }
     let mut grow_from = |keep: &[bool]| {
-        let kept = pairs
-            .iter()
-            .zip(keep)
-            .filter(|(_, keep)| **keep)
-            .map(|(pair, _)| pair.clone());
-        grown(input, &kept.collect::<Vec<VerifiedPair>>(), progress)
+        let kept = pairs.iter().zip(keep).filter(|(_, keep)| **keep);
+        let kept: Vec<VerifiedPair> = kept.map(|(pair, _)| pair.clone()).collect();
+        judged(grown(input, &kept, progress))
     };
-    let skeleton = grow_from(&near_in_tree(photos.len(), pairs, &tree));
-    let agrees: Vec<bool> = agreement(&skeleton)
-        .iter()
-        .map(|a| a.is_none_or(|fraction| fraction > AGREES))
-        .collect();
-    let again = grow_from(&agrees);
-    let registered = |found: &Grown| found.models.first().map_or(0, Model::registered) as f64;
-    let least = KEEPS * registered(&found);
-    let unfolds = |other: &Grown| registered(other) >= least && 2 * folds(other) <= folded;
-    [again, skeleton].into_iter().find(unfolds).unwrap_or(found)
+    let least = rules.keeps * found.registered() as f64;
+    let mut best: Option<Judged> = None;
+    for hops in rules.hops {
+        let skeleton = grow_from(&near_in_tree(photos.len(), pairs, &tree, *hops));
+        let agrees = skeleton
+            .agreement
+            .iter()
+            .map(|a| a.is_none_or(|fraction| fraction > AGREES));
+        let again = grow_from(&agrees.collect::<Vec<bool>>());
+        for other in [again, skeleton] {
+            let unfolds = other.registered() as f64 >= least
+                && 2 * other.folds <= found.folds
+                && other.support(pairs, &found) >= found.support(pairs, &other);
+            let better = |best: &Judged| other.support(pairs, &other) > best.support(pairs, best);
+            if unfolds && best.as_ref().is_none_or(better) {
+                best = Some(other);
+            }
+        }
+    }
+    best.unwrap_or(found).grown
 }

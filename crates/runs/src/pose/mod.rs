@@ -244,8 +244,8 @@ pub struct StageReport {
 }
 
 /// Finds the poses of photographs and writes them as a dataset. Features and matches of an earlier call are reused. Where fewer than [`ENOUGH_POSED`] of
-/// the photographs have a pose at first, or any of up to 25 has none, it tries again with frontal descriptors; a model that is larger by a twentieth of the
-/// photographs and holds half of them replaces the first. The result depends neither on the number of threads nor on the order of the files.
+/// the photographs have a pose at first, or any of up to 25 has none, or pairs of them contradict the model, it tries again with frontal descriptors; a model that is
+/// larger by a twentieth of the photographs and holds half of them, or as large and contradicted half as often, replaces the first. The result depends neither on the number of threads nor on the order of the files.
 ///
 /// # Errors
 /// When there are fewer than three photographs, a film cannot be read, no three photographs can be posed together, a distance is not

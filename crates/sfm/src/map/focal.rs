@@ -21,7 +21,7 @@ pub enum Source {
 }
 
 /// The guess, in long sides (COLMAP's default).
-const GUESS: f64 = 1.2;
+pub(super) const GUESS: f64 = 1.2;
 /// Candidates, in long sides: a field of view of 90 to 8 degrees, in steps of 7 %.
 const FIRST: f64 = 0.5;
 const STEP: f64 = 1.07;

@@ -5,7 +5,7 @@ use super::model::Working;
 use super::refine::Extent;
 use super::seed::seeds;
 use super::tracks::Tracks;
-use super::types::{MapOptions, PhotoInfo, Progress, VerifiedPair};
+use super::types::{FEW_PHOTOS, MapOptions, PhotoInfo, Progress, VerifiedPair};
 use super::verify::Cameras;
 use crate::geometry::pose::DPose;
 use crate::geometry::ransac::{Estimate, Limits};
@@ -37,7 +37,7 @@ const LAST_ROUNDS: usize = 3;
 ///
 /// A seed whose model holds half of what it could reach ends the search. Two photographs with wrong focal lengths may lead to a wrong
 /// model of all, which explains a third of what its photographs show instead of nine tenths: where focal lengths are open, or end far from where they began, the model
-/// must explain most of it as well. `tried` counts failed registrations.
+/// must explain most of it as well. So must a model of few photographs: a seed with wrong poses hardly finds others that disagree. `tried` counts failed registrations.
 pub(super) fn model<'a>(
     photos: &'a [PhotoInfo],
     cameras: &Cameras,
@@ -50,9 +50,10 @@ pub(super) fn model<'a>(
 ) -> Option<Working<'a>> {
     let empty = Working::new(photos, cameras, tracks, options);
     let open = empty.has_open_focals();
-    // Whether focal lengths tell by themselves that more must be asked of the model.
-    let is_doubtful = |model: &Working| open || model.is_far_from_first_focals();
-    let mut in_doubt = open;
+    let few = photos.len() <= FEW_PHOTOS;
+    // Whether more must be asked of the model.
+    let is_doubtful = |model: &Working| open || few || model.is_far_from_first_focals();
+    let mut in_doubt = open || few;
     let mut best: Option<(Working, Vec<usize>)> = None;
     let mut outcomes: Vec<Outcome> = Vec::new();
     let mut left = SEEDS;

@@ -81,6 +81,16 @@ pub fn reconstruct(
     let pairs = &still::without(photos, features, pairs)[..];
     let mut known = known_cameras(photos);
     let mut found = mapped(photos, features, pairs, &known, options, progress);
+    // What pairs tell of few photographs may be wrong, and a model with it as well.
+    if photos.len() <= FEW_PHOTOS
+        && let Some(usual) = usual(photos, &found.cameras)
+    {
+        let again = mapped(photos, features, pairs, &usual, options, progress);
+        if again.apart.is_none() && explained(&again) > explained(&found) {
+            found = again;
+            known = usual;
+        }
+    }
     let in_doubt = found.apart.is_some()
         || (found.registered() as f64) < IN_DOUBT * photos.len() as f64
         || is_far_from_first_focals(&found);
@@ -182,12 +192,23 @@ fn with_own_focals(
     })
 }
 
+/// Cameras of the usual view, if metadata tell nothing of them, and pairs tell another.
+fn usual(photos: &[PhotoInfo], cameras: &Cameras) -> Option<Vec<Option<(DCamera, Source)>>> {
+    if photos.iter().any(PhotoInfo::is_told) || cameras.iter().all(|(_, source)| *source == Source::Guess) {
+        return None;
+    }
+    let camera = |(camera, _): &(DCamera, Source)| {
+        let focal = focal::GUESS * camera.long_side();
+        Some((DCamera::centered(camera.width, camera.height, focal), Source::Guess))
+    };
+    Some(cameras.iter().map(camera).collect())
+}
+
 /// Cameras of a narrow view, if metadata tell nothing of them: pairs of such photographs fit all focal lengths nearly alike, and a model that starts with a much shorter one
 /// becomes flat, and breaks.
 fn narrow(photos: &[PhotoInfo], cameras: &Cameras) -> Option<Vec<Option<(DCamera, Source)>>> {
-    let told = |photo: &PhotoInfo| photo.focal_prior_px.is_some() || photo.camera.is_some();
     let shorter = |(camera, _): &(DCamera, Source)| camera.focal() < NARROW / 2.0 * camera.long_side();
-    if photos.iter().any(told) || !cameras.iter().all(shorter) {
+    if photos.iter().any(PhotoInfo::is_told) || !cameras.iter().all(shorter) {
         return None;
     }
     let camera = |(camera, _): &(DCamera, Source)| {

@@ -32,6 +32,13 @@ pub struct PhotoInfo {
     pub mount: Option<Mount>,
 }
 
+impl PhotoInfo {
+    /// Whether its focal length is known before any mapping.
+    pub(super) fn is_told(&self) -> bool {
+        self.focal_prior_px.is_some() || self.camera.is_some()
+    }
+}
+
 /// The place of a photograph on a rig: all photographs of a rig are taken from one position.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Mount {

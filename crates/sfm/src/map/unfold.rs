@@ -48,16 +48,16 @@ impl Judged {
         self.grown.models.first().map_or(0, Model::registered)
     }
 
-    /// Matches that agree with it, of the pairs on which `other` tells as well.
-    fn support(&self, pairs: &[VerifiedPair], other: &Self) -> f64 {
-        let both = self.agreement.iter().zip(&other.agreement).zip(pairs);
-        let agreeing = both.filter_map(|((own, other), pair)| Some((own.as_ref()?, other.as_ref()?, pair)));
-        agreeing.map(|(own, _, pair)| own * pair.matches.len() as f64).sum()
+    /// Strength of the pairs that agree with it.
+    fn support(&self, strengths: &[f64]) -> f64 {
+        let agreeing = self.agreement.iter().zip(strengths);
+        agreeing
+            .filter_map(|(agrees, strength)| Some((*agrees)? * strength))
+            .sum()
     }
 }
 
-/// Of the models that pairs contradict at most half as often, and with which no fewer matches agree, the one with which most do, where `found` is folded and there
-/// are such; else `found`.
+/// Of the models that pairs contradict at most half as often the one with which the strongest agree, where `found` is folded and there are such; else `found`.
 pub(super) fn unfolded(input: &Input, found: Grown, progress: &mut dyn FnMut(Progress)) -> Grown {
     let Input {
         photos,
@@ -102,10 +102,8 @@ pub(super) fn unfolded(input: &Input, found: Grown, progress: &mut dyn FnMut(Pro
             .map(|a| a.is_none_or(|fraction| fraction > AGREES));
         let again = grow_from(&agrees.collect::<Vec<bool>>());
         for other in [again, skeleton] {
-            let unfolds = other.registered() as f64 >= least
-                && 2 * other.folds <= found.folds
-                && other.support(pairs, &found) >= found.support(pairs, &other);
-            let better = |best: &Judged| other.support(pairs, &other) > best.support(pairs, best);
+            let unfolds = other.registered() as f64 >= least && 2 * other.folds <= found.folds;
+            let better = |best: &Judged| other.support(&strengths) > best.support(&strengths);
             if unfolds && best.as_ref().is_none_or(better) {
                 best = Some(other);
             }

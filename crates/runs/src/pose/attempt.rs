@@ -101,13 +101,10 @@ impl<'a> Attempt<'a> {
         self.reconstruction.registered()
     }
 
-    /// Neighbours that contradict the model, where photographs are so few that it is asked; else 0.
+    /// Neighbours that contradict the model of few photographs.
     fn contradictions(&self) -> usize {
         let Matched { work, infos, .. } = &self.matched;
-        match infos.len() {
-            ..=FEW_PHOTOS => self.reconstruction.contradictions(infos, work.features()),
-            _ => 0,
-        }
+        self.reconstruction.contradictions(infos, work.features())
     }
 
     /// For the report.
@@ -146,10 +143,13 @@ impl<'a> Attempt<'a> {
     /// one place, two opposite walls of a house as one) and add single ones of what looks alike.
     pub fn replaces(&self, first: &Self) -> bool {
         let photos = self.matched.work.photos().len();
-        let [contradict, contradicted] = [self, first].map(Self::contradictions);
-        let more = self.registered() >= photos.div_ceil(2).max(first.registered() + photos.div_ceil(20));
-        let agrees = contradicted >= CONTRADICTED && 2 * contradict <= contradicted;
-        more || agrees && self.registered() >= first.registered()
+        if self.registered() >= photos.div_ceil(2).max(first.registered() + photos.div_ceil(20)) {
+            return true;
+        }
+        let contradicted = first.contradictions();
+        contradicted >= CONTRADICTED
+            && 2 * self.contradictions() <= contradicted
+            && self.registered() >= first.registered()
     }
 }
 

@@ -101,10 +101,7 @@ pub fn reconstruct(
     {
         let again = mapped(photos, features, pairs, &narrow, options, progress);
         // Parts that look alike join at any focal length.
-        let contradicted = |found: &Reconstruction| match photos.len() {
-            ..=FEW_PHOTOS => found.contradictions(photos, features),
-            _ => 0,
-        };
+        let contradicted = |found: &Reconstruction| found.contradictions(photos, features);
         let more = explained(&again) > explained(&found);
         if again.apart.is_none() && more && contradicted(&again) <= contradicted(&found) {
             found = again;
@@ -194,25 +191,25 @@ fn with_own_focals(
 
 /// Cameras of the usual view, if metadata tell nothing of them, and pairs tell another.
 fn usual(photos: &[PhotoInfo], cameras: &Cameras) -> Option<Vec<Option<(DCamera, Source)>>> {
-    if photos.iter().any(PhotoInfo::is_told) || cameras.iter().all(|(_, source)| *source == Source::Guess) {
-        return None;
-    }
-    let camera = |(camera, _): &(DCamera, Source)| {
-        let focal = focal::GUESS * camera.long_side();
-        Some((DCamera::centered(camera.width, camera.height, focal), Source::Guess))
-    };
-    Some(cameras.iter().map(camera).collect())
+    let is_guess = cameras.iter().all(|(_, source)| *source == Source::Guess);
+    guessed(photos, cameras, focal::GUESS).filter(|_| !is_guess)
 }
 
 /// Cameras of a narrow view, if metadata tell nothing of them: pairs of such photographs fit all focal lengths nearly alike, and a model that starts with a much shorter one
 /// becomes flat, and breaks.
 fn narrow(photos: &[PhotoInfo], cameras: &Cameras) -> Option<Vec<Option<(DCamera, Source)>>> {
     let shorter = |(camera, _): &(DCamera, Source)| camera.focal() < NARROW / 2.0 * camera.long_side();
-    if photos.iter().any(PhotoInfo::is_told) || !cameras.iter().all(shorter) {
+    guessed(photos, cameras, NARROW).filter(|_| cameras.iter().all(shorter))
+}
+
+/// `[groups]` cameras of a focal length in long sides, if metadata tell nothing of them.
+fn guessed(photos: &[PhotoInfo], cameras: &Cameras, focal: f64) -> Option<Vec<Option<(DCamera, Source)>>> {
+    let told = |photo: &PhotoInfo| photo.focal_prior_px.is_some() || photo.camera.is_some();
+    if photos.iter().any(told) {
         return None;
     }
     let camera = |(camera, _): &(DCamera, Source)| {
-        let focal = NARROW * camera.long_side();
+        let focal = focal * camera.long_side();
         Some((DCamera::centered(camera.width, camera.height, focal), Source::Guess))
     };
     Some(cameras.iter().map(camera).collect())

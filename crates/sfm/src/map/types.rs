@@ -32,13 +32,6 @@ pub struct PhotoInfo {
     pub mount: Option<Mount>,
 }
 
-impl PhotoInfo {
-    /// Whether its focal length is known before any mapping.
-    pub(super) fn is_told(&self) -> bool {
-        self.focal_prior_px.is_some() || self.camera.is_some()
-    }
-}
-
 /// The place of a photograph on a rig: all photographs of a rig are taken from one position.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Mount {
@@ -207,9 +200,12 @@ impl Reconstruction {
         self.models.first().map_or(0, Model::registered)
     }
 
-    /// Neighbours whose matches contradict the largest model.
+    /// Neighbours whose matches contradict the largest model; 0 for more than [`FEW_PHOTOS`], of which some always do.
     pub fn contradictions(&self, photos: &[PhotoInfo], features: &[Features]) -> usize {
-        let Some(model) = self.models.first() else { return 0 };
+        let few = photos.len() <= FEW_PHOTOS;
+        let Some(model) = self.models.first().filter(|_| few) else {
+            return 0;
+        };
         let agreement = agreement(photos, features, &self.pairs, model);
         contradictions(&self.pairs, &strengths(photos, features, &self.pairs), &agreement).len()
     }

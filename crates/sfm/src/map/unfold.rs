@@ -71,11 +71,15 @@ pub(super) fn unfolded(input: &Input, found: Grown, progress: &mut dyn FnMut(Pro
     let tree = spanning_tree(photos.len(), pairs, &strengths);
     let judged = |grown: Grown| {
         let model = grown.models.first();
-        let agreement = model.map_or(Vec::new(), |model| agreement(photos, features, pairs, model));
-        let contradicts = |i: &&usize| agreement.get(**i).is_some_and(|a| a.is_some_and(|a| a < CONTRADICTS));
-        let folds = match few && !agreement.is_empty() {
+        let agreement = model.map_or(vec![None; pairs.len()], |model| {
+            agreement(photos, features, pairs, model)
+        });
+        let folds = match few {
             true => contradictions(pairs, &strengths, &agreement).len(),
-            false => tree.iter().filter(contradicts).count(),
+            false => {
+                let contradicts = |i: &&usize| agreement[**i].is_some_and(|a| a < CONTRADICTS);
+                tree.iter().filter(contradicts).count()
+            }
         };
         Judged {
             grown,

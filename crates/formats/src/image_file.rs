@@ -184,6 +184,17 @@ pub(crate) fn read_exif(path: &Path) -> Option<Vec<u8>> {
     open(path).ok()?.0.exif_metadata().ok()?
 }
 
+/// The XMP packet of an image, if there is one.
+pub(crate) fn read_xmp(path: &Path) -> Option<Vec<u8>> {
+    let mut reader = BufReader::new(File::open(path).ok()?);
+    if reader.fill_buf().ok()?.starts_with(&[0xFF, 0xD8]) {
+        let mut decoder = jpeg_decoder::Decoder::new(reader);
+        decoder.read_info().ok()?;
+        return decoder.xmp_data().map(<[u8]>::to_vec);
+    }
+    open(path).ok()?.0.xmp_metadata().ok()?
+}
+
 /// The pixels, with `orientation` applied.
 pub(crate) fn decode(path: &Path, orientation: Orientation, colour: Colour) -> Result<Pixels, FormatError> {
     let (decoder, _) = open(path)?;

@@ -27,6 +27,7 @@ mod splats;
 mod tensors;
 mod undistort;
 mod unpack;
+mod xml;
 mod zip;
 
 pub use atomic::write_atomic;

@@ -14,7 +14,7 @@ pub use crate::dataset::realitycapture::{
     parse_realitycapture_csv as realitycapture_csv, parse_realitycapture_xmp as realitycapture_xmp,
 };
 pub use crate::dataset::transforms::{CameraKeys, Frame, Transforms, parse_transforms as transforms};
-pub use crate::photos::parse_camera_tags as camera_tags;
+pub use crate::photos::{parse_camera_tags as camera_tags, parse_gimbal as gimbal};
 pub use crate::points_ply::parse_points_ply as points_ply;
 pub use crate::splats::antimatter::parse as splat;
 pub use crate::splats::gltf::parse as glb;

@@ -167,6 +167,11 @@ fn cases() -> Vec<Case> {
             b"II\x2a\0\x08\0\0\0\x01\0\x10\x01\x02\0\x04\0\0\0One\0\0\0\0\0".into(),
             |b| parse::camera_tags(b, [40, 30]).model.is_some(),
         ),
+        case(
+            "XMP",
+            br#"<a><rdf:Description drone-dji:GimbalPitchDegree="-90.0" drone-dji:GimbalRollDegree="+0"/></a>"#.into(),
+            |b| parse::gimbal(b).is_some(),
+        ),
         case("splats", splat_ply(), |b| parse::splat_ply(b).is_ok()),
         case(
             "reconstruction.json",

@@ -1,6 +1,7 @@
 //! Folders of photographs without poses.
 
 use exif::{Field, In, Tag, Value};
+use glam::DVec3;
 use irradia_formats::{ColmapCamera, ColmapImage, ColmapModel, PosedImage, write_colmap};
 use irradia_formats::{
     DatasetOptions, find_panoramas, photo_files, read_dataset, read_photo_folder, read_photo_folders,
@@ -38,12 +39,34 @@ fn exif_block(tags: &[(Tag, Value)]) -> Vec<u8> {
 
 /// Writes `block` as EXIF into the JPEG at `path`.
 fn add_exif(path: &Path, block: &[u8]) {
-    let length = (block.len() + 8) as u16;
-    let mut exif = [&b"\xff\xe1"[..], &length.to_be_bytes(), b"Exif\0\0", block].concat();
+    add_segment(path, &[b"Exif\0\0", block].concat());
+}
+
+/// Writes the application segment 1 of a JPEG at `path`.
+fn add_segment(path: &Path, payload: &[u8]) {
+    let length = (payload.len() + 2) as u16;
+    let mut segment = [&b"\xff\xe1"[..], &length.to_be_bytes(), payload].concat();
     let mut bytes = fs::read(path).unwrap();
-    exif.extend(bytes.split_off(2));
-    bytes.extend(exif);
+    segment.extend(bytes.split_off(2));
+    bytes.extend(segment);
     fs::write(path, bytes).unwrap();
+}
+
+#[test]
+fn a_drone_tells_where_up_is() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("a.jpg");
+    picture(40, 30, 10).save(&path).unwrap();
+    let packet = br#"<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF><rdf:Description drone-dji:GimbalPitchDegree="-90.00"
+        drone-dji:GimbalRollDegree="+0.00"/></rdf:RDF></x:xmpmeta>"#;
+    add_segment(&path, &[&b"http://ns.adobe.com/xap/1.0/\0"[..], packet].concat());
+    let found = read_photo_folder(folder.path()).unwrap();
+    let up = found.photos[0].up.expect("known");
+    assert!((up - DVec3::NEG_Z).length() < 1e-9, "{up}");
+    // Stored on its side, what the gimbal says is not known to be of the picture as it is seen.
+    add_exif(&path, &exif_block(&[(Tag::Orientation, Value::Short(vec![6]))]));
+    let found = read_photo_folder(folder.path()).unwrap();
+    assert_eq!(found.photos[0].up, None);
 }
 
 #[test]
@@ -178,7 +201,7 @@ fn phones_photographs_are_read_with_what_the_camera_wrote() {
     );
     assert!(found.left_out[0].1.contains("not a readable"), "{:?}", found.left_out);
     let photo = &found.photos[0];
-    assert_eq!((photo.width, photo.height, photo.up), (40, 30, [0, -1]));
+    assert_eq!((photo.width, photo.height, photo.up), (40, 30, None));
     assert_eq!(photo.tags.focal, Some(0.75));
     let read = photo.read(1).unwrap();
     assert_eq!((read.width, read.height, read.channels), (40, 30, 3));
@@ -209,8 +232,9 @@ fn photographs_are_as_read_dataset_decodes_them() {
     }
     let found = read_photo_folder(folder.path()).unwrap();
     assert_eq!(found.groups(), [0, 1, 1, 0, 2, 2]);
-    let up: Vec<[i8; 2]> = found.photos.iter().map(|photo| photo.up).collect();
-    assert_eq!(up, [[0, -1], [0, -1], [0, -1], [0, 1], [-1, 0], [1, 0]]);
+    let up: Vec<Option<DVec3>> = found.photos.iter().map(|photo| photo.up).collect();
+    let [left, right, under] = [DVec3::NEG_X, DVec3::X, DVec3::Y].map(Some);
+    assert_eq!(up, [None, None, None, under, left, right]);
     let sparse = folder.path().join("sparse/0");
     fs::create_dir_all(&sparse).unwrap();
     let model = ColmapModel {

@@ -399,17 +399,17 @@ pub(crate) fn oriented_size(header: &Header, orientation: Orientation) -> (u32, 
 }
 
 /// The orientation that [`super::read_dataset`] applies to a photograph of a COLMAP model whose camera has the upright size, and where
-/// up is then in the picture: `[right, down]`. Half turns and square pictures are not turned.
-pub(crate) fn turned_as_stored(header: &Header) -> (Orientation, [i8; 2]) {
+/// up is then in the picture, `[right, down]`, if it is not where the picture's y axis has it. Half turns and square pictures are not turned.
+pub(crate) fn turned_as_stored(header: &Header) -> (Orientation, Option<[i8; 2]>) {
     use Orientation::{FlipVertical, Rotate90, Rotate90FlipH, Rotate180, Rotate270, Rotate270FlipH};
     let (width, height) = oriented_size(header, header.orientation);
     let applied = orientation_to_apply(header, Some([f64::from(width), f64::from(height)]), true);
     let up = match header.orientation {
-        orientation if orientation == applied => [0, -1],
-        Rotate180 | FlipVertical => [0, 1],
-        Rotate90 | Rotate90FlipH => [-1, 0],
-        Rotate270 | Rotate270FlipH => [1, 0],
-        _ => [0, -1],
+        orientation if orientation == applied => None,
+        Rotate180 | FlipVertical => Some([0, 1]),
+        Rotate90 | Rotate90FlipH => Some([-1, 0]),
+        Rotate270 | Rotate270FlipH => Some([1, 0]),
+        _ => None,
     };
     (applied, up)
 }

@@ -3,8 +3,8 @@
 
 use super::declared::{Declared, DeclaredCamera, DeclaredPose, DeclaredView, Focal, lens_or_pinhole, pose_from_axes};
 use super::files::{begins_with, first_file, locate_image};
-use super::xml::{Element, parse_xml};
 use crate::error::read_and_parse;
+use crate::xml::{Element, parse_xml};
 use crate::{FormatError, Malformed};
 use glam::{DMat3, DVec3};
 use irradia_scene::Lens;

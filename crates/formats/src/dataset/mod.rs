@@ -23,12 +23,11 @@ pub(crate) mod phone;
 mod readout;
 pub(crate) mod realitycapture;
 mod split;
-mod tokens;
+pub(crate) mod tokens;
 mod tracks;
 pub(crate) mod transforms;
 mod visible;
 mod world;
-pub(crate) mod xml;
 
 use crate::FormatError;
 pub(crate) use assemble::{oriented_size, turned_as_stored};

@@ -7,9 +7,9 @@
 use super::declared::{Declared, DeclaredCamera, DeclaredPose, DeclaredView, Focal, lens_or_pinhole, pose_from_axes};
 use super::files::{begins_with, first_file, is_image_name, list_files, locate_image, relative_name};
 use super::tokens::text;
-use super::xml::{Element, numbers, parse_xml};
 use crate::error::read_and_parse;
 use crate::image_file::read_header;
+use crate::xml::{numbers, parse_xml, property};
 use crate::{FormatError, Malformed};
 use glam::{DMat3, DVec3};
 use irradia_scene::Lens;
@@ -186,15 +186,7 @@ pub fn parse_realitycapture_csv(bytes: &[u8]) -> Result<Vec<RealityCaptureView>,
 /// When it has no pose or focal length, or another model of distortion.
 pub fn parse_realitycapture_xmp(bytes: &[u8]) -> Result<RealityCaptureView, Malformed> {
     let document = parse_xml(bytes)?;
-    // Values are attributes of the description, or elements in it.
-    let all = document.descendants("rdf:Description");
-    let value = |name: &str| -> Option<String> {
-        all.iter().find_map(|description: &&Element| {
-            let element = || description.child(name).map(|child| child.text.as_str());
-            description.attribute(name).or_else(element).map(str::to_owned)
-        })
-    };
-    let several = |name: &str| value(name).map(|text| numbers(&text)).unwrap_or_default();
+    let several = |name: &str| property(&document, name).map(numbers).unwrap_or_default();
     let one = |name: &str| several(name).first().copied();
     let missing = |name: &str| Malformed(format!("has no {name}; export metadata with poses from RealityCapture"));
     let rotation: [f64; 9] = several("xcr:Rotation")
@@ -203,7 +195,7 @@ pub fn parse_realitycapture_xmp(bytes: &[u8]) -> Result<RealityCaptureView, Malf
     let position: [f64; 3] = several("xcr:Position")
         .try_into()
         .map_err(|_| missing("xcr:Position of 3 numbers"))?;
-    let model = value("xcr:DistortionModel").unwrap_or_else(|| "perspective".into());
+    let model = property(&document, "xcr:DistortionModel").unwrap_or("perspective");
     let coefficients = several("xcr:DistortionCoeficients");
     let k = |i: usize| coefficients.get(i).copied().unwrap_or(0.0);
     let bends = coefficients.iter().any(|v| *v != 0.0);

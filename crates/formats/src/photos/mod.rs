@@ -1,13 +1,16 @@
 //! A folder of photographs without poses: which there are, and what took them.
 
 mod exif;
+mod gimbal;
 mod panorama;
 
 use crate::dataset::{Beside, is_image_name, list_files, oriented_size, turned_as_stored};
 use crate::error::read_file;
-use crate::image_file::{Colour, decode, decode_jpeg_at, read_exif, read_header};
+use crate::image_file::{Colour, decode, decode_jpeg_at, read_exif, read_header, read_xmp};
 use crate::{FormatError, Pixels};
 pub use exif::{CameraTags, parse_camera_tags};
+pub use gimbal::parse_gimbal;
+use glam::DVec3;
 use image::metadata::Orientation;
 use irradia_scene::resize_area;
 pub use panorama::{PanoramaFace, find_panoramas};
@@ -41,8 +44,9 @@ pub struct PhotoEntry {
     pub depth: Option<PathBuf>,
     /// Its map of normals, in the folder `normals` or `normal`.
     pub normals: Option<PathBuf>,
-    /// Where up is in the decoded picture: `[right, down]`; `[0, -1]` unless it is decoded as stored, against its EXIF orientation.
-    pub up: [i8; 2],
+    /// Where up is in the axes of the decoded picture (x right, y down, z forward), a unit vector, if metadata tell: by a drone's gimbal, or by an EXIF
+    /// orientation against which the picture is decoded as stored.
+    pub up: Option<DVec3>,
     orientation: Orientation,
     jpeg: bool,
 }
@@ -322,7 +326,13 @@ fn read_entry(file: &Found) -> Result<PhotoEntry, String> {
     }
     let stored = [header.width, header.height];
     let tags = read_exif(path).map_or_else(CameraTags::default, |block| parse_camera_tags(&block, stored));
-    let (orientation, up) = turned_as_stored(&header);
+    let (orientation, turned) = turned_as_stored(&header);
+    let gimbal = || parse_gimbal(&read_xmp(path)?);
+    let up = match (turned, header.orientation) {
+        (Some([right, down]), _) => Some(DVec3::new(f64::from(right), f64::from(down), 0.0)),
+        (None, Orientation::NoTransforms) => gimbal(),
+        (None, _) => None,
+    };
     let (width, height) = oriented_size(&header, orientation);
     Ok(PhotoEntry {
         name: file.name.clone(),

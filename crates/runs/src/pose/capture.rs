@@ -239,17 +239,13 @@ impl Capture {
                 numbers.len() - 1
             });
             let face = self.faces.get(&photo.name);
-            let [right, down] = photo.up.map(f64::from);
             PhotoInfo {
                 name: photo.name.clone(),
                 width: photo.width,
                 height: photo.height,
                 group,
                 focal_prior_px: photo.focal_px(),
-                up: Some(match face {
-                    Some((_, face)) => face.turn.inverse() * DVec3::NEG_Y,
-                    None => DVec3::new(right, down, 0.0),
-                }),
+                up: face.map_or(photo.up, |(_, face)| Some(face.turn.inverse() * DVec3::NEG_Y)),
                 camera: face.map(|(_, face)| DCamera::pinhole(&face.camera)),
                 mount: face.map(|(rig, face)| Mount {
                     rig: *rig,

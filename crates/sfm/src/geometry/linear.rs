@@ -4,6 +4,15 @@
 
 use glam::{DMat3, DVec3};
 
+/// The sum of the outer products of `vectors` with themselves.
+pub fn scatter(vectors: impl Iterator<Item = DVec3>) -> [[f64; 3]; 3] {
+    let mut sum = DMat3::ZERO;
+    for v in vectors {
+        sum += DMat3::from_cols(v * v.x, v * v.y, v * v.z);
+    }
+    sum.to_cols_array_2d()
+}
+
 /// Eigenvalues, ascending, and the eigenvectors as rows of a symmetric matrix, by cyclic Jacobi rotations.
 pub fn symmetric_eigen<const N: usize>(mut a: [[f64; N]; N]) -> ([f64; N], [[f64; N]; N]) {
     let mut vectors = [[0.0; N]; N];

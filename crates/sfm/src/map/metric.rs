@@ -1,7 +1,8 @@
 //! Metres from the places that the photographs' metadata tell.
 
 use super::types::Model;
-use crate::geometry::align::Alignment;
+use crate::geometry::align::{Alignment, align};
+use crate::geometry::linear::{scatter, symmetric_eigen};
 use crate::median;
 use glam::{DQuat, DVec2, DVec3};
 
@@ -15,6 +16,14 @@ const AGREES: f64 = 3.0;
 const MOST_TRIED: usize = 150;
 /// Smallest error of a place that is assumed, m: metadata are rounded.
 const LEAST_ERROR_M: f64 = 0.1;
+/// Photographs of which all triples are tried.
+const MOST_IN_TRIPLES: usize = 20;
+/// Cosine of the angle by which a model is thought not to be upright at least, before its places turn it: photographs tell their up within less.
+const TILTED: f64 = 0.866;
+/// How far places reach in their second direction, in standard deviations, at least, to say where up is: of those on a line every turn about it is as good.
+const WIDE: f64 = 5.0;
+/// Residual of a model turned by its places by that of the upright one, at most.
+const BETTER: f64 = 0.5;
 
 /// The scale of a model, and how well it is known.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -30,27 +39,39 @@ pub struct Metric {
 }
 
 /// Brings an upright `model` to metres, with +X east and +Y north, by the `places` of its photographs `[photos]`: east, north and up of
-/// any origin, m. Its origin and up stay. Heights are not used, since satellites tell them poorly.
+/// any origin, m. Its origin stays. So does up, and heights are not used, since satellites tell them poorly; unless the places show clearly that it is
+/// wrong: what looks straight down, as drones do, has no up of its own, and the ground stands like a wall.
 ///
 /// # Errors
 /// When too few photographs have a place (`None`), or the scale is known too poorly: its relative standard deviation.
 pub fn to_metres(model: &mut Model, places: &[Option<DVec3>]) -> Result<Metric, Option<f64>> {
-    let pairs: Vec<(DVec2, DVec2)> = model
-        .poses
-        .iter()
-        .zip(places)
-        .filter_map(|(pose, place)| Some((pose.as_ref()?.position.truncate(), place.as_ref()?.truncate())))
+    let known = model.poses.iter().zip(places);
+    let pairs: Vec<(DVec3, DVec3)> = known
+        .filter_map(|(pose, place)| Some((pose.as_ref()?.position, (*place)?)))
         .collect();
     if pairs.len() < LEAST_PHOTOS {
         return Err(None);
     }
-    let (turn, metric) = fit(&pairs).ok_or(Some(f64::INFINITY))?;
+    let level = |turn: DQuat| {
+        let pairs = pairs
+            .iter()
+            .map(|(from, to)| ((turn * *from).truncate(), to.truncate()));
+        fit(&pairs.collect::<Vec<_>>())
+    };
+    let mut rotation = DQuat::IDENTITY;
+    let mut found = level(rotation);
+    if let Some((turn, turned)) = tilt(&pairs).and_then(|turn| Some((turn, level(turn)?)))
+        && found.is_none_or(|(_, upright)| turned.1.residual_m < BETTER * upright.residual_m)
+    {
+        (rotation, found) = (turn, Some(turned));
+    }
+    let (heading, metric) = found.ok_or(Some(f64::INFINITY))?;
     if metric.scale_error.is_nan() || metric.scale_error > COARSEST {
         return Err(Some(metric.scale_error));
     }
     let alignment = Alignment {
-        scale: turn.length(),
-        rotation: DQuat::from_rotation_z(turn.y.atan2(turn.x)),
+        scale: heading.length(),
+        rotation: DQuat::from_rotation_z(heading.y.atan2(heading.x)) * rotation,
         translation: DVec3::ZERO,
     };
     for pose in model.poses.iter_mut().flatten() {
@@ -99,6 +120,40 @@ fn fit(pairs: &[(DVec2, DVec2)]) -> Option<(DVec2, Metric)> {
         scale_error: (variance / spread).sqrt(),
     };
     (2 * agreeing.len() > pairs.len()).then_some((fit[0], metric))
+}
+
+/// The turn that brings up to +Z where the places, heights included, have it elsewhere: from the similarity of three photographs with the least
+/// median distance of all, and least squares over those that agree with it. `None` where up is as it should be, or open.
+fn tilt(pairs: &[(DVec3, DVec3)]) -> Option<DQuat> {
+    let off = |fit: &Alignment, (from, to): &(DVec3, DVec3)| fit.point(*from).distance(*to);
+    let tried: Vec<_> = pairs.iter().step_by(pairs.len().div_ceil(MOST_IN_TRIPLES)).collect();
+    let mut best: Option<(f64, Alignment)> = None;
+    for (i, a) in tried.iter().enumerate() {
+        for (j, b) in tried.iter().enumerate().skip(i + 1) {
+            for c in &tried[j + 1..] {
+                let Some(fit) = align(&[**a, **b, **c]) else { continue };
+                let median = median(pairs.iter().map(|pair| off(&fit, pair)).collect())?;
+                if best.is_none_or(|(least, _)| median < least) {
+                    best = Some((median, fit));
+                }
+            }
+        }
+    }
+    let (median, first) = best?;
+    let limit = AGREES * median.max(LEAST_ERROR_M);
+    let agreeing: Vec<(DVec3, DVec3)> = pairs
+        .iter()
+        .copied()
+        .filter(|pair| off(&first, pair) <= limit)
+        .collect();
+    let fit = align(&agreeing)?;
+    let n = agreeing.len() as f64;
+    let variance = agreeing.iter().map(|pair| off(&fit, pair).powi(2)).sum::<f64>() / n;
+    let mean = agreeing.iter().map(|pair| pair.1).sum::<DVec3>() / n;
+    let ([_, second, _], _) = symmetric_eigen(scatter(agreeing.iter().map(|(_, to)| *to - mean)));
+    let up = fit.rotation.inverse() * DVec3::Z;
+    (up.z < TILTED && second / n > WIDE * WIDE * variance.max(LEAST_ERROR_M * LEAST_ERROR_M))
+        .then(|| DQuat::from_rotation_arc(up, DVec3::Z))
 }
 
 fn product(a: DVec2, b: DVec2) -> DVec2 {
@@ -179,6 +234,44 @@ mod tests {
             (position.length() / 20.0 / 1.09f64.sqrt() - 1.0).abs() < 0.03,
             "{position}"
         );
+    }
+
+    /// A survey of `rows` x 6 photographs from 40 m above the ground, in a model whose ground is its wall x-z.
+    fn survey(rows: usize) -> (Model, Vec<Option<DVec3>>) {
+        let mut rng = Rng::new(5, 5);
+        let mut model = Model::default();
+        let mut places = Vec::new();
+        for i in 0..6 * rows {
+            let place = DVec3::new(20.0 * (i % 6) as f64, 25.0 * (i / 6) as f64, 40.0);
+            let mut noise = || 0.5 * f64::from(rng.normal());
+            places.push(Some(place + DVec3::new(noise(), noise(), noise())));
+            model.poses.push(Some(DPose {
+                rotation: DQuat::IDENTITY,
+                position: DQuat::from_rotation_x(-1.5) * place / 40.0,
+            }));
+        }
+        (model, places)
+    }
+
+    #[test]
+    fn a_survey_that_stands_like_a_wall_is_laid_down() {
+        let (mut model, places) = survey(3);
+        let metric = to_metres(&mut model, &places).expect("a scale");
+        assert!(metric.photos >= 14 && metric.scale_error < 0.01, "{metric:?}");
+        let heights: Vec<f64> = model.poses.iter().flatten().map(|pose| pose.position.z).collect();
+        assert!(heights.iter().all(|height| (height - 40.0).abs() < 2.0), "{heights:?}");
+        let across = model.poses[12].expect("posed").position - model.poses[0].expect("posed").position;
+        assert!((across - DVec3::new(0.0, 50.0, 0.0)).length() < 2.0, "{across}");
+    }
+
+    #[test]
+    fn places_on_a_line_do_not_turn_a_model() {
+        let (mut model, places) = survey(1);
+        let height =
+            |model: &Model| model.poses[5].expect("posed").position.z / model.poses[5].expect("posed").position.x;
+        let before = height(&model);
+        to_metres(&mut model, &places).expect("a scale");
+        assert!((height(&model) - before).abs() < 0.02, "{} {before}", height(&model));
     }
 
     #[test]

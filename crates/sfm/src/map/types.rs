@@ -24,7 +24,7 @@ pub struct PhotoInfo {
     pub group: usize,
     /// Focal length in px if the photograph's metadata tell it.
     pub focal_prior_px: Option<f64>,
-    /// The direction up in camera axes (x right, y down, z forward) if known; otherwise -y.
+    /// The direction up in camera axes (x right, y down, z forward) if known; otherwise -y, as most photographs are held, unless all look down.
     pub up: Option<DVec3>,
     /// The camera of its group, if it is known exactly; it is held.
     pub camera: Option<DCamera>,

@@ -1,4 +1,4 @@
-//! The part of XML that cameras are exported in: elements, attributes, text. No document types, no entities beyond the five of XML.
+//! The part of XML that cameras are exported in, and metadata (XMP): elements, attributes, text. No document types, no entities beyond the five of XML.
 
 use crate::Malformed;
 
@@ -48,8 +48,19 @@ impl Element {
     }
 }
 
+/// A property of an XMP packet: an attribute of a description, or an element in it.
+pub(crate) fn property<'a>(document: &'a Element, name: &str) -> Option<&'a str> {
+    document
+        .descendants("rdf:Description")
+        .into_iter()
+        .find_map(|description| {
+            let element = || description.child(name).map(|child| child.text.as_str());
+            description.attribute(name).or_else(element)
+        })
+}
+
 /// The leading numbers of `text`, separated by white space.
-pub(super) fn numbers(text: &str) -> Vec<f64> {
+pub(crate) fn numbers(text: &str) -> Vec<f64> {
     text.split_whitespace().map_while(|word| word.parse().ok()).collect()
 }
 
@@ -58,7 +69,7 @@ pub(super) fn numbers(text: &str) -> Vec<f64> {
 /// # Errors
 /// When tags do not match, or nothing is there.
 pub fn parse_xml(bytes: &[u8]) -> Result<Element, Malformed> {
-    let mut rest = super::tokens::text(bytes)?;
+    let mut rest = crate::dataset::tokens::text(bytes)?;
     // The innermost open element last; the first one holds the root.
     let mut open = vec![Element::default()];
     while let Some(at) = rest.find('<') {

@@ -2,14 +2,16 @@
 
 use glam::Vec3;
 use irradia_scene::{Camera, Intrinsics, Pose};
+use irradia_sfm::geometry::pose::DPose;
+use irradia_sfm::upright;
 use irradia_splat::{Splats, init::focus_point};
 
 /// From where a scene is seen.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Outlook {
-    /// The focus of the training cameras, or the centre of the splats; world.
+    /// The focus of the training cameras, the ground below those of a survey, or the centre of the splats; world.
     pub center: Vec3,
-    /// Unit vector, the cameras' mean up axis.
+    /// Unit vector, as the cameras were held.
     pub up: Vec3,
     /// Mean distance of the cameras from the axis through the centre along `up`, world units.
     pub radius: f32,
@@ -19,13 +21,15 @@ pub struct Outlook {
     pub intrinsics: Intrinsics,
 }
 
+/// Splats that tell how far the ground of a survey is.
+const SAMPLE: usize = 10_000;
+
 /// From the training cameras; for a scene without them, from the distribution of its splats.
 pub(crate) fn outlook(splats: Option<&Splats>, cameras: Option<&[Camera]>) -> Outlook {
     match cameras.filter(|cameras| !cameras.is_empty()) {
         Some(cameras) => {
-            let center = focus_point(cameras);
+            let (center, up) = center_and_up(splats, cameras);
             let n = cameras.len() as f32;
-            let up = (cameras.iter().map(|c| c.pose.rotation * Vec3::NEG_Y).sum::<Vec3>() / n).normalize_or(Vec3::Z);
             let height = cameras.iter().map(|c| (c.pose.position - center).dot(up)).sum::<f32>() / n;
             let across = |c: &Camera| {
                 let offset = c.pose.position - center;
@@ -71,6 +75,27 @@ pub(crate) fn outlook(splats: Option<&Splats>, cameras: Option<&[Camera]>) -> Ou
     }
 }
 
+fn center_and_up(splats: Option<&Splats>, cameras: &[Camera]) -> (Vec3, Vec3) {
+    let pose = |camera: &Camera| DPose {
+        rotation: camera.pose.rotation.as_dquat(),
+        position: camera.pose.position.as_dvec3(),
+    };
+    let poses: Vec<DPose> = cameras.iter().map(pose).collect();
+    let points = splats.into_iter().flat_map(|splats| {
+        let every = splats.len().div_ceil(SAMPLE).max(1);
+        (0..splats.len())
+            .step_by(every)
+            .map(|i| Vec3::from(splats.mean(i)).as_dvec3())
+    });
+    match upright::survey(&poses, points.filter(|point| point.is_finite())) {
+        Some(survey) => (survey.center.as_vec3(), survey.up.as_vec3()),
+        None => {
+            let up = upright::up(poses.iter().map(|pose| (pose.rotation, None)));
+            (focus_point(cameras), up.as_vec3())
+        }
+    }
+}
+
 /// A circle around the centre of the scene, at the training cameras' mean distance and height.
 pub(crate) fn orbit(
     splats: Option<&Splats>,
@@ -101,4 +126,41 @@ pub(crate) fn orbit(
             Camera::new(Pose::look_at(eye, center, up), intrinsics)
         })
         .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use glam::Quat;
+    use irradia_scene::GaussianCloud;
+
+    #[test]
+    fn around_a_survey_means_above_its_ground() {
+        let ground = (0..400).map(|i| [0.5 * (i % 20) as f32, 0.5 * (i / 20) as f32, 0.0]);
+        let cloud = GaussianCloud {
+            means: ground.collect(),
+            quats: vec![[1.0, 0.0, 0.0, 0.0]; 400],
+            log_scales: vec![[-3.0; 3]; 400],
+            opacity_logits: vec![2.0; 400],
+            sh: vec![0.0; 1200],
+            sh_degree: 0,
+            ..GaussianCloud::default()
+        };
+        let camera = |i: usize| {
+            let pose = Pose {
+                rotation: Quat::from_rotation_x(std::f32::consts::PI),
+                position: Vec3::new(2.5 * (i % 5) as f32, 2.5 * (i / 5) as f32, 4.0),
+            };
+            Camera::new(pose, Intrinsics::from_fov_x(64, 48, 1.0))
+        };
+        let cameras: Vec<Camera> = (0..20).map(camera).collect();
+        for camera in orbit(Some(&Splats::from_cloud(&cloud)), Some(&cameras), 8, None) {
+            let forward = camera.pose.rotation * Vec3::Z;
+            assert!(
+                camera.pose.position.z > 3.0 && forward.z < -0.5,
+                "{:?} {forward}",
+                camera.pose
+            );
+        }
+    }
 }

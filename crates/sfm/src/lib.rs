@@ -18,6 +18,7 @@ pub mod matching;
 mod median;
 mod overlay;
 mod still_scene;
+pub mod upright;
 
 pub use backdrop::Backdrop;
 pub use bars::bars;

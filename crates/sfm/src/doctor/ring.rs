@@ -1,7 +1,7 @@
 //! Captures that go around something, or look around: gaps, and ends that do not meet.
 
 use super::{Diagnosis, Evidence, Graph};
-use crate::map::up;
+use crate::upright::up;
 use glam::{DQuat, DVec3};
 
 /// Photographs from which on a capture can be a ring.

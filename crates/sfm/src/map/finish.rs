@@ -3,8 +3,8 @@
 use super::model::Working;
 use super::types::{LeftOut, MapOptions, Model, ModelPoint, PairKind, PhotoInfo, Reason, VerifiedPair};
 use crate::geometry::align::Alignment;
-use crate::geometry::linear::{scatter, symmetric_eigen};
 use crate::geometry::pose::DPose;
+use crate::upright::{survey, up};
 use crate::{Features, PairMatches, median};
 use glam::{DQuat, DVec3};
 
@@ -57,18 +57,14 @@ pub(super) fn collected(working: &Working, photos: &[PhotoInfo]) -> Model {
     model
 }
 
-/// Standard deviation of the viewing directions of a survey about their mean at most, degrees.
-const PARALLEL: f64 = 15.0;
-/// Standard deviation of the positions of its cameras across their views at least, in the direction in which it is less, by the distance of the points.
-/// Of 50 captures those by kite and by drone have 0.27 and 0.47 (12 and 3 degrees); those that look ahead so nearly in parallel up to 0.21.
-const SPREAD: f64 = 0.25;
-
 /// Up is +Z, the points' median is the origin, and the cameras' median distance from it is 1.
 fn upright(model: &Model, photos: &[PhotoInfo]) -> Alignment {
     let cameras = photos.iter().zip(&model.poses);
-    let up = up(cameras.filter_map(|(photo, pose)| Some((pose.as_ref()?.rotation, photo.up))));
+    let held = || up(cameras.filter_map(|(photo, pose)| Some((pose.as_ref()?.rotation, photo.up))));
+    let poses: Vec<DPose> = model.poses.iter().flatten().copied().collect();
     let is_open = photos.iter().all(|photo| photo.up.is_none());
-    let up = is_open.then(|| survey(model)).flatten().unwrap_or(up);
+    let found = is_open.then(|| survey(&poses, model.points.iter().map(|point| point.position)));
+    let up = found.flatten().map_or_else(held, |survey| survey.up);
     let rotation = DQuat::from_rotation_arc(up, DVec3::Z);
     let middle = |values| median(values).unwrap_or(0.0);
     let center =
@@ -86,49 +82,6 @@ fn upright(model: &Model, photos: &[PhotoInfo]) -> Alignment {
         scale,
         rotation,
         translation: -scale * (rotation * center),
-    }
-}
-
-/// Up, if the cameras look straight down as those of a survey do: in one direction, from all over a plane across it, farther apart than anybody's
-/// arms who takes a wall. No photograph of it has an up of its own.
-fn survey(model: &Model) -> Option<DVec3> {
-    let poses: Vec<_> = model.poses.iter().flatten().collect();
-    let n = poses.len() as f64;
-    let forward = (poses.iter().map(|pose| pose.rotation * DVec3::Z).sum::<DVec3>()).try_normalize()?;
-    let off = |pose: &&DPose| (pose.rotation * DVec3::Z).angle_between(forward).to_degrees().powi(2);
-    let apart = (poses.iter().map(off).sum::<f64>() / n).sqrt();
-    let center = poses.iter().map(|pose| pose.position).sum::<DVec3>() / n;
-    let depths = model.points.iter().map(|point| (point.position - center).dot(forward));
-    let depth = median(depths.collect())?;
-    let across = poses
-        .iter()
-        .map(|pose| (pose.position - center).reject_from_normalized(forward));
-    // The first eigenvalue is that along the views.
-    let ([_, narrow, _], _) = symmetric_eigen(scatter(across));
-    (apart < PARALLEL && depth > 0.0 && (narrow / n).sqrt() > SPREAD * depth).then_some(-forward)
-}
-
-/// The direction up, from the rotation of each camera to the world and the direction up in its own axes, if known: photographs are
-/// held level more often than not, so that all their x axes lie in one horizontal plane.
-///
-/// Its normal is the answer if the x axes leave no doubt about it and it agrees with the mean of the photographs' own up
-/// directions; otherwise that mean.
-pub(crate) fn up(cameras: impl Iterator<Item = (DQuat, Option<DVec3>)>) -> DVec3 {
-    let mut mean = DVec3::ZERO;
-    let rights = cameras.map(|(rotation, own)| {
-        let own = own.unwrap_or(DVec3::NEG_Y);
-        mean += rotation * own;
-        rotation * own.cross(DVec3::NEG_Z).normalize_or_zero()
-    });
-    let (values, vectors) = symmetric_eigen(scatter(rights));
-    let mean = mean.normalize_or(DVec3::NEG_Y);
-    let normal = DVec3::from_array(vectors[0]);
-    let normal = normal * normal.dot(mean).signum();
-    // Within 30 degrees, and the second axis at least five times as wide as what is left over.
-    if values[1] > 5.0 * values[0] && values[1] > 0.02 * values[2] && normal.dot(mean) > 0.866 {
-        normal
-    } else {
-        mean
     }
 }
 
@@ -183,41 +136,4 @@ pub(super) fn left_out(
             reason: reason(photo),
         })
         .collect()
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    /// Cameras on a grid, `step` apart, that look along +Z at points 4 units away.
-    fn grid(step: f64) -> Model {
-        let places = (0..20).map(|i| DVec3::new(step * f64::from(i % 5), step * f64::from(i / 5), 0.0));
-        let pose = |position| DPose {
-            rotation: DQuat::from_rotation_y(0.05),
-            position,
-        };
-        let point = |i| ModelPoint {
-            position: DVec3::new(f64::from(i), 1.0, 4.0),
-            track: Vec::new(),
-            error: 0.0,
-        };
-        Model {
-            poses: places.map(|place| Some(pose(place))).collect(),
-            points: (0..9).map(point).collect(),
-            ..Model::default()
-        }
-    }
-
-    #[test]
-    fn a_survey_looks_down_and_few_steps_before_a_wall_do_not() {
-        let up = survey(&grid(1.0)).expect("a survey");
-        assert!(up.angle_between(DVec3::NEG_Z) < 0.06, "{up}");
-        assert_eq!(survey(&grid(0.5)), None);
-        // Around something.
-        let mut around = grid(1.0);
-        for (i, pose) in around.poses.iter_mut().flatten().enumerate() {
-            pose.rotation = DQuat::from_rotation_y(0.1 * i as f64 - 1.0);
-        }
-        assert_eq!(survey(&around), None);
-    }
 }

@@ -32,7 +32,6 @@ mod zoom;
 pub use absent::{ABSENT_PAIRS, absent};
 pub use agree::{agreement, contradictions, strengths, telling};
 pub use distance::{Distance, DistanceFit, to_distances};
-pub(crate) use finish::up;
 pub use focal::Source;
 pub use guide::add_guided_points;
 pub use metric::{Metric, to_metres};

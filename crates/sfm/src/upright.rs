@@ -45,7 +45,7 @@ pub struct Survey {
 }
 
 /// The survey that `cameras` made of `points`, if they look straight down as those of one do: in one direction, from all over a plane across it,
-/// farther apart than anybody's arms who takes a wall. No photograph of it has an up of its own.
+/// farther apart than handheld photographs of a wall are. None of its photographs has an up of its own.
 pub fn survey(cameras: &[DPose], points: impl Iterator<Item = DVec3>) -> Option<Survey> {
     let n = cameras.len() as f64;
     let forward = (cameras.iter().map(|pose| pose.rotation * DVec3::Z).sum::<DVec3>()).try_normalize()?;

@@ -173,26 +173,34 @@ fn read_jpeg_header(path: &Path) -> Result<Option<Header>, FormatError> {
         }))
 }
 
-/// The EXIF block of an image, beginning with its TIFF header, if there is one.
-pub(crate) fn read_exif(path: &Path) -> Option<Vec<u8>> {
-    let mut reader = BufReader::new(File::open(path).ok()?);
-    if reader.fill_buf().ok()?.starts_with(&[0xFF, 0xD8]) {
-        let mut decoder = jpeg_decoder::Decoder::new(reader);
-        decoder.read_info().ok()?;
-        return decoder.exif_data().map(<[u8]>::to_vec);
-    }
-    open(path).ok()?.0.exif_metadata().ok()?
+/// What cameras write beside the pixels; empty where nothing can be read.
+#[derive(Default)]
+pub(crate) struct Metadata {
+    /// The EXIF block, beginning with its TIFF header.
+    pub(crate) exif: Option<Vec<u8>>,
+    /// The XMP packet.
+    pub(crate) xmp: Option<Vec<u8>>,
 }
 
-/// The XMP packet of an image, if there is one.
-pub(crate) fn read_xmp(path: &Path) -> Option<Vec<u8>> {
-    let mut reader = BufReader::new(File::open(path).ok()?);
-    if reader.fill_buf().ok()?.starts_with(&[0xFF, 0xD8]) {
-        let mut decoder = jpeg_decoder::Decoder::new(reader);
-        decoder.read_info().ok()?;
-        return decoder.xmp_data().map(<[u8]>::to_vec);
-    }
-    open(path).ok()?.0.xmp_metadata().ok()?
+/// The metadata of an image, in one pass over its headers.
+pub(crate) fn read_metadata(path: &Path) -> Metadata {
+    let read = || {
+        let mut reader = BufReader::new(File::open(path).ok()?);
+        if reader.fill_buf().ok()?.starts_with(&[0xFF, 0xD8]) {
+            let mut decoder = jpeg_decoder::Decoder::new(reader);
+            decoder.read_info().ok()?;
+            return Some(Metadata {
+                exif: decoder.exif_data().map(<[u8]>::to_vec),
+                xmp: decoder.xmp_data().map(<[u8]>::to_vec),
+            });
+        }
+        let mut decoder = open(path).ok()?.0;
+        Some(Metadata {
+            exif: decoder.exif_metadata().ok().flatten(),
+            xmp: decoder.xmp_metadata().ok().flatten(),
+        })
+    };
+    read().unwrap_or_default()
 }
 
 /// The pixels, with `orientation` applied.

@@ -51,12 +51,15 @@ pub fn survey(cameras: &[DPose], points: impl Iterator<Item = DVec3>) -> Option<
     let forward = (cameras.iter().map(|pose| pose.rotation * DVec3::Z).sum::<DVec3>()).try_normalize()?;
     let off = |pose: &DPose| (pose.rotation * DVec3::Z).angle_between(forward).to_degrees().powi(2);
     let apart = (cameras.iter().map(off).sum::<f64>() / n).sqrt();
+    if apart >= PARALLEL {
+        return None;
+    }
     let mean = cameras.iter().map(|pose| pose.position).sum::<DVec3>() / n;
     let depth = median(points.map(|point| (point - mean).dot(forward)).collect())?;
     let across = (cameras.iter()).map(|pose| (pose.position - mean).reject_from_normalized(forward));
     // The first eigenvalue is that along the views.
     let ([_, narrow, _], _) = symmetric_eigen(scatter(across));
-    (apart < PARALLEL && depth > 0.0 && (narrow / n).sqrt() > SPREAD * depth).then_some(Survey {
+    (depth > 0.0 && (narrow / n).sqrt() > SPREAD * depth).then_some(Survey {
         up: -forward,
         center: mean + depth * forward,
     })

@@ -6,7 +6,7 @@ mod panorama;
 
 use crate::dataset::{Beside, is_image_name, list_files, oriented_size, turned_as_stored};
 use crate::error::read_file;
-use crate::image_file::{Colour, decode, decode_jpeg_at, read_exif, read_header, read_xmp};
+use crate::image_file::{Colour, decode, decode_jpeg_at, read_header, read_metadata};
 use crate::{FormatError, Pixels};
 pub use exif::{CameraTags, parse_camera_tags};
 pub use gimbal::parse_gimbal;
@@ -325,12 +325,14 @@ fn read_entry(file: &Found) -> Result<PhotoEntry, String> {
         hash ^= mask_hash(mask).map_err(reason)?;
     }
     let stored = [header.width, header.height];
-    let tags = read_exif(path).map_or_else(CameraTags::default, |block| parse_camera_tags(&block, stored));
+    let metadata = read_metadata(path);
+    let tags = metadata
+        .exif
+        .map_or_else(CameraTags::default, |block| parse_camera_tags(&block, stored));
     let (orientation, turned) = turned_as_stored(&header);
-    let gimbal = || parse_gimbal(&read_xmp(path)?);
     let up = match (turned, header.orientation) {
         (Some([right, down]), _) => Some(DVec3::new(f64::from(right), f64::from(down), 0.0)),
-        (None, Orientation::NoTransforms) => gimbal(),
+        (None, Orientation::NoTransforms) => metadata.xmp.and_then(|packet| parse_gimbal(&packet)),
         (None, _) => None,
     };
     let (width, height) = oriented_size(&header, orientation);

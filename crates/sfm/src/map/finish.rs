@@ -62,9 +62,10 @@ fn upright(model: &Model, photos: &[PhotoInfo]) -> Alignment {
     let cameras = photos.iter().zip(&model.poses);
     let held = || up(cameras.filter_map(|(photo, pose)| Some((pose.as_ref()?.rotation, photo.up))));
     let poses: Vec<DPose> = model.poses.iter().flatten().copied().collect();
+    let points = model.points.iter().map(|point| point.position);
     let is_open = photos.iter().all(|photo| photo.up.is_none());
-    let found = is_open.then(|| survey(&poses, model.points.iter().map(|point| point.position)));
-    let up = found.flatten().map_or_else(held, |survey| survey.up);
+    let survey = survey(&poses, points).filter(|_| is_open);
+    let up = survey.map_or_else(held, |survey| survey.up);
     let rotation = DQuat::from_rotation_arc(up, DVec3::Z);
     let middle = |values| median(values).unwrap_or(0.0);
     let center =

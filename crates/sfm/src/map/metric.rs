@@ -83,29 +83,29 @@ pub fn to_metres(model: &mut Model, places: &[Option<DVec3>]) -> Result<Metric, 
     Ok(metric)
 }
 
+/// The pairs that agree with the one of `fits` that has the least median distance of all; `None` without any.
+fn agreeing<P: Copy, F>(pairs: &[P], fits: impl Iterator<Item = F>, off: impl Fn(&F, &P) -> f64) -> Option<Vec<P>> {
+    let mut best: Option<(f64, F)> = None;
+    for fit in fits {
+        let median = median(pairs.iter().map(|pair| off(&fit, pair)).collect())?;
+        if best.as_ref().is_none_or(|(least, _)| median < *least) {
+            best = Some((median, fit));
+        }
+    }
+    let (median, best) = best?;
+    let limit = AGREES * median.max(LEAST_ERROR_M);
+    Some(pairs.iter().copied().filter(|pair| off(&best, pair) <= limit).collect())
+}
+
 /// Scale and turn, as a complex number, from pairs (model, metres): the fit of two photographs with the least median distance of all,
 /// then least squares over those that agree with it.
 fn fit(pairs: &[(DVec2, DVec2)]) -> Option<(DVec2, Metric)> {
-    let mut best: Option<(f64, [DVec2; 2])> = None;
     let tried: Vec<_> = pairs.iter().step_by(pairs.len().div_ceil(MOST_TRIED)).collect();
-    for (i, a) in tried.iter().enumerate() {
-        for b in &tried[i + 1..] {
-            let Some(fit) = least_squares(&[**a, **b]) else {
-                continue;
-            };
-            let median = median(pairs.iter().map(|pair| distance(&fit, pair)).collect())?;
-            if best.is_none_or(|(least, _)| median < least) {
-                best = Some((median, fit));
-            }
-        }
-    }
-    let (median, first) = best?;
-    let limit = AGREES * median.max(LEAST_ERROR_M);
-    let agreeing: Vec<(DVec2, DVec2)> = pairs
-        .iter()
-        .copied()
-        .filter(|pair| distance(&first, pair) <= limit)
-        .collect();
+    let twos = tried.iter().enumerate().flat_map(|(i, a)| {
+        let rest = tried[i + 1..].iter();
+        rest.filter_map(|b| least_squares(&[**a, **b]))
+    });
+    let agreeing = agreeing(pairs, twos, distance)?;
     let fit = least_squares(&agreeing)?;
     let n = agreeing.len() as f64;
     let squares: f64 = agreeing.iter().map(|pair| distance(&fit, pair).powi(2)).sum();
@@ -127,25 +127,10 @@ fn fit(pairs: &[(DVec2, DVec2)]) -> Option<(DVec2, Metric)> {
 fn tilt(pairs: &[(DVec3, DVec3)]) -> Option<DQuat> {
     let off = |fit: &Alignment, (from, to): &(DVec3, DVec3)| fit.point(*from).distance(*to);
     let tried: Vec<_> = pairs.iter().step_by(pairs.len().div_ceil(MOST_IN_TRIPLES)).collect();
-    let mut best: Option<(f64, Alignment)> = None;
-    for (i, a) in tried.iter().enumerate() {
-        for (j, b) in tried.iter().enumerate().skip(i + 1) {
-            for c in &tried[j + 1..] {
-                let Some(fit) = align(&[**a, **b, **c]) else { continue };
-                let median = median(pairs.iter().map(|pair| off(&fit, pair)).collect())?;
-                if best.is_none_or(|(least, _)| median < least) {
-                    best = Some((median, fit));
-                }
-            }
-        }
-    }
-    let (median, first) = best?;
-    let limit = AGREES * median.max(LEAST_ERROR_M);
-    let agreeing: Vec<(DVec3, DVec3)> = pairs
-        .iter()
-        .copied()
-        .filter(|pair| off(&first, pair) <= limit)
-        .collect();
+    let count = tried.len();
+    let triples = (0..count).flat_map(|i| (i + 1..count).flat_map(move |j| (j + 1..count).map(move |k| [i, j, k])));
+    let threes = triples.filter_map(|photos| align(&photos.map(|i| *tried[i])));
+    let agreeing = agreeing(pairs, threes, off)?;
     let fit = align(&agreeing)?;
     let n = agreeing.len() as f64;
     let variance = agreeing.iter().map(|pair| off(&fit, pair).powi(2)).sum::<f64>() / n;

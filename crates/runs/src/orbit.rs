@@ -1,5 +1,7 @@
 //! Where a scene is seen from: its centre and up axis, and cameras on a circle around it.
 
+use std::f32::consts::{FRAC_PI_2, PI, TAU};
+
 use glam::Vec3;
 use irradia_scene::{Camera, Intrinsics, Pose};
 use irradia_sfm::geometry::pose::DPose;
@@ -96,7 +98,27 @@ fn center_and_up(splats: Option<&Splats>, cameras: &[Camera]) -> (Vec3, Vec3) {
     }
 }
 
-/// A circle around the centre of the scene, at the training cameras' mean distance and height.
+/// A gap between the azimuths of adjacent cameras, beyond which what lies there was not photographed; radians.
+const GAP: f32 = FRAC_PI_2;
+/// The least half-width of an arc, for cameras that hardly move, radians.
+const LEAST_HALF: f32 = 0.1;
+
+/// The middle and half the width of the arc that holds all `azimuths`, radians; `None` where they lie all around.
+fn arc(mut azimuths: Vec<f32>) -> Option<(f32, f32)> {
+    azimuths.sort_unstable_by(f32::total_cmp);
+    let n = azimuths.len();
+    let next = |i: usize| azimuths[(i + 1) % n] + if i + 1 == n { TAU } else { 0.0 };
+    let (last, gap) = (0..n)
+        .map(|i| (i, next(i) - azimuths[i]))
+        .max_by(|a, b| a.1.total_cmp(&b.1))?;
+    let half = 0.5 * (TAU - gap);
+    // Between -pi and pi, as azimuths are.
+    let middle = (next(last) + half + PI).rem_euclid(TAU) - PI;
+    (gap > GAP).then_some((middle, half.max(LEAST_HALF)))
+}
+
+/// A circle around the centre of the scene, at the training cameras' mean distance and height; there and back where these stand on one side of it.
+/// It starts at the azimuth of the first camera.
 pub(crate) fn orbit(
     splats: Option<&Splats>,
     cameras: Option<&[Camera]>,
@@ -114,14 +136,28 @@ pub(crate) fn orbit(
         let fov_x = 2.0 * (0.5 * intrinsics.width as f32 / intrinsics.fx).atan();
         intrinsics = Intrinsics::from_fov_x(width, height, fov_x);
     }
-    // The circle starts at the azimuth of the first camera.
-    let first = cameras.and_then(|cameras| cameras.first());
-    let toward = first.map_or(up.any_orthonormal_vector(), |c| c.pose.position - center);
+    let cameras = cameras.unwrap_or_default();
+    let toward = cameras
+        .first()
+        .map_or(up.any_orthonormal_vector(), |c| c.pose.position - center);
     let x = (toward - up * toward.dot(up)).normalize_or(up.any_orthonormal_vector());
     let y = up.cross(x);
+    let azimuth = |camera: &Camera| {
+        let offset = camera.pose.position - center;
+        offset.dot(y).atan2(offset.dot(x))
+    };
+    let arc = arc(cameras.iter().map(azimuth).collect());
     (0..frames)
         .map(|i| {
-            let angle = std::f32::consts::TAU * i as f32 / frames as f32;
+            let turn = TAU * i as f32 / frames as f32;
+            let angle = match arc {
+                // The first camera's azimuth is zero.
+                Some((middle, half)) => {
+                    let start = (-middle / half).clamp(-1.0, 1.0).asin();
+                    middle + half * (turn + start).sin()
+                }
+                None => turn,
+            };
             let eye = center + radius * (x * angle.cos() + y * angle.sin()) + up * height;
             Camera::new(Pose::look_at(eye, center, up), intrinsics)
         })
@@ -133,6 +169,47 @@ mod tests {
     use super::*;
     use glam::Quat;
     use irradia_scene::GaussianCloud;
+
+    /// Cameras at these azimuths, degrees, on a circle of radius 3 around the z axis.
+    fn ring(azimuths: impl IntoIterator<Item = f32>) -> Vec<Camera> {
+        let camera = |degrees: f32| {
+            let (sin, cos) = degrees.to_radians().sin_cos();
+            let pose = Pose::look_at(Vec3::new(3.0 * cos, 3.0 * sin, 1.0), Vec3::ZERO, Vec3::Z);
+            Camera::new(pose, Intrinsics::from_fov_x(64, 48, 1.0))
+        };
+        azimuths.into_iter().map(camera).collect()
+    }
+
+    fn azimuths(cameras: &[Camera]) -> Vec<f32> {
+        let azimuth = |c: &Camera| c.pose.position.y.atan2(c.pose.position.x).to_degrees();
+        cameras.iter().map(azimuth).collect()
+    }
+
+    #[test]
+    fn an_orbit_stays_on_the_side_that_was_photographed() {
+        // Across the cut of the azimuths, from 120 to 240 degrees.
+        let cameras = ring((0..=12).map(|i| 10.0 * i as f32 + 120.0));
+        let seen = azimuths(&orbit(None, Some(&cameras), 64, None));
+        let beside = seen.iter().map(|azimuth| (azimuth.abs() - 180.0).abs());
+        let width = beside.clone().fold(0.0, f32::max);
+        assert!((width - 60.0).abs() < 0.5, "{seen:?}");
+        assert!((seen[0] - 120.0).abs() < 0.5, "{seen:?}");
+        let step = |i: usize| (seen[(i + 1) % 64] - seen[i] + 540.0).rem_euclid(360.0) - 180.0;
+        assert!((0..64).all(|i| step(i).abs() < 7.0), "{seen:?}");
+
+        let alone = azimuths(&orbit(None, Some(&ring([30.0])), 16, None));
+        assert!(alone.iter().all(|azimuth| azimuth.is_finite()), "{alone:?}");
+    }
+
+    #[test]
+    fn an_orbit_of_cameras_all_around_is_a_circle() {
+        let cameras = ring((0..9).map(|i| 35.0 * i as f32));
+        let seen = azimuths(&orbit(None, Some(&cameras), 4, None));
+        for (azimuth, expected) in seen.iter().zip([0.0, 90.0, 180.0, -90.0]) {
+            let off = (azimuth - expected + 540.0).rem_euclid(360.0) - 180.0;
+            assert!(off.abs() < 0.5, "{seen:?}");
+        }
+    }
 
     #[test]
     fn around_a_survey_means_above_its_ground() {

@@ -55,10 +55,25 @@ pub enum Active<'a> {
     All,
 }
 
+/// Learning rates: that of a plane times that of an item.
+#[derive(Clone, Copy, Debug)]
+pub struct AdamRates<'a> {
+    /// One for each plane; a plane whose rate is 0 rests with its moments.
+    pub planes: &'a [f32],
+    /// One for each item (length: the stride); 1 when absent.
+    pub items: Option<&'a [f32]>,
+}
+
+impl<'a> AdamRates<'a> {
+    /// The same for all items of a plane.
+    pub fn of_planes(planes: &'a [f32]) -> Self {
+        Self { planes, items: None }
+    }
+}
+
 /// One step on every plane.
 ///
-/// `parameters`, `gradients` and both `moments` have the same shape; `rates[c]` is plane `c`'s learning rate, and a plane whose
-/// rate is 0 rests with its moments. Pieces of planes run in parallel; the result does not depend on how.
+/// `parameters`, `gradients` and both `moments` have the same shape. Pieces of planes run in parallel; the result does not depend on how.
 ///
 /// # Panics
 /// When shapes differ.
@@ -67,7 +82,7 @@ pub fn adam(
     parameters: &mut Planes,
     gradients: &Planes,
     moments: [&mut Planes; 2],
-    rates: &[f32],
+    rates: AdamRates,
     active: Active,
     step: AdamStep,
 ) {
@@ -83,9 +98,10 @@ pub fn adam(
         Active::Dense(flags) => flags.len() == stride,
         Active::All => true,
     };
+    let rated = rates.planes.len() == count && rates.items.is_none_or(|items| items.len() == stride);
     assert!(
-        rates.len() == count && complete,
-        "a rate a plane, a flag an item, a count a run"
+        rated && complete,
+        "a rate a plane and an item, a flag an item, a count a run"
     );
     if stride == 0 {
         return;
@@ -96,7 +112,7 @@ pub fn adam(
         .zip(gradients.as_slice().par_chunks(stride))
         .zip(first.as_mut_slice().par_chunks_mut(stride))
         .zip(second.as_mut_slice().par_chunks_mut(stride))
-        .zip(rates)
+        .zip(rates.planes)
         .filter(|(_, rate)| **rate != 0.0)
         .for_each(|((((parameters, gradients), first), second), rate)| {
             parameters
@@ -115,6 +131,7 @@ pub fn adam(
                         len,
                         active,
                         rate: *rate,
+                        of_items: rates.items,
                         step,
                     });
                 });
@@ -146,6 +163,15 @@ impl<L: Lanes<Scalar = f32>> AdamRule<L> {
         }
     }
 
+    /// The rule at `factor` times its learning rate.
+    #[inline(always)]
+    fn at(&self, factor: L) -> Self {
+        Self {
+            rate: self.rate * factor,
+            ..*self
+        }
+    }
+
     /// Parameter and both moments after the gradient `g`.
     #[inline(always)]
     pub fn step(&self, g: L, parameter: L, first: L, second: L) -> [L; 3] {
@@ -171,6 +197,7 @@ struct AdamPiece<'a> {
     len: usize,
     active: Active<'a>,
     rate: f32,
+    of_items: Option<&'a [f32]>,
     step: AdamStep,
 }
 
@@ -213,6 +240,7 @@ impl Kernel for AdamPiece<'_> {
                 let m_old = simd.load(&self.first[at..]);
                 let v_old = simd.load(&self.second[at..]);
                 let p_old = simd.load(&self.parameter[at..]);
+                let rule = self.of_items.map_or(rule, |rates| rule.at(simd.load(&rates[item..])));
                 let [mut p, mut m, mut v] = rule.step(g, p_old, m_old, v_old);
                 if dense {
                     m = m.masked(faintest.lt(m.abs()));
@@ -253,6 +281,8 @@ mod tests {
     /// Items come and go, each at its own pace, and have no gradient worth reading while they are away; some never come.
     fn agrees_with_the_paper(dense: bool) {
         let (n, rate, steps) = (3 * RUN + 37, 0.01, 12);
+        // The rate of each item.
+        let of_item = |i: usize| [1.0, 0.25, 0.5][i % 3];
         // The items of the second run never come.
         let present = |i: usize, t: u64| i / RUN != 1 && i % 5 != 4 && (t + i as u64).is_multiple_of(1 + i as u64 % 4);
         for level in Level::all() {
@@ -273,9 +303,9 @@ mod tests {
                     let gradient = ((i % 37) as f32 - 10.5) * 0.1 + t as f32 * 0.03;
                     if present(i, t) {
                         g.set(1, i, gradient);
-                        expected[i].step(f64::from(gradient), rate, t);
+                        expected[i].step(f64::from(gradient), rate * f64::from(of_item(i)), t);
                     } else if dense {
-                        expected[i].step(0.0, rate, t);
+                        expected[i].step(0.0, rate * f64::from(of_item(i)), t);
                     }
                 }
                 let step = AdamStep {
@@ -285,12 +315,17 @@ mod tests {
                     step: t,
                 };
                 let rates = [0.0, rate as f32];
+                let items: Vec<f32> = (0..p.stride()).map(of_item).collect();
                 let active = if dense {
                     Active::Dense(&active)
                 } else {
                     Active::Sparse(&active, &counts)
                 };
-                adam(level, &mut p, &g, [&mut m, &mut v], &rates, active, step);
+                let rates = AdamRates {
+                    planes: &rates,
+                    items: Some(&items),
+                };
+                adam(level, &mut p, &g, [&mut m, &mut v], rates, active, step);
             }
             for (i, expected) in expected.iter().enumerate() {
                 assert_eq!(p.get(0, i), 0.0, "a plane with rate 0 rests");
@@ -329,7 +364,8 @@ mod tests {
                 step: t,
             };
             let active = Active::Dense(&absent);
-            adam(Level::detect(), &mut p, &g, [&mut m, &mut v], &[0.01], active, step);
+            let (moments, rates) = ([&mut m, &mut v], AdamRates::of_planes(&[0.01]));
+            adam(Level::detect(), &mut p, &g, moments, rates, active, step);
             assert!(m.get(0, 0) == 0.0 || m.get(0, 0).is_normal(), "step {t}");
         }
         assert_eq!(m.get(0, 0), 0.0);

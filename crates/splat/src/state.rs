@@ -2,7 +2,7 @@ use crate::regularize::Regularized;
 use crate::render::CHUNK;
 use crate::{COLUMN_NAMES, SplatGradients, Splats};
 use irradia_compute::Planes;
-use irradia_compute::adam::{Active, AdamStep, adam};
+use irradia_compute::adam::{Active, AdamRates, AdamStep, adam};
 use irradia_compute::simd::Level;
 use irradia_compute::sort::{Pair, pair, payload, sort_by_key};
 use rayon::prelude::*;
@@ -47,6 +47,9 @@ pub struct Optimizer {
 pub struct Rates {
     /// Of the means, world units per step.
     pub means: f32,
+    /// The camera of the last frame, world: where it is given, `means` is relative to the distance of each splat from it, so that a step looks as
+    /// large wherever a splat is.
+    pub means_from: Option<[f32; 3]>,
     /// Of the raw quaternions.
     pub quats: f32,
     /// Of the ln scales.
@@ -64,6 +67,7 @@ impl Rates {
     pub fn scaled(self, factor: f32) -> Self {
         Self {
             means: self.means * factor,
+            means_from: self.means_from,
             quats: self.quats * factor,
             log_scales: self.log_scales * factor,
             opacities: self.opacities * factor,
@@ -246,12 +250,13 @@ impl SplatState {
             Regularized::Visible => active,
             Regularized::All => Active::All,
         };
+        let distances = rates.means_from.map(|from| distances(&self.splats.means, from));
         let rules = [
-            (vec![rates.means; 3], active),
-            (vec![rates.quats; 4], active),
-            (vec![rates.log_scales; 3], shape_active),
-            (vec![rates.opacities], shape_active),
-            (sh, active),
+            (vec![rates.means; 3], distances.as_deref(), active),
+            (vec![rates.quats; 4], None, active),
+            (vec![rates.log_scales; 3], None, shape_active),
+            (vec![rates.opacities], None, shape_active),
+            (sh, None, active),
         ];
         let [first, second] = &mut self.moments;
         let columns = self
@@ -260,10 +265,11 @@ impl SplatState {
             .into_iter()
             .zip(first.columns_mut())
             .zip(second.columns_mut());
-        for (((parameters, first), second), (g, (rates, active))) in
+        for (((parameters, first), second), (g, (planes, items, active))) in
             columns.zip(gradients.splats.columns().into_iter().zip(rules))
         {
-            adam(level, parameters, g, [first, second], &rates, active, optimizer.step);
+            let rates = AdamRates { planes: &planes, items };
+            adam(level, parameters, g, [first, second], rates, active, optimizer.step);
         }
     }
 
@@ -314,6 +320,20 @@ impl SplatState {
             },
         );
     }
+}
+
+/// Distance of every item of `means` from `center`, world units, as long as the stride.
+fn distances(means: &Planes, center: [f32; 3]) -> Vec<f32> {
+    let mut distances = vec![0.0; means.stride()];
+    let [x, y, z] = [0, 1, 2].map(|c| means.plane(c).par_chunks(CHUNK));
+    let chunks = distances.par_chunks_mut(CHUNK).zip(x).zip(y.zip(z));
+    chunks.for_each(|((distances, x), (y, z))| {
+        for (distance, ((x, y), z)) in distances.iter_mut().zip(x.iter().zip(y).zip(z)) {
+            let [x, y, z] = [x - center[0], y - center[1], z - center[2]];
+            *distance = (x * x + y * y + z * z).sqrt();
+        }
+    });
+    distances
 }
 
 /// Indices in Morton (Z-curve) order of the positions, 10 bits per axis, over the box of the central 98 % of each axis (otherwise
@@ -376,6 +396,44 @@ mod tests {
         assert_eq!(column(&state.splats.means, 0), [2.0, 0.0, 0.0, 1.0, 2.0]);
         assert_eq!(column(&state.moments[1].means, 0), [20.0, 0.0, 0.0, 0.0, 0.0]);
         assert_eq!(column(&state.statistics, SplatState::SEEN), [200.0, 0.0, 0.0, 0.0, 0.0]);
+    }
+
+    /// The first step of Adam is the rate, whatever the gradient.
+    #[test]
+    fn steps_of_means_are_relative_to_the_distance_from_the_camera_if_it_is_given() {
+        let mut splats = Splats::zeros(3, 0);
+        for (i, z) in [1.0, 4.0, 30.0].into_iter().enumerate() {
+            splats.means.set(2, i, z);
+        }
+        let mut gradients = SplatGradients {
+            splats: Splats::zeros(3, 0),
+            active: vec![1.0; splats.means.stride()],
+            counts: vec![3],
+            ..SplatGradients::default()
+        };
+        (0..3).for_each(|i| gradients.splats.means.set(0, i, 0.1 + i as f32));
+        let optimizer = Optimizer {
+            step: AdamStep {
+                beta1: 0.9,
+                beta2: 0.999,
+                epsilon: 1e-15,
+                step: 1,
+            },
+            dense: true,
+        };
+        for (means_from, expected) in [(None, [0.01; 3]), (Some([0.0, 0.0, 2.0]), [0.01, 0.02, 0.28])] {
+            let mut state = SplatState::new(splats.clone());
+            let rates = Rates {
+                means: 0.01,
+                means_from,
+                ..Rates::default()
+            };
+            state.step(Level::detect(), &gradients, Regularized::Visible, &rates, 0, optimizer);
+            for (i, expected) in expected.into_iter().enumerate() {
+                let moved = -state.splats.means.get(0, i);
+                assert!((moved - expected).abs() < 1e-5 * expected, "{i}: {moved} {expected}");
+            }
+        }
     }
 
     #[test]

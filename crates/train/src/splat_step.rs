@@ -59,7 +59,7 @@ impl Trainer {
                 .as_ref()
                 .map(|(samples, reach)| (&samples[..], *reach, &camera.intrinsics)),
         };
-        let (update, has_lpips) = (self.update(&plan, &camera), self.options.lpips.is_some());
+        let (update, has_lpips) = (self.update(&plan, view, &camera), self.options.lpips.is_some());
         let ahead = self.sockets.are_empty().then(|| {
             let frame = (&camera, &options);
             self.device_loss
@@ -145,11 +145,19 @@ impl Trainer {
         loss
     }
 
-    /// The splat update of this step, whose view is that of `camera`.
-    fn update(&self, plan: &StepPlan, camera: &Camera) -> Update {
+    /// The splat update of this step, whose view `view` is seen by `camera`.
+    fn update(&self, plan: &StepPlan, view: usize, camera: &Camera) -> Update {
         let longer = self.pace.min(1.0).powf(f64::from(self.recipe.length_exponent)) as f32;
         let mut rates = plan.rates().scaled(longer);
-        rates.means *= self.extent_of_rate;
+        // Of what is as far away as most of the scene.
+        let typical_rate = rates.means * self.extent_of_rate;
+        if self.recipe.extent_pixels > 0.0 {
+            let k = &self.dataset.views[view].camera.intrinsics;
+            rates.means *= self.recipe.extent_pixels / k.fx.max(k.fy);
+            rates.means_from = Some(camera.pose.position.to_array());
+        } else {
+            rates.means = typical_rate;
+        }
         let adam = &self.recipe.adam;
         let (noise, limit) = (plan.value(Param::Noise), plan.value(Param::ConditionCap));
         Update {
@@ -173,7 +181,7 @@ impl Trainer {
                 dense: adam.kind == AdamKind::Dense,
             },
             noise: (noise > 0.0).then_some(Noise {
-                amount: noise * rates.means,
+                amount: noise * typical_rate,
                 seed: self.options.seed,
                 step: self.clock.step,
             }),

@@ -139,7 +139,7 @@ pub struct Trainer {
     pub pace: f64,
     /// Extent of the scene, world units: 1.1 times the largest distance of a camera from their mean (3DGS).
     pub extent: f32,
-    /// What the rate of the means is relative to, world units: the extent, or a number of pixels.
+    /// What the rate of the means is relative to, world units: the extent, or a number of pixels at the depth of what most views show.
     pub(crate) extent_of_rate: f32,
     /// Wall time of all steps so far, excluding the loading of photographs and the evaluation of held-out views.
     pub seconds: f64,

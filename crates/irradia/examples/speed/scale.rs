@@ -172,6 +172,7 @@ pub fn update(dense: bool, regularizers: Regularizers) -> Update {
         trained_fraction: 1.0,
         rates: Rates {
             means: rate,
+            means_from: None,
             quats: rate,
             log_scales: rate,
             opacities: rate,

@@ -206,6 +206,7 @@ pub(super) fn usual_update() -> Update {
         trained_fraction: 1.0,
         rates: Rates {
             means: 1e-3,
+            means_from: None,
             quats: 1e-3,
             log_scales: 5e-3,
             opacities: 2e-2,
@@ -264,8 +265,16 @@ fn steps_agree_with_the_cpu_under_every_option_of_an_update() {
         },
     ];
     let (splats, camera) = scene(4000, 2, 40);
+    let by_distance = Update {
+        rates: Rates {
+            means_from: Some(camera.pose.position.to_array()),
+            ..base.rates
+        },
+        ..base
+    };
+    let updates = updates.into_iter().chain([by_distance]);
     let [v_color, .., error] = gradients(&camera, 6);
-    for (case, update) in updates.into_iter().enumerate() {
+    for (case, update) in updates.enumerate() {
         let mut engines = [0, 1].map(|_| Engine::new(SplatState::new(splats.clone())));
         engines[1].use_device(&Device::Gpu(gpu.clone())).unwrap();
         for step in 1..=3 {

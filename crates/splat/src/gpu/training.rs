@@ -30,6 +30,7 @@ mod update_flag {
     pub const GRADIENT: u32 = 32;
     pub const ABSOLUTE: u32 = 64;
     pub const ERROR: u32 = 128;
+    pub const DISTANCE: u32 = 256;
 }
 
 /// Which gradients a frame on the device has.
@@ -411,6 +412,7 @@ impl GpuTraining {
                 update_flag::ABSOLUTE,
             ),
             (update.statistics == Some(Statistics::Error), update_flag::ERROR),
+            (rates.means_from.is_some(), update_flag::DISTANCE),
         ];
         let floats = [
             [rates.means, rates.quats, rates.log_scales, rates.opacities].map(rate),

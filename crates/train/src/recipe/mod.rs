@@ -83,8 +83,8 @@ documented! {
         /// degrees apart, splats that only one of them sees, among other cameras and away from points, are moved far away.
         #[serde(default, skip_serializing_if = "is_default")]
         pub free_space: f32,
-        /// The extent to which `rate_means` is relative, in pixels of the training images at the depth of what they show; 0: the largest distance of
-        /// a camera from their mean, as in 3DGS, which says little about how large the scene is in the images.
+        /// The extent to which `rate_means` is relative, in pixels of the training images at the distance of each splat from the camera of the step;
+        /// 0: the largest distance of a camera from their mean, as in 3DGS, which says little about how large the scene is in the images.
         #[serde(default, skip_serializing_if = "is_default")]
         pub extent_pixels: f32,
         /// Exponent of the rates' dependence on the length of a run that is longer than the recipe: with 0.5 a run of four times the

@@ -135,6 +135,7 @@ impl StepPlan {
     pub fn rates(&self) -> Rates {
         Rates {
             means: self.value(Param::RateMeans),
+            means_from: None,
             quats: self.value(Param::RateQuats),
             log_scales: self.value(Param::RateScales),
             opacities: self.value(Param::RateOpacities),

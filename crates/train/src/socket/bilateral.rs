@@ -10,7 +10,7 @@
 
 use super::{Occupant, pieces};
 use crate::tensor_file::{NamedTensor, TensorSource, to_bytes};
-use irradia_compute::adam::{Active, AdamStep, adam};
+use irradia_compute::adam::{Active, AdamRates, AdamStep, adam};
 use irradia_compute::simd::{Kernel, Lanes, Simd};
 use irradia_compute::{Level, Planes};
 use rayon::prelude::*;
@@ -142,7 +142,8 @@ impl BilateralGrid {
         let [first, second] = &mut learnt.moments;
         let gradient = Planes::from_interleaved(1, &gradient);
         let (own, moments) = (&mut learnt.own, [first, second]);
-        adam(Level::detect(), own, &gradient, moments, &[rate], Active::All, step);
+        let rates = AdamRates::of_planes(std::slice::from_ref(&rate));
+        adam(Level::detect(), own, &gradient, moments, rates, Active::All, step);
         let share = 1.0 / self.train.len() as f32;
         let moved = own.as_slice().iter().zip(before.as_slice());
         for (mean, (own, before)) in self.mean.iter_mut().zip(moved) {

@@ -1,7 +1,7 @@
 //! Adam for per-view parameters: a view's parameters are updated only in the steps that show it.
 
 use crate::tensor_file::{NamedTensor, TensorSource};
-use irradia_compute::adam::{Active, AdamStep, adam};
+use irradia_compute::adam::{Active, AdamRates, AdamStep, adam};
 use irradia_compute::{Level, Planes};
 
 /// Adam's constants as published (Kingma and Ba 2015).
@@ -53,7 +53,7 @@ impl<const N: usize> PerViewAdam<N> {
             &mut one,
             &gradient,
             [&mut first, &mut second],
-            &rates,
+            AdamRates::of_planes(&rates),
             Active::Sparse(&active, &[1]),
             step,
         );

@@ -26,3 +26,5 @@ const UPDATE_FREEZE: u32 = 16u;
 const UPDATE_GRADIENT: u32 = 32u;
 const UPDATE_ABSOLUTE: u32 = 64u;
 const UPDATE_ERROR: u32 = 128u;
+// The rate of the means is relative to the distance from the camera.
+const UPDATE_DISTANCE: u32 = 256u;

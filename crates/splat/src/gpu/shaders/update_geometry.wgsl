@@ -81,11 +81,16 @@ fn optimize(i: u32, stride: u32, is_active: bool, is_dense: bool, shapes_all: bo
             g[p] = 0.0;
         }
     }
+    var rate_of_means = update.rates.x;
+    if has(flags, UPDATE_DISTANCE) {
+        let mean = vec3f(geometry[i], geometry[stride + i], geometry[2u * stride + i]);
+        rate_of_means *= distance(mean, view.center.xyz);
+    }
     // Position and rotation move only where they have a gradient, or with all.
     let first = select(7u, 0u, is_active || is_dense);
     // Shapes rest in dense steps like the others, unless they have gradients everywhere.
     for (var p = first; p < GEOMETRY; p++) {
-        var rate = update.rates.x;
+        var rate = rate_of_means;
         if p >= 3u {
             rate = update.rates.y;
         }

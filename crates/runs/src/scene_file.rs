@@ -92,8 +92,8 @@ impl Scene {
         self.model.render(&mut Renderer::new(), camera, &self.options)
     }
 
-    /// `frames` cameras on a circle around the focus of the training cameras, at their mean distance and height; for a scene
-    /// without them, around the centre of the splats. `size` is width and height in pixels; if `None`, that of the training
+    /// `frames` cameras on a circle around the focus of the training cameras, at their mean distance and height, or there and back on the arc on
+    /// which these stand, where they leave a quarter of the circle or more; for a scene without them, around the centre of the splats. `size` is width and height in pixels; if `None`, that of the training
     /// images, or 1280 x 720.
     pub fn orbit(&self, frames: u32, size: Option<(u32, u32)>) -> Vec<Camera> {
         orbit(self.model.splats(), self.cameras.as_deref(), frames, size)

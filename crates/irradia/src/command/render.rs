@@ -21,7 +21,7 @@ pub struct Args {
     /// Views of the dataset to render
     #[arg(long, value_enum, default_value_t = Split::Test)]
     pub split: Split,
-    /// Render this number of frames on a circle around the scene instead
+    /// Render this number of frames on a circle around the scene instead, or on an arc, there and back, where only one side was photographed
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=100_000))]
     pub orbit: Option<u32>,
     /// Render a camera path: a file that the viewer or nerfstudio saved, or orbit, spiral or training (through the cameras)

@@ -8,8 +8,8 @@ use irradia_sfm::geometry::camera::DCamera;
 use irradia_sfm::geometry::pose::DPose;
 use irradia_sfm::map::{
     Distance, Known, MapOptions, Model, ModelPoint, Mount, PairKind, PhotoInfo, Reason, Reconstruction,
-    add_guided_points, agreement, determines_focal, extend, reconstruct, same_place, stands_still, to_distances,
-    verify,
+    add_guided_points, agreement, complete, determines_focal, extend, reconstruct, same_place, stands_still,
+    to_distances, verify,
 };
 use irradia_sfm::{DESCRIPTOR_BYTES, Features, Keypoint, PairMatches};
 use std::f64::consts::{FRAC_PI_2, PI};
@@ -158,6 +158,37 @@ fn photographs_are_registered_into_a_known_model_that_stays_as_it_is() {
     }
     let focal = model.cameras[1].expect("registered").focal();
     assert!((focal / 870.0 - 1.0).abs() < 0.02, "{focal}");
+}
+
+#[test]
+fn a_model_is_completed_and_another_beside_it_stays() {
+    let world = World::new(around(24, 1.0), 2000, 0.5, 0.3, 4);
+    // Pairs within each of three parts, and of the third with the first.
+    let part = |photo: u32| [16, 20, 24].iter().position(|end| photo < *end).expect("a part");
+    let pairs = |keep: &dyn Fn([usize; 2]) -> bool| -> Vec<PairMatches> {
+        let kept = world.pairs.iter().filter(|pair| keep(pair.photos.map(part)));
+        kept.cloned().collect()
+    };
+    let apart = pairs(&|[a, b]| a == b && a < 2);
+    let joined = pairs(&|[a, b]| a == b || [a, b] == [0, 2]);
+    let options = MapOptions::default();
+    let first = reconstruct(&world.photos, &world.features, &apart, &options, &mut |_| ());
+    let sizes = |found: &Reconstruction| found.models.iter().map(Model::registered).collect::<Vec<_>>();
+    assert_eq!((sizes(&first), first.left_out.len()), (vec![16, 4], 4));
+    let completed = complete(&world.photos, &world.features, &joined, &first, &options, &mut |_| ());
+    assert_eq!((sizes(&completed), completed.left_out.len()), (vec![20, 4], 0));
+    let [before, after] = [&first, &completed].map(|found| &found.models[0]);
+    assert!(before.poses[..16] == after.poses[..16] && before.cameras == after.cameras);
+    assert!(completed.models[1] == first.models[1]);
+    let seen = World {
+        poses: world.poses[..16].iter().chain(&world.poses[20..]).copied().collect(),
+        ..world
+    };
+    let found = Model {
+        poses: after.poses[..16].iter().chain(&after.poses[20..]).copied().collect(),
+        ..after.clone()
+    };
+    assert!(seen.auc(&found, 1.0) > 90.0, "{}", seen.auc(&found, 1.0));
 }
 
 /// A wavy wall before `photos` cameras 9 degrees apart, every look of which four points far from each other share: its points, its photographs with their

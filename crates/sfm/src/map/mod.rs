@@ -307,6 +307,40 @@ pub fn extend(
     }
 }
 
+/// `found`, with further photographs in its largest model, which stays as it is: those that `options` register. Its other models stay unless they share photographs with it now.
+///
+/// # Panics
+/// As [`reconstruct`], and when `found` has no model.
+pub fn complete(
+    photos: &[PhotoInfo],
+    features: &[Features],
+    pairs: &[PairMatches],
+    found: &Reconstruction,
+    options: &MapOptions,
+    progress: &mut dyn FnMut(Progress),
+) -> Reconstruction {
+    let mut photos = photos.to_vec();
+    found.regroup(&mut photos);
+    let (largest, others) = found.models.split_first().expect("a model");
+    let known = Known {
+        poses: largest.poses.clone(),
+        cameras: largest.cameras.clone(),
+    };
+    let mut completed = extend(&photos, features, pairs, &known, options, progress);
+    let poses = &completed.models[0].poses;
+    let shares = |other: &&Model| poses.iter().zip(&other.poses).any(|(a, b)| a.is_some() && b.is_some());
+    let others: Vec<Model> = others.iter().filter(|other| !shares(other)).cloned().collect();
+    completed
+        .left_out
+        .retain(|left| others.iter().all(|other| other.poses[left.photo].is_none()));
+    completed.models.extend(others);
+    Reconstruction {
+        zooms: found.zooms.clone(),
+        own_focals: found.own_focals,
+        ..completed
+    }
+}
+
 /// Models, and what was tried.
 struct Grown {
     /// Largest first.

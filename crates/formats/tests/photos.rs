@@ -376,6 +376,26 @@ fn folders_are_read_together_and_names_stay_apart() {
 }
 
 #[test]
+fn folders_of_one_name_are_told_apart_by_those_around_them() {
+    let root = tempfile::tempdir().unwrap();
+    let folders = ["monday/DCIM", "tuesday/DCIM", "spare"].map(|name| root.path().join(name));
+    for (folder, red) in folders.iter().zip([10, 90, 200]) {
+        fs::create_dir_all(folder).unwrap();
+        picture(40, 30, red).save(folder.join("1.png")).unwrap();
+    }
+    let found = read_photo_folders(&folders).unwrap();
+    let names: Vec<&str> = found.photos.iter().map(|photo| photo.name.as_str()).collect();
+    assert_eq!(names, ["monday_DCIM_1.png", "spare_1.png", "tuesday_DCIM_1.png"]);
+    // The same folder by two ways.
+    let again = root.path().join("monday/../monday/DCIM");
+    let found = read_photo_folders(&[folders[0].clone(), again]).unwrap();
+    assert_eq!(
+        (found.photos.len(), found.left_out.len(), found.repeated.len()),
+        (1, 0, 1)
+    );
+}
+
+#[test]
 fn photographs_at_a_fraction_of_their_size_have_the_masks_of_that_size() {
     let root = tempfile::tempdir().unwrap();
     let root = root.path();

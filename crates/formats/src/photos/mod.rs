@@ -151,7 +151,7 @@ pub fn read_photo_folder(folder: &Path) -> Result<PhotoFolder, FormatError> {
     read_photo_folders(&[folder])
 }
 
-/// As [`read_photo_folder`], of several folders: photographs of the same name get that of their folder before it.
+/// As [`read_photo_folder`], of several folders: photographs of the same name get that of their folder before it, and of those around it as far as they differ.
 ///
 /// # Errors
 /// When a folder cannot be read.
@@ -192,25 +192,11 @@ pub fn read_photo_folders(folders: &[impl AsRef<Path>]) -> Result<PhotoFolder, F
     let (forms, mut files): (Vec<Found>, Vec<Found>) = files.into_iter().partition(is_other_form);
     let repeats = |file: Found| (file.name, "another form of a photograph that is read".to_owned());
     found.repeated.extend(forms.into_iter().map(repeats));
-    let mut known: HashMap<String, usize> = HashMap::new();
-    for file in &files {
-        *known.entry(file.name.clone()).or_default() += 1;
-    }
-    for file in files.iter_mut().filter(|file| known[&file.name] > 1) {
-        let folder = file.path.parent().and_then(Path::file_name).unwrap_or_default();
-        file.name = format!("{}_{}", folder.to_string_lossy(), file.name);
-    }
-    files.sort_by(|a, b| a.name.cmp(&b.name));
+    tell_apart(&mut files);
+    files.sort_by(|a, b| a.name.cmp(&b.name).then_with(|| a.path.cmp(&b.path)));
     let entries: Vec<(String, Result<PhotoEntry, String>)> = files
         .par_iter()
-        .enumerate()
-        .map(|(i, file)| {
-            let entry = match i > 0 && files[i - 1].name == file.name {
-                true => Err("another photograph has this name: rename it".to_owned()),
-                false => read_entry(file),
-            };
-            (file.name.clone(), entry)
-        })
+        .map(|file| (file.name.clone(), read_entry(file)))
         .collect();
     let mut first_with: BTreeMap<u64, String> = BTreeMap::new();
     let mut first_taken: HashMap<(PathBuf, String), String> = HashMap::new();
@@ -228,6 +214,9 @@ pub fn read_photo_folders(folders: &[impl AsRef<Path>]) -> Result<PhotoFolder, F
             found.repeated.push((name, format!("a copy of {first}, byte for byte")));
         } else if let Some(first) = taken.as_ref().and_then(|taken| first_taken.get(taken)) {
             found.repeated.push((name, format!("another form of {first}")));
+        } else if found.photos.last().is_some_and(|other| other.name == name) {
+            let reason = "another photograph has this name: rename it".to_owned();
+            found.left_out.push((name, reason));
         } else {
             first_with.insert(photo.hash, name.clone());
             first_taken.extend(taken.map(|taken| (taken, name)));
@@ -237,6 +226,24 @@ pub fn read_photo_folders(folders: &[impl AsRef<Path>]) -> Result<PhotoFolder, F
     Ok(found)
 }
 
+/// Puts the name of the folder before those of photographs of one name, and of the folders around it where these have one name as well.
+fn tell_apart(files: &mut [Found]) {
+    let mut levels: Vec<usize> = vec![0; files.len()];
+    for level in 1..=MOST_FOLDERS {
+        let mut known: HashMap<String, usize> = HashMap::new();
+        for file in files.iter() {
+            *known.entry(file.name.clone()).or_default() += 1;
+        }
+        for (file, at) in files.iter_mut().zip(&mut levels) {
+            let around = file.path.ancestors().nth(level).and_then(Path::file_name);
+            if let (true, Some(folder)) = (known[&file.name] > 1 && *at == level - 1, around) {
+                file.name = format!("{}_{}", folder.to_string_lossy(), file.name);
+                *at = level;
+            }
+        }
+    }
+}
+
 /// The pictures that can be read by their extension in the folder `path` or its `images`; none where it is no folder.
 pub fn photo_files(path: &Path) -> Vec<PathBuf> {
     let mut files = pictures_of(path).map_or(Vec::new(), |pictures| pictures.files);
@@ -244,6 +251,8 @@ pub fn photo_files(path: &Path) -> Vec<PathBuf> {
     files
 }
 
+/// Folders by which photographs of one name are told apart.
+const MOST_FOLDERS: usize = 4;
 /// Folders of photographs below that of a capture: as they are, or at a fraction of their size, as benchmarks have them.
 const IMAGES: [&str; 5] = ["images", "images_1", "images_2", "images_4", "images_8"];
 

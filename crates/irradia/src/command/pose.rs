@@ -109,7 +109,7 @@ pub fn pose_first(input: &mut TrainInput, poses: Poses, anyway: bool) -> Result<
         "{} has no poses: they are found first",
         input.data.display()
     ));
-    let report = pose_into_run(input, poses)?;
+    let report = pose_into_run(input, poses, None)?;
     let posed = &input.data;
     if report.fraction() < ENOUGH_POSED && !anyway {
         let reasons: Vec<&str> = report
@@ -140,8 +140,9 @@ pub fn pose_again(input: &mut TrainInput, dataset: &Dataset, poses: Poses, anywa
         input.data = images;
     }
     input.reading.format = None;
-    let report = pose_into_run(input, poses)?;
     let file_name = |name: &str| name.rsplit('/').next().unwrap_or(name).to_owned();
+    let listed = dataset.views.iter().map(|view| file_name(&view.name)).collect();
+    let report = pose_into_run(input, poses, Some(listed))?;
     let left_out: HashSet<&str> = report.left_out.iter().map(|left| left.name.as_str()).collect();
     let lost = |views: &[usize]| {
         let names = views.iter().map(|view| file_name(&dataset.views[*view].name));
@@ -172,13 +173,14 @@ pub fn pose_again(input: &mut TrainInput, dataset: &Dataset, poses: Poses, anywa
     Ok(())
 }
 
-/// Poses the photographs of `input` into the folder `posed` of its run, and makes that its dataset.
-fn pose_into_run(input: &mut TrainInput, poses: Poses) -> Result<PoseReport> {
+/// Poses the photographs of `input`, or `only` some, into the folder `posed` of its run, and makes that its dataset.
+fn pose_into_run(input: &mut TrainInput, poses: Poses, only: Option<HashSet<String>>) -> Result<PoseReport> {
     let posed = input.out.join("posed");
     note(format_args!("poses are found, into {}", posed.display()));
     let data = std::mem::replace(&mut input.data, posed.clone());
     let request = PoseInput {
         mapper: poses.into(),
+        only,
         ..PoseInput::new(data, &posed)
     };
     let report = pose_with_progress(&request)?;

@@ -139,6 +139,7 @@ impl Capture {
             repeated.extend(films.into_iter().map(|film| (name(film), why.to_owned())));
         };
         unused(sources.live, "a film that was taken with the photograph of its name");
+        let named = sources.films.len();
         match sources.beside.is_empty() || sources.folders.is_empty() || film::can_be_read() {
             true => sources.films.append(&mut sources.beside),
             false => unused(
@@ -150,9 +151,10 @@ impl Capture {
             let path = paths.first().map(|path| path.display().to_string()).unwrap_or_default();
             RunError::Refused(format!("{path}: {what} need a folder to be written to: give --out"))
         };
+        let mut damaged = Vec::new();
         if !sources.films.is_empty() {
             let folder = out.ok_or_else(|| needs_out("frames of a film"))?.join(FRAMES);
-            film::frames(&sources.films, &folder, progress)?;
+            damaged = film::frames(&sources.films, named, &folder, progress)?;
             sources.folders.push(folder);
         }
         let mut capture = Self {
@@ -161,6 +163,7 @@ impl Capture {
             faces: HashMap::new(),
         };
         capture.folder.repeated.append(&mut repeated);
+        capture.folder.left_out.append(&mut damaged);
         let panoramas = capture.take_panoramas();
         if !panoramas.is_empty() {
             let out = out.ok_or_else(|| needs_out("faces of panoramas"))?;

@@ -195,7 +195,7 @@ fn finding(diagnosis: &Diagnosis, names: &[String], model: Option<&Model>) -> Fi
 }
 
 /// Pictures that cannot be read have no other faults; those with the same reason are one finding.
-fn add_unreadable(report: &mut DoctorReport, folder: &PhotoFolder, work: &Work) {
+pub(super) fn add_unreadable(report: &mut DoctorReport, folder: &PhotoFolder, work: &Work) {
     report.photos += folder.left_out.len();
     let unused = folder.unused().chain(work.undecodable());
     let unused = unused.map(|(name, reason)| (name.as_str(), reason.as_str()));

@@ -9,6 +9,7 @@ use irradia_sfm::features::{Extractor, GreyPhoto, Sift};
 use irradia_sfm::matching::{MatchOptions, match_features};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
+use std::ffi::OsString;
 use std::fs;
 use std::io::{BufReader, Read};
 use std::path::{Path, PathBuf};
@@ -68,12 +69,13 @@ impl Chosen {
     }
 }
 
-/// Writes the chosen frames of `films` as JPEG into `folder`, unless an earlier call did.
+/// Writes the chosen frames of `films` as JPEG into `folder`, unless an earlier call did. Returns those of all but the first `named` films that cannot be read, and why.
 pub(super) fn frames(
     films: &[PathBuf],
+    named: usize,
     folder: &Path,
     progress: &(dyn Fn(PoseProgress) + Sync),
-) -> Result<(), RunError> {
+) -> Result<Vec<(String, String)>, RunError> {
     let record = folder.join(RECORD);
     let mut chosen = films.iter().map(|film| of_file(film)).collect::<Result<Vec<_>, _>>()?;
     for i in 0..chosen.len() {
@@ -93,28 +95,45 @@ pub(super) fn frames(
             .iter()
             .flat_map(|film| film.frames.iter().map(|frame| film.name(*frame)));
         if known == chosen && names.all(|name| folder.join(name).is_file()) {
-            return Ok(());
+            let damaged = chosen.iter().filter(|film| film.frames.is_empty());
+            return Ok(damaged
+                .map(|film| left_out(&film.film, "ffmpeg cannot read it"))
+                .collect());
         }
     }
     progress(PoseProgress::Stage { name: "frames", of: 0 });
     let mut before = 0;
     let mut measured = Vec::new();
-    for film in films {
-        let frames = measure(film, before, progress)?;
-        if frames.is_empty() {
-            return Err(RunError::Refused(format!("{}: the film has no frames", film.display())));
-        }
+    let mut damaged = Vec::new();
+    for (i, film) in films.iter().enumerate() {
+        let frames = match measure(film, before, progress) {
+            Ok(frames) => frames,
+            Err(error) if i < named => return Err(error),
+            Err(error) => {
+                damaged.push(left_out(film, &error.to_string()));
+                Vec::new()
+            }
+        };
         before += frames.len();
         measured.push(frames);
     }
     // Frames of an earlier choice must not be taken for photographs.
     begin(folder, RECORD)?;
     for ((chosen, frames), wanted) in chosen.iter_mut().zip(&measured).zip(shares(&measured)) {
-        chosen.frames = choose(frames, wanted);
-        extract(chosen, folder)?;
+        if !frames.is_empty() {
+            chosen.frames = choose(frames, wanted);
+            extract(chosen, folder)?;
+        }
     }
     write_atomic(&record, |file| file.write_all(&crate::folder::to_json(&chosen)))?;
-    Ok(())
+    Ok(damaged)
+}
+
+/// The name of a film, and why it gives no frames.
+fn left_out(film: &Path, reason: &str) -> (String, String) {
+    let path = format!("{}: ", film.display());
+    let name = film.file_name().unwrap_or_default().to_string_lossy().into_owned();
+    (name, reason.strip_prefix(&path).unwrap_or(reason).to_owned())
 }
 
 /// A film of which nothing is chosen yet.
@@ -156,7 +175,7 @@ struct Frame {
 fn measure(film: &Path, before: usize, progress: &(dyn Fn(PoseProgress) + Sync)) -> Result<Vec<Frame>, RunError> {
     let mut child = Command::new("ffmpeg")
         .args(["-loglevel", "error", "-i"])
-        .arg(film)
+        .arg(file_url(film))
         .args(["-vf", &format!("scale={WIDTH}:-2"), "-fps_mode", "passthrough"])
         .args(["-f", "image2pipe", "-c:v", "pgm", "-pix_fmt", "gray", "-"])
         .stdin(Stdio::null())
@@ -208,7 +227,17 @@ fn measure(film: &Path, before: usize, progress: &(dyn Fn(PoseProgress) + Sync))
     if !status.success() {
         return Err(unreadable(film, &said));
     }
+    if frames.is_empty() {
+        return Err(RunError::Refused(format!("{}: the film has no frames", film.display())));
+    }
     Ok(frames)
+}
+
+/// A film as ffmpeg takes it, whose name may look like another protocol's.
+fn file_url(film: &Path) -> OsString {
+    let mut url = OsString::from("file:");
+    url.push(std::path::absolute(film).unwrap_or_else(|_| film.to_owned()));
+    url
 }
 
 fn no_ffmpeg(film: &Path, error: &std::io::Error) -> RunError {
@@ -340,15 +369,17 @@ fn extract(chosen: &Chosen, folder: &Path) -> Result<(), RunError> {
     let film = &chosen.film;
     let output = Command::new("ffmpeg")
         .args(["-loglevel", "error", "-y", "-i"])
-        .arg(film)
+        .arg(file_url(film))
         .args([
             "-vf",
-            &format!("select='{}'", is_one_of(&chosen.frames)),
+            // Pixels that are not square (DV, anamorphic) become so: the cameras have one focal length.
+            &format!("select='{}',scale=iw*sar:ih", is_one_of(&chosen.frames)),
             "-fps_mode",
             "passthrough",
         ])
-        .args(["-q:v", "2", "-start_number", "0"])
-        .arg(folder.join("chosen_%06d.jpg"))
+        // A pattern: the folder's own name may hold a `%`.
+        .args(["-q:v", "2", "-start_number", "0", "chosen_%06d.jpg"])
+        .current_dir(folder)
         .stdin(Stdio::null())
         .output()
         .map_err(|error| no_ffmpeg(film, &error))?;

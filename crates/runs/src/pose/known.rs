@@ -30,6 +30,8 @@ impl KnownPoses {
     /// The dataset's photographs and those of `more`, by name.
     pub fn with(&self, more: PhotoFolder) -> Result<PhotoFolder, RunError> {
         let mut folder = read_photo_folder(&self.data.join("images"))?;
+        // What else lies there is no part of the dataset.
+        folder.photos.retain(|photo| self.images.contains_key(&photo.name));
         let present = |name: &&String| folder.photos.iter().any(|photo| photo.name == **name);
         if let Some(name) = self.images.keys().filter(|name| !present(name)).min() {
             return Err(RunError::Refused(format!(
@@ -56,8 +58,10 @@ impl KnownPoses {
             }
         }
         if folder.photos.len() == before {
+            let reasons = folder.left_out.iter().take(3);
+            let reasons: String = reasons.map(|(name, reason)| format!("; {name}: {reason}")).collect();
             return Err(RunError::Refused(format!(
-                "there is no photograph to add that {} does not have",
+                "there is no photograph to add that {} does not have{reasons}",
                 self.data.display()
             )));
         }

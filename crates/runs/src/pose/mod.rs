@@ -12,6 +12,7 @@
 //! ```
 
 mod attempt;
+mod brought;
 mod capture;
 mod check;
 mod colmap;
@@ -30,11 +31,12 @@ use crate::RunError;
 use crate::folder::to_json;
 use attempt::{Attempt, Matched};
 use capture::Capture;
-use irradia_formats::{PhotoFolder, write_atomic};
+use irradia_formats::{PhotoEntry, PhotoFolder, write_atomic};
 use irradia_sfm::doctor::Kind;
 use irradia_sfm::map::{MapOptions, PhotoInfo, Reconstruction};
 use serde::Serialize;
 use stages::Work;
+use std::collections::HashSet;
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -59,6 +61,8 @@ pub struct PoseInput {
     pub photos: Vec<PathBuf>,
     /// The folder of the dataset; created if missing.
     pub out: PathBuf,
+    /// File names of the photographs that are used, where all of them are found; others that lie beside them are ignored. All if `None`.
+    pub only: Option<HashSet<String>>,
     /// Whether the photographs are added to the dataset in `out`, in COLMAP's format, whose poses and cameras stay as they are.
     pub into: bool,
     /// Distances between cameras that are known; they bring the poses to metres.
@@ -79,6 +83,7 @@ impl PoseInput {
         Self {
             photos: vec![photos.into()],
             out: out.into(),
+            only: None,
             into: false,
             distances: Vec::new(),
             mapper: Mapper::default(),
@@ -274,6 +279,12 @@ pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Resu
     fs::create_dir_all(out).map_err(RunError::io("create", out))?;
     let mut clock = Clock::new();
     let mut capture = Capture::read(&input.photos, Some(out), progress)?;
+    if let Some(only) = &input.only {
+        let is_one = |photo: &PhotoEntry| only.contains(&photo.name);
+        if capture.folder.photos.iter().filter(|photo| is_one(photo)).count() == only.len() {
+            capture.folder.photos.retain(is_one);
+        }
+    }
     if let Some(known) = &known {
         if capture.has_panoramas() {
             return Err(RunError::setting(
@@ -287,6 +298,7 @@ pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Resu
     let mut folder = &capture.folder;
     check_enough(&input.photos, folder)?;
     place::check(&input.distances, folder)?;
+    brought::clear_beside(out, &folder.photos)?;
     clock.end("photographs");
     if input.mapper == Mapper::Colmap {
         if !input.distances.is_empty() {
@@ -358,17 +370,23 @@ pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Resu
         mut reconstruction,
     } = attempt;
     reconstruction.regroup(&mut infos);
+    let mut warnings = Vec::new();
+    let mut warn = |warning: String| {
+        progress(PoseProgress::Warned(warning.clone()));
+        warnings.push(warning);
+    };
     let scale = match reconstruction.models.first_mut() {
         // What is known keeps its unit.
         Some(model) if is_new => {
-            let by_places = place::scale(folder, &work, model, progress);
+            let by_places = place::scale(folder, &work, model, &mut warn);
             place::scale_by_distances(&input.distances, &infos, model)?.or(by_places)
         }
         _ => None,
     };
     clock.end("poses");
     let stood_still = masked.as_ref().map(|masked| &masked.still);
-    let examined = doctor::examine(&work, &infos, &pairs, &reconstruction, stood_still);
+    let mut examined = doctor::examine(&work, &infos, &pairs, &reconstruction, stood_still);
+    doctor::add_unreadable(&mut examined, folder, &work);
     doctor::write(out, folder, &work, &examined)?;
     clock.end("doctor");
     if reconstruction.models.is_empty() {
@@ -379,7 +397,7 @@ pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Resu
             &examined,
         )));
     }
-    output::write(out, folder, &work, &infos, &reconstruction)?;
+    output::write(out, folder, &work, &infos, &reconstruction, input.into)?;
     clock.end("writing");
 
     let mut report = output::report(folder, &work, &infos, &reconstruction);
@@ -389,6 +407,7 @@ pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Resu
     report.pairs = pairs.len();
     report.warnings = work.warnings().to_vec();
     report.warnings.extend(told);
+    report.warnings.extend(warnings);
     report.stages = clock.stages;
     report.seconds = started.elapsed().as_secs_f64();
     write_atomic(&out.join(REPORT), |file| file.write_all(&to_json(&report)))?;

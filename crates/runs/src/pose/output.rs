@@ -1,5 +1,6 @@
 //! The dataset that was reconstructed.
 
+use super::brought::{self, IMAGES, MASKS, belongings, is_same};
 use super::stages::Work;
 use super::{CameraReport, LeftOutPhoto, PoseReport};
 use crate::RunError;
@@ -12,28 +13,31 @@ use irradia_sfm::map::{Model, ModelPoint, PhotoInfo, Reconstruction};
 use std::fs;
 use std::path::{Path, PathBuf};
 
-/// Writes `images` and `sparse`.
+/// Writes `images` and `sparse`. What an earlier call brought of other photographs is put away, unless these were `added` to it.
 pub(super) fn write(
     out: &Path,
     folder: &PhotoFolder,
     work: &Work,
     infos: &[PhotoInfo],
     found: &Reconstruction,
+    added: bool,
 ) -> Result<(), RunError> {
-    let images = out.join("images");
-    fs::create_dir_all(&images).map_err(RunError::io("create", &images))?;
-    for (photo, i) in work.photos().iter().enumerate() {
-        if found.models.iter().any(|model| model.poses[photo].is_some()) {
-            link_photo(out, &folder.photos[*i])?;
-        }
-    }
+    let has_pose = |(photo, i): (usize, &usize)| {
+        let mut models = found.models.iter();
+        models
+            .any(|model| model.poses[photo].is_some())
+            .then_some(&folder.photos[*i])
+    };
+    let posed: Vec<&PhotoEntry> = work.photos().iter().enumerate().filter_map(has_pose).collect();
+    posed.iter().try_for_each(|photo| link_photo(out, photo))?;
     let written = begin_models(out)?;
     for (number, model) in found.models.iter().enumerate() {
         let to = written.join(number.to_string());
         fs::create_dir_all(&to).map_err(RunError::io("create", &to))?;
         write_colmap(&to, &colmap_model(work, infos, model))?;
     }
-    end_models(out, &written)
+    end_models(out, &written)?;
+    brought::record(out, &posed, added)
 }
 
 /// An empty folder for models, beside those of an earlier call, which may have been more and remain until these are complete.
@@ -55,49 +59,38 @@ pub(super) fn end_models(out: &Path, written: &Path) -> Result<(), RunError> {
     fs::rename(written, &sparse).map_err(RunError::io("rename", written))
 }
 
-/// Brings a photograph, its mask and its maps of depth and normals into the folders `images`, which exists, `masks`, `depths` and `normals` of the dataset.
+/// Brings a photograph, its mask and its maps of depth and normals into the folders `images`, `masks`, `depths` and `normals` of the dataset.
 pub(super) fn link_photo(out: &Path, photo: &PhotoEntry) -> Result<(), RunError> {
-    link(&photo.path, &out.join("images").join(&photo.name))?;
-    for (file, folder) in [
-        (&photo.mask, "masks"),
-        (&photo.depth, "depths"),
-        (&photo.normals, "normals"),
-    ] {
-        if let Some(file) = file {
-            link_beside(file, &out.join(folder), &photo.name)?;
-        }
+    for file in belongings(photo) {
+        bring(file.from, &out.join(file.folder), &file.name)?;
     }
     Ok(())
 }
 
 /// Brings a panorama and its mask into the dataset, where training finds them beside their faces.
 pub(super) fn link_panorama(out: &Path, panorama: &PhotoEntry) -> Result<(), RunError> {
-    let folder = out.join(PANORAMAS);
-    fs::create_dir_all(&folder).map_err(RunError::io("create", &folder))?;
-    link(&panorama.path, &folder.join(&panorama.name))?;
-    if let Some(mask) = &panorama.mask {
-        link_beside(mask, &out.join(PANORAMA_MASKS), &panorama.name)?;
+    for file in belongings(panorama) {
+        match file.folder {
+            IMAGES => bring(file.from, &out.join(PANORAMAS), &file.name)?,
+            MASKS => bring(file.from, &out.join(PANORAMA_MASKS), &file.name)?,
+            _ => (),
+        }
     }
     Ok(())
 }
 
-/// Brings the file that belongs to the photograph `name` into `folder`, which is created, under that name with its own extension appended.
-fn link_beside(file: &Path, folder: &Path, name: &str) -> Result<(), RunError> {
+/// Makes `name` in `folder`, which is created, the file `from`: a hard link where the file system allows it, else a copy, as of masks, which users edit in a dataset.
+fn bring(from: &Path, folder: &Path, name: &str) -> Result<(), RunError> {
     fs::create_dir_all(folder).map_err(RunError::io("create", folder))?;
-    let extension = file.extension().unwrap_or_default().to_string_lossy();
-    link(file, &folder.join(format!("{name}.{extension}")))
-}
-
-/// Makes `to` the file `from`: a hard link where the file system allows it, else a copy.
-fn link(from: &Path, to: &Path) -> Result<(), RunError> {
-    let same = |a: &Path, b: &Path| fs::canonicalize(a).is_ok_and(|a| fs::canonicalize(b).is_ok_and(|b| a == b));
-    if same(from, to) {
+    let to = &folder.join(name);
+    if is_same(from, to) {
         return Ok(());
     }
     if to.exists() {
         fs::remove_file(to).map_err(RunError::io("replace", to))?;
     }
-    if fs::hard_link(from, to).is_err() {
+    let is_mask = [MASKS, PANORAMA_MASKS].iter().any(|masks| folder.ends_with(masks));
+    if is_mask || fs::hard_link(from, to).is_err() {
         fs::copy(from, to).map_err(RunError::io("write", to))?;
     }
     Ok(())

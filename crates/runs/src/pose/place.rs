@@ -1,7 +1,7 @@
 //! Metres from what the photographs' metadata say of their places, or from known distances.
 
 use super::stages::Work;
-use super::{KnownDistance, PoseProgress, ScaleReport};
+use super::{KnownDistance, ScaleReport};
 use crate::RunError;
 use glam::DVec3;
 use irradia_formats::PhotoFolder;
@@ -11,12 +11,12 @@ use irradia_sfm::map::{Distance, Model, PhotoInfo, to_distances, to_metres};
 const RADIUS_M: f64 = 6_378_137.0;
 const ECCENTRICITY_SQUARED: f64 = 6.694_379_990_14e-3;
 
-/// Brings `model` to metres if enough photographs tell their place, and tells what is known of its scale.
+/// Brings `model` to metres if enough photographs tell their place, and tells what is known of its scale; warns where that is too little.
 pub(super) fn scale(
     folder: &PhotoFolder,
     work: &Work,
     model: &mut Model,
-    progress: &(dyn Fn(PoseProgress) + Sync),
+    warn: &mut dyn FnMut(String),
 ) -> Option<ScaleReport> {
     let gps: Vec<Option<[f64; 3]>> = work.photos().iter().map(|i| folder.photos[*i].tags.gps).collect();
     match to_metres(model, &local(&gps)) {
@@ -28,10 +28,10 @@ pub(super) fn scale(
             scale_error: metric.scale_error,
         }),
         Err(Some(error)) => {
-            progress(PoseProgress::Warned(format!(
+            warn(format!(
                 "the places of the photographs leave the scale open by {:.0} %: the unit of the poses is arbitrary",
                 100.0 * error.min(10.0)
-            )));
+            ));
             None
         }
         Err(None) => None,

@@ -3,6 +3,7 @@
 
 use super::PoseProgress;
 use super::attempt::{Attempt, Matched};
+use super::brought::MASKS;
 use super::stages::in_rgb;
 use crate::RunError;
 use irradia_formats::{PhotoEntry, PhotoFolder, write_png};
@@ -14,7 +15,6 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 /// The folder of masks, and what tells that they are of an earlier call.
-const MASKS: &str = "masks";
 const RECORD: &str = ".irradia";
 /// Longer side of the pictures in which masks are found, px.
 const SIDE: u32 = 480;

@@ -760,3 +760,34 @@ fn several_films_are_posed_together() {
     assert!(10 * report.registered >= 9 * names.len(), "{report:#?}");
     assert_eq!(report.models.len(), 1, "{:?}", report.models);
 }
+
+#[test]
+fn films_are_read_as_they_look_and_damaged_ones_left_out() {
+    let folder = tempfile::tempdir().unwrap();
+    let Some(films) = films(folder.path()) else {
+        eprintln!("SKIPPED: ffmpeg is not installed, so that no film can be made");
+        return;
+    };
+    let photos = folder.path().join("photos");
+    fs::create_dir(&photos).unwrap();
+    // Pixels twice as wide as high, in a folder whose name is a pattern of ffmpeg's.
+    let made = Command::new("ffmpeg")
+        .args(["-loglevel", "error", "-y", "-i"])
+        .arg(&films[0])
+        .args(["-vf", "scale=iw/2:ih,setsar=2", "-q:v", "2"])
+        .arg(photos.join("wide.mp4"))
+        .status();
+    assert!(made.is_ok_and(|status| status.success()));
+    let given = photographs(&photos);
+    fs::write(photos.join("damaged.mp4"), "no film").unwrap();
+    let out = folder.path().join("half 50%d");
+    let report = quietly(&PoseInput::new(&photos, &out)).unwrap();
+    let left: Vec<&str> = report.left_out.iter().map(|left| left.name.as_str()).collect();
+    assert!(left.contains(&"damaged.mp4"), "{left:?}");
+    let is_frame = |path: &PathBuf| path.extension().is_some_and(|extension| extension == "jpg");
+    let mut frames = fs::read_dir(out.join("frames"))
+        .unwrap()
+        .map(|entry| entry.unwrap().path());
+    let size = |path: &Path| read_image(path).map(|image| (image.width, image.height)).unwrap();
+    assert_eq!(size(&frames.find(is_frame).unwrap()), size(&photos.join(&given[0].0)));
+}

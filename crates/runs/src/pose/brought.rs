@@ -1,0 +1,176 @@
+//! The files of photographs that are brought into the dataset, and what an earlier call brought.
+
+use crate::RunError;
+use crate::folder::to_json;
+use irradia_formats::{PhotoEntry, write_atomic};
+use std::collections::BTreeSet;
+use std::fs;
+use std::path::{Component, Path};
+
+/// The record of what was brought, in the folder of the dataset.
+const RECORD: &str = "files.json";
+/// Where files go that the capture does not have any more: they may be the last ones.
+const UNUSED: &str = "unused";
+/// Where photographs lie.
+pub(super) const IMAGES: &str = "images";
+/// Where masks lie.
+pub(super) const MASKS: &str = "masks";
+
+/// Paths in the folder of the dataset, with `/`.
+type Files = BTreeSet<String>;
+
+/// A file that belongs to a photograph, and where it lies in the dataset.
+pub(super) struct Belonging<'a> {
+    pub from: &'a Path,
+    pub folder: &'static str,
+    pub name: String,
+}
+
+/// A photograph and what lies beside it: its mask and its maps of depth and normals, under its name with their own extension appended.
+pub(super) fn belongings(photo: &PhotoEntry) -> impl Iterator<Item = Belonging<'_>> {
+    let beside = [
+        (&photo.mask, MASKS),
+        (&photo.depth, "depths"),
+        (&photo.normals, "normals"),
+    ];
+    let image = Belonging {
+        from: &photo.path,
+        folder: IMAGES,
+        name: photo.name.clone(),
+    };
+    std::iter::once(image).chain(beside.into_iter().filter_map(|(file, folder)| {
+        let from = file.as_deref()?;
+        let extension = from.extension().unwrap_or_default().to_string_lossy();
+        Some(Belonging {
+            from,
+            folder,
+            name: format!("{}.{extension}", photo.name),
+        })
+    }))
+}
+
+impl Belonging<'_> {
+    fn file(&self) -> String {
+        format!("{}/{}", self.folder, self.name)
+    }
+
+    fn is_there(&self, out: &Path) -> bool {
+        is_same(self.from, &out.join(self.file()))
+    }
+}
+
+/// Whether both paths lead to one place.
+pub(super) fn is_same(a: &Path, b: &Path) -> bool {
+    fs::canonicalize(a).is_ok_and(|a| fs::canonicalize(b).is_ok_and(|b| a == b))
+}
+
+/// Puts away what an earlier call brought beside photographs and `photos` do not have: masks that were taken away would still hide what they hid.
+pub(super) fn clear_beside(out: &Path, photos: &[PhotoEntry]) -> Result<(), RunError> {
+    let has: Files = photos.iter().flat_map(belongings).map(|file| file.file()).collect();
+    let stale = before(out).into_iter();
+    put_away(
+        out,
+        stale.filter(|file| !file.starts_with(IMAGES) && !has.contains(file)),
+    )
+}
+
+/// Puts away what an earlier call brought and `posed` do not have, unless photographs were `added`, and records what is there now.
+pub(super) fn record(out: &Path, posed: &[&PhotoEntry], added: bool) -> Result<(), RunError> {
+    let before = before(out);
+    // What lay in the dataset from the start stays.
+    let brought = |file: &Belonging| before.contains(&file.file()) || !file.is_there(out);
+    let files = posed.iter().flat_map(|photo| belongings(photo));
+    let mut now: Files = files.filter(brought).map(|file| file.file()).collect();
+    match added {
+        true => now.extend(before),
+        false => put_away(out, before.difference(&now).cloned())?,
+    }
+    write_atomic(&out.join(RECORD), |file| file.write_all(&to_json(&now)))?;
+    Ok(())
+}
+
+fn before(out: &Path) -> Files {
+    let record = fs::read(out.join(RECORD)).ok();
+    record
+        .and_then(|bytes| serde_json::from_slice(&bytes).ok())
+        .unwrap_or_default()
+}
+
+/// Moves `files` into [`UNUSED`], and removes folders that are empty then. What a record names outside of the dataset is ignored.
+fn put_away(out: &Path, files: impl Iterator<Item = String>) -> Result<(), RunError> {
+    let is_inside = |file: &str| {
+        Path::new(file)
+            .components()
+            .all(|part| matches!(part, Component::Normal(_)))
+    };
+    for file in files {
+        let path = out.join(&file);
+        if !is_inside(&file) || !path.is_file() {
+            continue;
+        }
+        let to = out.join(UNUSED).join(&file);
+        let folder = to.parent().expect("in a folder");
+        fs::create_dir_all(folder).map_err(RunError::io("create", folder))?;
+        fs::rename(&path, &to).map_err(RunError::io("rename", &path))?;
+        // A folder that is not empty stays.
+        let _ = path.parent().map(fs::remove_dir);
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use irradia_formats::{read_photo_folder, write_png};
+    use std::path::PathBuf;
+
+    #[test]
+    fn what_an_earlier_call_brought_is_put_away_and_nothing_else() {
+        let root = tempfile::tempdir().unwrap();
+        let [source, out] = ["source", "out"].map(|name| root.path().join(name));
+        let write = |path: PathBuf, value: u8| {
+            fs::create_dir_all(path.parent().unwrap()).unwrap();
+            write_png(&path, 8, 8, 1, &[value; 64]).unwrap();
+        };
+        for (i, name) in ["a.png", "b.png"].into_iter().enumerate() {
+            write(source.join(name), i as u8);
+            write(source.join("masks").join(name), 100 + i as u8);
+        }
+        let bring = |added: bool| {
+            let photos = read_photo_folder(&source).unwrap().photos;
+            clear_beside(&out, &photos).unwrap();
+            for file in photos.iter().flat_map(belongings) {
+                let to = out.join(file.folder).join(&file.name);
+                fs::create_dir_all(to.parent().unwrap()).unwrap();
+                fs::copy(file.from, to).unwrap();
+            }
+            record(&out, &photos.iter().collect::<Vec<_>>(), added).unwrap();
+        };
+        let there = |file: &str| out.join(file).exists();
+        bring(false);
+        assert!(there("masks/a.png.png") && there("images/b.png"));
+        write(out.join("masks/mine.png"), 7);
+        fs::remove_dir_all(source.join("masks")).unwrap();
+        fs::remove_file(source.join("b.png")).unwrap();
+        bring(true);
+        assert!(
+            !there("masks/a.png.png") && there("images/b.png"),
+            "photographs stay where others are added"
+        );
+        bring(false);
+        assert!(there("images/a.png") && !there("images/b.png") && there("masks/mine.png"));
+        assert!(
+            there("unused/images/b.png") && there("unused/masks/a.png.png"),
+            "nothing is lost"
+        );
+        fs::write(out.join(RECORD), r#"["../source/a.png", "images/none.png"]"#).unwrap();
+        bring(false);
+        assert!(source.join("a.png").exists());
+        // A dataset in place: its own files are not recorded.
+        let photos = read_photo_folder(&out).unwrap().photos;
+        fs::remove_file(out.join(RECORD)).unwrap();
+        record(&out, &photos.iter().collect::<Vec<_>>(), false).unwrap();
+        record(&out, &[], false).unwrap();
+        assert!(there("images/a.png"));
+    }
+}

@@ -5,7 +5,8 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
 
 /// Writes a file atomically: under a temporary name in the same folder, synced to the disk, then renamed to `path`. If
-/// anything fails, or the process is killed, the previous content of `path` is unchanged.
+/// anything fails, or the process is killed, the previous content of `path` is unchanged. A link keeps leading to the file, which is replaced; what is no file, such as a
+/// pipe or `/dev/stdout`, is written to as it is.
 ///
 /// # Errors
 /// [`FormatError::Write`] with the system's reason, such as a full disk; the temporary file is removed.
@@ -17,6 +18,13 @@ pub fn write_atomic(path: &Path, write: impl FnOnce(&mut dyn Write) -> io::Resul
 }
 
 fn write_beside(path: &Path, write: impl FnOnce(&mut dyn Write) -> io::Result<()>) -> io::Result<()> {
+    // Of what is not there yet there is no other name.
+    let path = &fs::canonicalize(path).unwrap_or_else(|_| path.to_owned());
+    if fs::metadata(path).is_ok_and(|found| !found.is_file() && !found.is_dir()) {
+        let mut writer = BufWriter::with_capacity(1 << 18, OpenOptions::new().write(true).open(path)?);
+        write(&mut writer)?;
+        return writer.flush();
+    }
     let (temporary, file) = Temporary::beside(path)?;
     let mut writer = BufWriter::with_capacity(1 << 18, file);
     write(&mut writer)?;
@@ -71,6 +79,22 @@ impl Drop for Temporary {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[cfg(unix)]
+    #[test]
+    fn links_keep_leading_to_the_file_and_devices_stay() {
+        let folder = tempfile::tempdir().unwrap();
+        let [file, link, device] = ["a.bin", "link", "device"].map(|name| folder.path().join(name));
+        fs::write(&file, b"old").unwrap();
+        std::os::unix::fs::symlink(&file, &link).unwrap();
+        std::os::unix::fs::symlink("/dev/null", &device).unwrap();
+        for path in [&link, &device] {
+            write_atomic(path, |w| w.write_all(b"new")).unwrap();
+            assert!(fs::symlink_metadata(path).unwrap().is_symlink());
+        }
+        assert_eq!(fs::read(&file).unwrap(), b"new");
+        assert!(!fs::metadata(&device).unwrap().is_file());
+    }
 
     #[test]
     fn a_failed_write_leaves_the_old_file_and_no_temporary() {

@@ -41,6 +41,12 @@ pub enum FormatError {
         /// The known extensions.
         known: String,
     },
+    /// A folder without a scene.
+    #[error(
+        "{} holds no scene (scene.ply, or meta.json of SOG); that of a run is written at its end: continue it with irradia train --resume",
+        .0.display()
+    )]
+    NoScene(PathBuf),
     /// A file, where a folder is needed.
     #[error(
         "{} is a file: name the folder of a dataset or of photographs; an archive must be unpacked first",

@@ -136,14 +136,16 @@ impl Editing {
             let message = format!("{} holds a run: name another folder", output.display());
             return Err(RunError::Refused(message));
         }
+        let splits = self.split_files(&file)?;
         let mut notes = Vec::new();
-        for (name, cloud) in &self.splits {
-            let path = self.beside(&file, name)?;
-            notes.extend(write_splats_with(&path, cloud, options)?);
+        if !is_file {
+            fs::create_dir_all(output).map_err(RunError::io("create", output))?;
+        }
+        for (path, cloud) in &splits {
+            notes.extend(write_splats_with(path, cloud, options)?);
             notes.push(format!("{}: {} splats split off", path.display(), cloud.len()));
         }
         if !is_file {
-            fs::create_dir_all(output).map_err(RunError::io("create", output))?;
             let folder = RunFolder::at(output);
             if let Some(cameras) = cameras_moved(&self.path, &self.moved) {
                 folder.write("cameras.json", &cameras)?;
@@ -196,10 +198,10 @@ impl Editing {
             Err(_) => EditList::default(),
         };
         list.edits.extend(self.list.edits.iter().cloned());
+        let splits = self.split_files(&self.path)?;
         let mut notes = Vec::new();
-        for (name, cloud) in &self.splits {
-            let path = self.beside(&self.path, name)?;
-            write_splats(&path, cloud)?;
+        for (path, cloud) in &splits {
+            write_splats(path, cloud)?;
             notes.push(format!("{}: {} splats split off", path.display(), cloud.len()));
         }
         if let Some(path) = folder.newest_checkpoint()? {
@@ -224,6 +226,8 @@ impl Editing {
         cloud.antialiased = self.draft.cloud.antialiased;
         cloud.world_from_dataset = self.draft.cloud.world_from_dataset;
         let mut draft = Draft::new(cloud, self.draft.cameras.clone());
+        // What photographs decide about the scene they decide here.
+        draft.photographs = self.draft.photographs.clone();
         let mut total = Provenance::identity(draft.len());
         for edit in &self.list.edits {
             total = total.then(&apply(&mut draft, edit, &|file| open_scene(file, &self.path))?.provenance);
@@ -238,20 +242,28 @@ impl Editing {
         Ok(sources.iter().flatten().count())
     }
 
-    /// The file for a scene that is split off, beside `file`.
-    fn beside(&self, file: &Path, name: &str) -> Result<PathBuf, RunError> {
-        let mut path = file.with_file_name(name);
-        if SplatFormat::of(&path).is_err() {
-            path = file.with_file_name(format!("{name}.ply"));
-        }
-        let is_taken = same_file(&path, file) || same_file(&path, &self.path);
-        match is_taken {
-            true => Err(RunError::Refused(format!(
-                "split {name}: {} is the scene itself; choose another name",
+    /// The scenes that are split off and their files, beside `file`; each has a name of its own.
+    fn split_files(&self, file: &Path) -> Result<Vec<(PathBuf, &GaussianCloud)>, RunError> {
+        let mut files: Vec<(PathBuf, &GaussianCloud)> = Vec::new();
+        for (name, cloud) in &self.splits {
+            let mut path = file.with_file_name(name);
+            if SplatFormat::of(&path).is_err() {
+                path = file.with_file_name(format!("{name}.ply"));
+            }
+            let what = match () {
+                () if path == file || same_file(&path, &self.path) => "the scene itself",
+                () if files.iter().any(|(other, _)| *other == path) => "split off before",
+                () => {
+                    files.push((path, cloud));
+                    continue;
+                }
+            };
+            return Err(RunError::Refused(format!(
+                "split {name}: {} is {what}; choose another name",
                 path.display()
-            ))),
-            false => Ok(path),
+            )));
         }
+        Ok(files)
     }
 
     /// Writes `before.png` and `after.png` to a folder: the scene around which a camera looks, as it was and as it is.

@@ -11,7 +11,7 @@ use irradia_splat::{Splats, init::focus_point};
 /// From where a scene is seen.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Outlook {
-    /// The focus of the training cameras, the ground below those of a survey, or the centre of the splats; world.
+    /// The focus of the training cameras, the ground below those of a survey, or the middle of most splats; world.
     pub center: Vec3,
     /// Unit vector, as the cameras were held.
     pub up: Vec3,
@@ -55,8 +55,11 @@ pub(crate) fn outlook(splats: Option<&Splats>, cameras: Option<&[Camera]>) -> Ou
             };
             let axes = [0, 1, 2].map(|c| {
                 let at = quantiles(&|splats| splats.means.plane(c));
-                let at = |share| at(share).unwrap_or(0.0);
-                (at(0.5), at(0.9) - at(0.1))
+                let [first, low, high, last] = [0.02, 0.1, 0.9, 0.98].map(|share| at(share).unwrap_or(0.0));
+                // All of an object, and not the far surroundings of a scene.
+                let (middle, reach) = (0.5 * (low + high), 0.75 * (high - low));
+                let (low, high) = (first.max(middle - reach), last.min(middle + reach));
+                (0.5 * (low + high), high - low)
             });
             // A few splats in one place are as large as themselves.
             let sizes = [0, 1, 2].map(|c| quantiles(&|splats| splats.log_scales.plane(c))(0.5).map_or(0.0, f32::exp));
@@ -69,8 +72,9 @@ pub(crate) fn outlook(splats: Option<&Splats>, cameras: Option<&[Camera]>) -> Ou
                 center: Vec3::from_array(axes.map(|a| a.0)),
                 // Most files of this kind come from COLMAP, whose y axis points down.
                 up: Vec3::NEG_Y,
-                radius: 1.5 * size,
-                height: 0.4 * size,
+                // A picture of 16:9 is 0.61 of its distance high.
+                radius: 2.0 * size,
+                height: 0.5 * size,
                 intrinsics: Intrinsics::from_fov_x(1280, 720, 1.0),
             }
         }

@@ -14,6 +14,12 @@ use std::path::Path;
 
 /// Frames of a path at most.
 const MAX_FRAMES: usize = 100_000;
+/// The mean of the training cameras is within the scene if it is nearer to the centre than this part of their distance; half a ring's is at 0.64.
+const WITHIN: f32 = 0.5;
+/// How much nearer to the scene's centre, in units of its distance, a spiral comes: cameras half around leave their mean beside what they show.
+const NEARER: f32 = 0.3;
+/// How far a spiral all around rises and falls, in units of its radius.
+const RISES: f32 = 0.3;
 /// Range of frames per second.
 const FPS: std::ops::RangeInclusive<f32> = 0.1..=240.0;
 
@@ -116,7 +122,7 @@ impl Film {
     }
 
     /// `frames` cameras on two turns of an elliptic spiral about the training cameras' mean, looking at the scene's centre: the path
-    /// of LLFF (Mildenhall et al. 2019) for forward-facing captures.
+    /// of LLFF (Mildenhall et al. 2019) for forward-facing captures. The mean of cameras all around is within the scene: there the turns are an orbit that rises and falls.
     pub fn spiral(scene: &Scene, frames: u32, size: Option<(u32, u32)>) -> Self {
         let outlook = scene.outlook();
         let around = scene.orbit(32, None);
@@ -137,12 +143,23 @@ impl Film {
             offsets.sort_unstable_by(f32::total_cmp);
             offsets[(offsets.len() * 9 / 10).min(offsets.len() - 1)]
         };
-        let radii = Vec3::new(radius(Vec3::X), radius(Vec3::Y), radius(Vec3::Z)) * 0.7;
+        let is_within = center.distance(outlook.center) < WITHIN * outlook.radius.hypot(outlook.height);
+        let mut radii = Vec3::new(radius(Vec3::X), radius(Vec3::Y), radius(Vec3::Z)) * 0.7;
+        radii.z = radii.z.min(NEARER * center.distance(outlook.center));
         let intrinsics = sized(outlook.intrinsics, size);
         let camera = |i: u32| {
             let angle = 2.0 * TAU * i as f32 / frames as f32;
-            let offset = Vec3::new(angle.cos(), -angle.sin(), -(0.5 * angle).sin()) * radii;
-            let eye = center + pose.rotation * offset;
+            let eye = match is_within {
+                true => {
+                    let (x, y) = outlook.up.any_orthonormal_pair();
+                    let height = outlook.height + RISES * outlook.radius * (0.5 * angle).sin();
+                    outlook.center + outlook.radius * (x * angle.cos() + y * angle.sin()) + outlook.up * height
+                }
+                false => {
+                    let offset = Vec3::new(angle.cos(), -angle.sin(), -(0.5 * angle).sin()) * radii;
+                    center + pose.rotation * offset
+                }
+            };
             Camera::new(Pose::look_at(eye, outlook.center, outlook.up), intrinsics)
         };
         Self {
@@ -379,6 +396,9 @@ fn slerp(a: Quat, b: Quat, t: f32) -> Quat {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use irradia_scene::Similarity;
+    use irradia_splat::{RenderOptions, Splats};
+    use irradia_train::model::Model;
 
     fn path(loops: bool) -> CameraPath {
         let key = |i: usize| {
@@ -397,6 +417,34 @@ mod tests {
             ease: false,
             closing: 2.0,
             keys: (0..4).map(key).collect(),
+        }
+    }
+
+    #[test]
+    fn a_spiral_keeps_out_of_what_cameras_surround() {
+        let ring = |part: f32| -> Vec<Camera> {
+            let eye = |i: u32| {
+                let angle = part * TAU * i as f32 / 24.0;
+                Vec3::new(angle.cos(), angle.sin(), 0.2)
+            };
+            let look = |i| Pose::look_at(eye(i), Vec3::ZERO, Vec3::Z);
+            let k = Intrinsics::from_fov_x(64, 48, 1.0);
+            (0..24).map(|i| Camera::new(look(i), k)).collect()
+        };
+        for part in [1.0, 0.7, 0.5, 0.1] {
+            let scene = Scene {
+                model: Model::of_splats(Splats::zeros(1, 0)),
+                options: RenderOptions::default(),
+                cameras: Some(ring(part).into()),
+                world_from_dataset: Similarity::IDENTITY,
+            };
+            let film = Film::spiral(&scene, 40, None);
+            let nearest = film
+                .cameras
+                .iter()
+                .map(|c| c.pose.position.length())
+                .fold(f32::INFINITY, f32::min);
+            assert!(nearest > 0.4, "{part}: {nearest}");
         }
     }
 

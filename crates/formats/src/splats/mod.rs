@@ -262,7 +262,14 @@ pub fn read_splats(path: &Path) -> Result<GaussianCloud, FormatError> {
 /// # Errors
 /// The same.
 pub fn read_splat_file(path: &Path) -> Result<SplatFile, FormatError> {
-    let mut format = SplatFormat::of(path)?;
+    let mut format = SplatFormat::of(path).map_err(|unknown| match std::fs::metadata(path) {
+        Err(source) => FormatError::Read {
+            path: path.to_owned(),
+            source,
+        },
+        Ok(found) if found.is_dir() => FormatError::NoScene(path.to_owned()),
+        Ok(_) => unknown,
+    })?;
     let mut unread = Vec::new();
     let mut cloud = match format {
         SplatFormat::Ply | SplatFormat::CompressedPly | SplatFormat::PointsPly => read_and_parse(path, |bytes| {

@@ -18,7 +18,7 @@ use std::path::PathBuf;
 
 #[derive(clap::Args)]
 pub struct Args {
-    /// The scene: RUN, or a file; background and filters are taken from the run that contains it
+    /// The scene: RUN, or a file; background, filters, held-out views and the size of the photographs are taken from the run that contains it
     pub scene: PathBuf,
     /// Dataset of photographs
     #[arg(long)]
@@ -86,6 +86,12 @@ pub fn run(args: &Args) -> Result<()> {
     }
     if reading.readout.is_none() {
         reading.readout = run.as_ref().and_then(|record| record.input.reading.readout.clone());
+    }
+    if let (Some(record), (None, None, false)) = (&run, (reading.downscale, reading.max_side, reading.full_size)) {
+        let of_run = &record.input.reading;
+        reading.max_side = of_run.max_side;
+        reading.downscale = Some(of_run.downscale).filter(|factor| *factor > 1.0);
+        reading.full_size = reading.max_side.is_none() && reading.downscale.is_none();
     }
     let dataset = scene.place(reading.read(&args.data)?);
     let background = match (args.background, &run) {

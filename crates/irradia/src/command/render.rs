@@ -138,9 +138,25 @@ fn write_film(args: &Args, scene: &Scene, film: &Film) -> Result<()> {
     say(format_args!("{} frames in {}", film.cameras.len(), args.out.display()))
 }
 
+/// Extensions of films, by which no folder of frames is meant.
+const FILMS: [&str; 7] = ["mp4", "webm", "gif", "mov", "m4v", "mkv", "avi"];
+
 fn write_frames(args: &Args, scene: &Scene, cameras: Vec<(String, Camera)>) -> Result<()> {
     if cameras.is_empty() {
         return Err(Usage("nothing to render: no such views".into()).into());
+    }
+    let extension = args
+        .out
+        .extension()
+        .and_then(|e| e.to_str())
+        .unwrap_or_default()
+        .to_lowercase();
+    if !args.out.is_dir() && FILMS.contains(&extension.as_str()) {
+        return Err(Usage(format!(
+            "{}: films are .mp4, .webm or .gif, of --orbit or --path; name a folder for the frames",
+            args.out.display()
+        ))
+        .into());
     }
     std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
     let mut painter = painter(args, scene)?;

@@ -92,6 +92,23 @@ fn what_is_split_off_and_merged_again_is_the_same_scene() {
         part.is_file() && notes.iter().any(|note| note.contains("split off")),
         "{notes:?}"
     );
+    // In a folder that is not there yet; neither the scene's name nor one name twice.
+    let fresh = folder.path().join("fresh");
+    editing.write(&fresh, &WriteOptions::default()).expect("writes");
+    assert!(fresh.join("part.ply").is_file() && fresh.join("scene.ply").is_file());
+    let refused = |edits: &[&str], out: &str, words: &str| {
+        let error = edited(&path, edits).write(&folder.path().join(out), &WriteOptions::default());
+        let error = error.expect_err("refused").to_string();
+        assert!(error.contains(words) && !folder.path().join(out).exists(), "{error}");
+    };
+    let half = "half-space point=0,0,0.5 normal=0,0,1";
+    refused(&[&format!("split name=new {half}")], "new.ply", "the scene itself");
+    let twice = format!("split name=twice {half}");
+    refused(
+        &[&twice, &twice.replace("normal=0,0,1", "normal=0,0,-1")],
+        "other.ply",
+        "split off before",
+    );
     let merged = edited(&out, &[&format!("merge file={}", part.display())]);
     let whole = read_splats(&path.join("scene.ply")).unwrap();
     assert_eq!(merged.draft().len(), whole.len());

@@ -330,6 +330,26 @@ fn nerfstudio_splits_points_and_frames_with_their_own_camera() {
 }
 
 #[test]
+fn a_photograph_that_is_listed_twice_is_one_view() {
+    let folder = pictures(9, 8, 8);
+    let root = folder.path();
+    let text = transforms(9, r#""camera_angle_x": 0.7"#);
+    let first = text[text.find(r#"{"file_path""#).unwrap()..]
+        .split_once("},")
+        .unwrap()
+        .0;
+    let others = text.strip_suffix("]}").unwrap();
+    fs::write(root.join("transforms.json"), format!("{others},{first}}}]}}")).unwrap();
+    let dataset = read(root).unwrap();
+    assert_eq!(dataset.views.len(), 9);
+    assert!(
+        dataset.warnings.iter().any(|w| w.contains("1 of 10 views")),
+        "{:?}",
+        dataset.warnings
+    );
+}
+
+#[test]
 fn blender_folders_without_a_test_file_hold_out_validation_or_every_eighth() {
     let folder = pictures(9, 8, 8);
     let root = folder.path();

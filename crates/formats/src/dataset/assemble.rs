@@ -96,7 +96,16 @@ pub(super) fn assemble(declared: Declared, options: &DatasetOptions) -> Result<D
         views = panoramas::join(views, &root);
     }
     views.sort_by(|a, b| a.name.cmp(&b.name));
+    let declared = views.len();
+    // A copy of a held-out view would be trained on.
+    views.dedup_by(|again, first| again.image.is_some() && again.image == first.image);
     let named = views.len();
+    if named < declared {
+        warnings.push(format!(
+            "{} of {declared} views are left out: their photographs are those of others",
+            declared - named
+        ));
+    }
     if let Some(readout) = &options.readout {
         let moving = readout::of_neighbours(&mut views, readout);
         if moving < named {

@@ -61,11 +61,14 @@ fn a_dataset_without_its_training_images_is_rejected() {
     // There are enough held-out views to train on, if that were allowed.
     let path = folder.path().join("data/transforms_test.json");
     let mut test = json(&path);
-    let frame = test["frames"][0].clone();
-    test["frames"]
-        .as_array_mut()
-        .expect("frames")
-        .extend([frame.clone(), frame]);
+    let mut frame = test["frames"][0].clone();
+    let first = frame["file_path"].as_str().expect("a path").to_owned();
+    for copy in ["more", "most"] {
+        let at = |name: &str| folder.path().join("data").join(format!("{name}.png"));
+        fs::copy(at(&first), at(&format!("{first}_{copy}"))).expect("copied");
+        frame["file_path"] = format!("{first}_{copy}").into();
+        test["frames"].as_array_mut().expect("frames").push(frame.clone());
+    }
     fs::write(&path, test.to_string()).expect("written");
     fs::remove_dir_all(folder.path().join("data/train")).expect("removed");
     irradia(folder.path(), "train data --out x").refused(1, &["data", "no view is left to train on", "r_000"]);

@@ -483,6 +483,19 @@ impl Recipe {
     }
 
     fn validate(&self) -> Result<(), String> {
+        let AdamKnobs {
+            beta1, beta2, epsilon, ..
+        } = self.adam;
+        for (name, beta) in [("beta1", beta1), ("beta2", beta2)] {
+            if !(0.0..1.0).contains(&beta) {
+                return Err(format!("adam.{name} = {beta} must be at least 0 and below 1"));
+            }
+        }
+        if !(epsilon.is_finite() && epsilon > 0.0) {
+            return Err(format!(
+                "adam.epsilon = {epsilon} must be above 0: splats without a gradient would become no numbers"
+            ));
+        }
         if self.stage.is_empty() {
             return Err("there must be at least one [[stage]]".into());
         }
@@ -746,6 +759,8 @@ mod tests {
             ("params.sh_degree={ steps = [[0, 1]], to = 3 }", "expected a number"),
             ("params.sh_degree=true", "in `params.sh_degree`"),
             ("init.opacity=1", "init.opacity"),
+            ("adam.epsilon=0", "adam.epsilon"),
+            ("adam.beta1=1", "adam.beta1"),
             ("nonsense", "key=value"),
             ("name.deeper=3", "inside a string"),
         ] {

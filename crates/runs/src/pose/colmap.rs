@@ -1,5 +1,6 @@
 //! Poses by COLMAP, where it is asked for: whichever version is on the path, whose options are taken from its own help.
 
+use super::brought;
 use super::capture::Capture;
 use super::stages::max_features;
 use super::{LeftOutPhoto, PoseInput, PoseProgress, PoseReport, joined, output};
@@ -21,11 +22,12 @@ pub(super) fn run(
     let folder = &capture.folder;
     let colmap = Colmap::find(&input.colmap)?;
     let out = &input.out;
-    let images = out.join("images");
-    fs::create_dir_all(&images).map_err(RunError::io("create", &images))?;
+    let images = out.join(brought::IMAGES);
     for photo in &folder.photos {
         output::link_photo(out, photo)?;
     }
+    // COLMAP reads whatever lies there.
+    brought::record(out, &folder.photos.iter().collect::<Vec<_>>(), false)?;
     let (database, written) = (out.join("colmap.db"), output::begin_models(out)?);
     if database.exists() {
         // COLMAP would add to that of an earlier call.

@@ -30,8 +30,6 @@ impl KnownPoses {
     /// The dataset's photographs and those of `more`, by name.
     pub fn with(&self, more: PhotoFolder) -> Result<PhotoFolder, RunError> {
         let mut folder = read_photo_folder(&self.data.join("images"))?;
-        // What else lies there is no part of the dataset.
-        folder.photos.retain(|photo| self.images.contains_key(&photo.name));
         let present = |name: &&String| folder.photos.iter().any(|photo| photo.name == **name);
         if let Some(name) = self.images.keys().filter(|name| !present(name)).min() {
             return Err(RunError::Refused(format!(

@@ -36,7 +36,7 @@ pub fn detect(path: &Path) -> Result<Kind, FormatError> {
         // The error lists what was expected.
         read_dataset(path, &DatasetOptions::default())?;
     }
-    match SplatFormat::of(path)? {
+    match SplatFormat::of_existing(path)? {
         SplatFormat::Ply | SplatFormat::PointsPly if !read_and_parse(path, has_splats)? => Ok(Kind::Points),
         format => Ok(Kind::Splats(format)),
     }

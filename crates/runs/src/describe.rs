@@ -14,7 +14,6 @@ use std::path::Path;
 /// When it does not exist, cannot be read, or is none of these.
 pub fn describe(path: impl AsRef<Path>) -> Result<Description, RunError> {
     let scene = scene_of(path.as_ref());
-    std::fs::metadata(&scene).map_err(RunError::io("read", &scene))?;
     if is_field(&scene) {
         let bytes = std::fs::metadata(&scene).map_or(0, |file| file.len());
         return Ok(describe_field(&read_field(&scene)?, bytes));

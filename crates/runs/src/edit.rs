@@ -140,12 +140,6 @@ impl Editing {
         let mut notes = Vec::new();
         if !is_file {
             fs::create_dir_all(output).map_err(RunError::io("create", output))?;
-        }
-        for (path, cloud) in &splits {
-            notes.extend(write_splats_with(path, cloud, options)?);
-            notes.push(format!("{}: {} splats split off", path.display(), cloud.len()));
-        }
-        if !is_file {
             let folder = RunFolder::at(output);
             if let Some(cameras) = cameras_moved(&self.path, &self.moved) {
                 folder.write("cameras.json", &cameras)?;
@@ -160,6 +154,10 @@ impl Editing {
                     crate::RESIDUAL
                 ));
             }
+        }
+        for (path, cloud) in &splits {
+            notes.extend(write_splats_with(path, cloud, options)?);
+            notes.push(format!("{}: {} splats split off", path.display(), cloud.len()));
         }
         notes.extend(write_splats_with(&file, &self.draft.shown(), options)?);
         match self.draft.hidden.count() {
@@ -250,18 +248,19 @@ impl Editing {
             if SplatFormat::of(&path).is_err() {
                 path = file.with_file_name(format!("{name}.ply"));
             }
-            let what = match () {
-                () if path == file || same_file(&path, &self.path) => "the scene itself",
-                () if files.iter().any(|(other, _)| *other == path) => "split off before",
-                () => {
-                    files.push((path, cloud));
-                    continue;
-                }
-            };
-            return Err(RunError::Refused(format!(
-                "split {name}: {} is {what}; choose another name",
-                path.display()
-            )));
+            let is_scene = path == file || same_file(&path, &self.path);
+            if is_scene || files.iter().any(|(other, _)| *other == path) {
+                let what = if is_scene {
+                    "the scene itself"
+                } else {
+                    "split off before"
+                };
+                return Err(RunError::Refused(format!(
+                    "split {name}: {} is {what}; choose another name",
+                    path.display()
+                )));
+            }
+            files.push((path, cloud));
         }
         Ok(files)
     }

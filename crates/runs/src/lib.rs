@@ -86,7 +86,7 @@ pub use photographs::photographs_of;
 pub use pose::{
     AttemptReport, CameraReport, DoctorInput, DoctorReport, ENOUGH_POSED, Finding, KnownDistance, LeftOutPhoto, Mapper,
     PoseCheck, PoseInput, PoseProgress, PoseReport, ScaleReport, StageReport, by_reason, check_poses, doctor,
-    is_capture, is_posed_here, pose,
+    is_capture, is_film_name, is_posed_here, pose,
 };
 pub use protocol::Protocol;
 pub use provenance::{data_fingerprint, program_fingerprint};

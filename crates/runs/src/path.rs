@@ -143,27 +143,35 @@ impl Film {
             offsets.sort_unstable_by(f32::total_cmp);
             offsets[(offsets.len() * 9 / 10).min(offsets.len() - 1)]
         };
-        let is_within = center.distance(outlook.center) < WITHIN * outlook.radius.hypot(outlook.height);
+        if center.distance(outlook.center) < WITHIN * outlook.radius.hypot(outlook.height) {
+            return Self::rising(scene, frames, size);
+        }
         let mut radii = Vec3::new(radius(Vec3::X), radius(Vec3::Y), radius(Vec3::Z)) * 0.7;
         radii.z = radii.z.min(NEARER * center.distance(outlook.center));
         let intrinsics = sized(outlook.intrinsics, size);
         let camera = |i: u32| {
             let angle = 2.0 * TAU * i as f32 / frames as f32;
-            let eye = match is_within {
-                true => {
-                    let (x, y) = outlook.up.any_orthonormal_pair();
-                    let height = outlook.height + RISES * outlook.radius * (0.5 * angle).sin();
-                    outlook.center + outlook.radius * (x * angle.cos() + y * angle.sin()) + outlook.up * height
-                }
-                false => {
-                    let offset = Vec3::new(angle.cos(), -angle.sin(), -(0.5 * angle).sin()) * radii;
-                    center + pose.rotation * offset
-                }
-            };
+            let offset = Vec3::new(angle.cos(), -angle.sin(), -(0.5 * angle).sin()) * radii;
+            let eye = center + pose.rotation * offset;
             Camera::new(Pose::look_at(eye, outlook.center, outlook.up), intrinsics)
         };
         Self {
             cameras: (0..frames).map(camera).collect(),
+            fps: 30.0,
+        }
+    }
+
+    /// `frames` cameras on two turns of an orbit, or of its arc, that rises and falls.
+    fn rising(scene: &Scene, frames: u32, size: Option<(u32, u32)>) -> Self {
+        let outlook = scene.outlook();
+        let turn = scene.orbit(frames.div_ceil(2), size);
+        let camera = |(i, camera): (u32, &Camera)| {
+            let rise = RISES * outlook.radius * (TAU * i as f32 / frames as f32).sin();
+            let eye = camera.pose.position + rise * outlook.up;
+            Camera::new(Pose::look_at(eye, outlook.center, outlook.up), camera.intrinsics)
+        };
+        Self {
+            cameras: (0..frames).zip(turn.iter().cycle()).map(camera).collect(),
             fps: 30.0,
         }
     }

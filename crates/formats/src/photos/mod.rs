@@ -189,9 +189,16 @@ pub fn read_photo_folders(folders: &[impl AsRef<Path>]) -> Result<PhotoFolder, F
         .map(|path| path.with_extension(""))
         .collect();
     let is_other_form = |file: &Found| is_unread(&file.path).is_some() && read.contains(&file.path.with_extension(""));
-    let (forms, mut files): (Vec<Found>, Vec<Found>) = files.into_iter().partition(is_other_form);
+    let (forms, files): (Vec<Found>, Vec<Found>) = files.into_iter().partition(is_other_form);
     let repeats = |file: Found| (file.name, "another form of a photograph that is read".to_owned());
     found.repeated.extend(forms.into_iter().map(repeats));
+    let mut places = HashSet::new();
+    let (mut files, again): (Vec<Found>, Vec<Found>) = files.into_iter().partition(|file| {
+        let place = file.path.canonicalize().unwrap_or_else(|_| file.path.clone());
+        places.insert((place, file.name.clone()))
+    });
+    let given = |file: Found| (file.name, "given twice".to_owned());
+    found.repeated.extend(again.into_iter().map(given));
     tell_apart(&mut files);
     files.sort_by(|a, b| a.name.cmp(&b.name).then_with(|| a.path.cmp(&b.path)));
     let entries: Vec<(String, Result<PhotoEntry, String>)> = files
@@ -228,17 +235,17 @@ pub fn read_photo_folders(folders: &[impl AsRef<Path>]) -> Result<PhotoFolder, F
 
 /// Puts the name of the folder before those of photographs of one name, and of the folders around it where these have one name as well.
 fn tell_apart(files: &mut [Found]) {
-    let mut levels: Vec<usize> = vec![0; files.len()];
-    for level in 1..=MOST_FOLDERS {
+    let mut folders = vec![0; files.len()];
+    for _ in 0..MOST_FOLDERS {
         let mut known: HashMap<String, usize> = HashMap::new();
         for file in files.iter() {
             *known.entry(file.name.clone()).or_default() += 1;
         }
-        for (file, at) in files.iter_mut().zip(&mut levels) {
-            let around = file.path.ancestors().nth(level).and_then(Path::file_name);
-            if let (true, Some(folder)) = (known[&file.name] > 1 && *at == level - 1, around) {
+        for (file, folders) in files.iter_mut().zip(&mut folders) {
+            let around = file.path.ancestors().nth(*folders + 1).and_then(Path::file_name);
+            if let (true, Some(folder)) = (known[&file.name] > 1, around) {
                 file.name = format!("{}_{}", folder.to_string_lossy(), file.name);
-                *at = level;
+                *folders += 1;
             }
         }
     }

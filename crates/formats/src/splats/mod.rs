@@ -113,6 +113,21 @@ impl SplatFormat {
         })
     }
 
+    /// As [`SplatFormat::of`], of what is there to be read.
+    ///
+    /// # Errors
+    /// Besides, when there is nothing, or a folder without a scene.
+    pub(crate) fn of_existing(path: &Path) -> Result<Self, FormatError> {
+        Self::of(path).map_err(|unknown| match std::fs::metadata(path) {
+            Err(source) => FormatError::Read {
+                path: path.to_owned(),
+                source,
+            },
+            Ok(found) if found.is_dir() => FormatError::NoScene(path.to_owned()),
+            Ok(_) => unknown,
+        })
+    }
+
     /// Whether what is written is equal to the bit when it is read.
     pub fn is_lossless(self) -> bool {
         matches!(self, Self::Ply | Self::Npz)
@@ -262,14 +277,7 @@ pub fn read_splats(path: &Path) -> Result<GaussianCloud, FormatError> {
 /// # Errors
 /// The same.
 pub fn read_splat_file(path: &Path) -> Result<SplatFile, FormatError> {
-    let mut format = SplatFormat::of(path).map_err(|unknown| match std::fs::metadata(path) {
-        Err(source) => FormatError::Read {
-            path: path.to_owned(),
-            source,
-        },
-        Ok(found) if found.is_dir() => FormatError::NoScene(path.to_owned()),
-        Ok(_) => unknown,
-    })?;
+    let mut format = SplatFormat::of_existing(path)?;
     let mut unread = Vec::new();
     let mut cloud = match format {
         SplatFormat::Ply | SplatFormat::CompressedPly | SplatFormat::PointsPly => read_and_parse(path, |bytes| {

@@ -7,7 +7,7 @@ use crate::terminal::say;
 use anyhow::{Context, Result};
 use irradia_runs::scene::{Camera, Image};
 use irradia_runs::train::painter::Painter;
-use irradia_runs::{Film, Scene, file_stems, write_image};
+use irradia_runs::{Film, Scene, file_stems, is_film_name, write_image};
 use std::path::{Path, PathBuf};
 
 #[derive(clap::Args)]
@@ -138,20 +138,12 @@ fn write_film(args: &Args, scene: &Scene, film: &Film) -> Result<()> {
     say(format_args!("{} frames in {}", film.cameras.len(), args.out.display()))
 }
 
-/// Extensions of films, by which no folder of frames is meant.
-const FILMS: [&str; 7] = ["mp4", "webm", "gif", "mov", "m4v", "mkv", "avi"];
-
 fn write_frames(args: &Args, scene: &Scene, cameras: Vec<(String, Camera)>) -> Result<()> {
     if cameras.is_empty() {
         return Err(Usage("nothing to render: no such views".into()).into());
     }
-    let extension = args
-        .out
-        .extension()
-        .and_then(|e| e.to_str())
-        .unwrap_or_default()
-        .to_lowercase();
-    if !args.out.is_dir() && FILMS.contains(&extension.as_str()) {
+    let is_film = film::kind(&args.out).is_some() || is_film_name(&args.out);
+    if is_film && !args.out.is_dir() {
         return Err(Usage(format!(
             "{}: films are .mp4, .webm or .gif, of --orbit or --path; name a folder for the frames",
             args.out.display()

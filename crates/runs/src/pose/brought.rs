@@ -2,7 +2,7 @@
 
 use crate::RunError;
 use crate::folder::to_json;
-use irradia_formats::{PhotoEntry, write_atomic};
+use irradia_formats::{PANORAMA_MASKS, PANORAMAS, PhotoEntry, write_atomic};
 use std::collections::BTreeSet;
 use std::fs;
 use std::path::{Component, Path};
@@ -20,14 +20,14 @@ pub(super) const MASKS: &str = "masks";
 type Files = BTreeSet<String>;
 
 /// A file that belongs to a photograph, and where it lies in the dataset.
-pub(super) struct Belonging<'a> {
-    pub from: &'a Path,
-    pub folder: &'static str,
-    pub name: String,
+struct Belonging<'a> {
+    from: &'a Path,
+    folder: &'static str,
+    name: String,
 }
 
 /// A photograph and what lies beside it: its mask and its maps of depth and normals, under its name with their own extension appended.
-pub(super) fn belongings(photo: &PhotoEntry) -> impl Iterator<Item = Belonging<'_>> {
+fn belongings(photo: &PhotoEntry) -> impl Iterator<Item = Belonging<'_>> {
     let beside = [
         (&photo.mask, MASKS),
         (&photo.depth, "depths"),
@@ -54,14 +54,40 @@ impl Belonging<'_> {
         format!("{}/{}", self.folder, self.name)
     }
 
-    fn is_there(&self, out: &Path) -> bool {
-        is_same(self.from, &out.join(self.file()))
+    /// Whether it is the file `to` already, and not a link or copy.
+    fn is(&self, to: &Path) -> bool {
+        fs::canonicalize(self.from).is_ok_and(|from| fs::canonicalize(to).is_ok_and(|to| from == to))
+    }
+
+    /// Brings it into `folder`, which is created: as a hard link where the file system allows it, else, and masks, which users edit in a dataset, as a copy.
+    fn bring(&self, folder: &Path) -> Result<(), RunError> {
+        fs::create_dir_all(folder).map_err(RunError::io("create", folder))?;
+        let to = &folder.join(&self.name);
+        if self.is(to) {
+            return Ok(());
+        }
+        if to.exists() {
+            fs::remove_file(to).map_err(RunError::io("replace", to))?;
+        }
+        if self.folder == MASKS || fs::hard_link(self.from, to).is_err() {
+            fs::copy(self.from, to).map_err(RunError::io("write", to))?;
+        }
+        Ok(())
     }
 }
 
-/// Whether both paths lead to one place.
-pub(super) fn is_same(a: &Path, b: &Path) -> bool {
-    fs::canonicalize(a).is_ok_and(|a| fs::canonicalize(b).is_ok_and(|b| a == b))
+/// Brings a photograph, its mask and its maps of depth and normals into the folders `images`, `masks`, `depths` and `normals` of the dataset.
+pub(super) fn bring_photo(out: &Path, photo: &PhotoEntry) -> Result<(), RunError> {
+    belongings(photo).try_for_each(|file| file.bring(&out.join(file.folder)))
+}
+
+/// Brings a panorama and its mask into the dataset, where training finds them beside their faces.
+pub(super) fn bring_panorama(out: &Path, panorama: &PhotoEntry) -> Result<(), RunError> {
+    belongings(panorama).try_for_each(|file| match file.folder {
+        IMAGES => file.bring(&out.join(PANORAMAS)),
+        MASKS => file.bring(&out.join(PANORAMA_MASKS)),
+        _ => Ok(()),
+    })
 }
 
 /// Puts away what an earlier call brought beside photographs and `photos` do not have: masks that were taken away would still hide what they hid.
@@ -78,7 +104,7 @@ pub(super) fn clear_beside(out: &Path, photos: &[PhotoEntry]) -> Result<(), RunE
 pub(super) fn record(out: &Path, posed: &[&PhotoEntry], added: bool) -> Result<(), RunError> {
     let before = before(out);
     // What lay in the dataset from the start stays.
-    let brought = |file: &Belonging| before.contains(&file.file()) || !file.is_there(out);
+    let brought = |file: &Belonging| before.contains(&file.file()) || !file.is(&out.join(file.file()));
     let files = posed.iter().flat_map(|photo| belongings(photo));
     let mut now: Files = files.filter(brought).map(|file| file.file()).collect();
     match added {
@@ -139,11 +165,7 @@ mod tests {
         let bring = |added: bool| {
             let photos = read_photo_folder(&source).unwrap().photos;
             clear_beside(&out, &photos).unwrap();
-            for file in photos.iter().flat_map(belongings) {
-                let to = out.join(file.folder).join(&file.name);
-                fs::create_dir_all(to.parent().unwrap()).unwrap();
-                fs::copy(file.from, to).unwrap();
-            }
+            photos.iter().try_for_each(|photo| bring_photo(&out, photo)).unwrap();
             record(&out, &photos.iter().collect::<Vec<_>>(), added).unwrap();
         };
         let there = |file: &str| out.join(file).exists();

@@ -1,6 +1,6 @@
 //! What is posed: photographs of one or several folders, frames of films, faces of panoramas.
 
-use super::output::link_panorama;
+use super::brought::bring_panorama;
 use super::{MIN_PHOTOS, PoseProgress, film, is_film};
 use crate::RunError;
 use glam::{DQuat, DVec3};
@@ -199,7 +199,7 @@ impl Capture {
             .map(|panorama| panorama.cut_panorama(folder))
             .collect::<Result<_, _>>()?;
         for panorama in panoramas {
-            link_panorama(out, panorama)?;
+            bring_panorama(out, panorama)?;
         }
         let all = || cut.iter().flatten().map(|face| &face.name);
         let taken = |name: &&String| self.folder.photos.iter().any(|photo| photo.name == **name);

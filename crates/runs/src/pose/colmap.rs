@@ -24,7 +24,7 @@ pub(super) fn run(
     let out = &input.out;
     let images = out.join(brought::IMAGES);
     for photo in &folder.photos {
-        output::link_photo(out, photo)?;
+        brought::bring_photo(out, photo)?;
     }
     // COLMAP reads whatever lies there.
     brought::record(out, &folder.photos.iter().collect::<Vec<_>>(), false)?;

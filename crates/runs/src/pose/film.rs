@@ -32,10 +32,15 @@ const BATCH: usize = 32;
 /// The longest line of a header of ffmpeg's grey pictures.
 const LONGEST_LINE: usize = 64;
 
+/// Whether `path` has the extension of a film.
+pub fn is_film_name(path: &Path) -> bool {
+    let extension = path.extension().and_then(|e| e.to_str()).map(str::to_ascii_lowercase);
+    extension.is_some_and(|e| FILMS.contains(&e.as_str()))
+}
+
 /// Whether `path` is a film by its extension.
 pub(super) fn is_film(path: &Path) -> bool {
-    let extension = path.extension().and_then(|e| e.to_str()).map(str::to_ascii_lowercase);
-    extension.is_some_and(|e| FILMS.contains(&e.as_str())) && path.is_file()
+    is_film_name(path) && path.is_file()
 }
 
 /// Whether ffmpeg is installed.
@@ -61,11 +66,20 @@ struct Chosen {
     /// What the frames' names begin with.
     stem: String,
     frames: Vec<usize>,
+    /// Why it gives no frames.
+    #[serde(default)]
+    damaged: Option<String>,
 }
 
 impl Chosen {
     fn name(&self, frame: usize) -> String {
         format!("{}_{frame:06}.jpg", self.stem)
+    }
+
+    /// Its file's name and the reason, if it gives no frames.
+    fn left_out(&self) -> Option<(String, String)> {
+        let name = self.film.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        self.damaged.clone().map(|reason| (name, reason))
     }
 }
 
@@ -90,27 +104,26 @@ pub(super) fn frames(
     if let Some(known) = known.filter(|known| known.len() == chosen.len()) {
         for (chosen, known) in chosen.iter_mut().zip(&known) {
             chosen.frames.clone_from(&known.frames);
+            chosen.damaged.clone_from(&known.damaged);
         }
         let mut names = chosen
             .iter()
             .flat_map(|film| film.frames.iter().map(|frame| film.name(*frame)));
         if known == chosen && names.all(|name| folder.join(name).is_file()) {
-            let damaged = chosen.iter().filter(|film| film.frames.is_empty());
-            return Ok(damaged
-                .map(|film| left_out(&film.film, "ffmpeg cannot read it"))
-                .collect());
+            return Ok(chosen.iter().filter_map(Chosen::left_out).collect());
         }
     }
     progress(PoseProgress::Stage { name: "frames", of: 0 });
     let mut before = 0;
     let mut measured = Vec::new();
-    let mut damaged = Vec::new();
     for (i, film) in films.iter().enumerate() {
         let frames = match measure(film, before, progress) {
             Ok(frames) => frames,
             Err(error) if i < named => return Err(error),
             Err(error) => {
-                damaged.push(left_out(film, &error.to_string()));
+                let said = error.to_string();
+                let path = format!("{}: ", film.display());
+                chosen[i].damaged = Some(said.strip_prefix(&path).unwrap_or(&said).to_owned());
                 Vec::new()
             }
         };
@@ -126,14 +139,7 @@ pub(super) fn frames(
         }
     }
     write_atomic(&record, |file| file.write_all(&crate::folder::to_json(&chosen)))?;
-    Ok(damaged)
-}
-
-/// The name of a film, and why it gives no frames.
-fn left_out(film: &Path, reason: &str) -> (String, String) {
-    let path = format!("{}: ", film.display());
-    let name = film.file_name().unwrap_or_default().to_string_lossy().into_owned();
-    (name, reason.strip_prefix(&path).unwrap_or(reason).to_owned())
+    Ok(chosen.iter().filter_map(Chosen::left_out).collect())
 }
 
 /// A film of which nothing is chosen yet.
@@ -145,6 +151,7 @@ fn of_file(film: &Path) -> Result<Chosen, RunError> {
         modified: metadata.modified().ok(),
         stem: film.file_stem().unwrap_or_default().to_string_lossy().into_owned(),
         frames: Vec::new(),
+        damaged: None,
     })
 }
 

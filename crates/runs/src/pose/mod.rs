@@ -45,6 +45,7 @@ pub use capture::is_capture;
 pub use check::{PoseCheck, check_poses};
 pub use doctor::{DoctorInput, DoctorReport, Finding, doctor};
 use film::is_film;
+pub use film::is_film_name;
 pub(crate) use points::{are_missing, find_points};
 
 /// The fraction of the photographs that should have a pose: below it, a second attempt is made, and no training begins unasked.
@@ -366,19 +367,18 @@ pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Resu
         clock.end("masks");
     }
     let Attempt {
-        matched: Matched { work, mut infos, pairs },
+        matched: Matched {
+            mut work,
+            mut infos,
+            pairs,
+        },
         mut reconstruction,
     } = attempt;
     reconstruction.regroup(&mut infos);
-    let mut warnings = Vec::new();
-    let mut warn = |warning: String| {
-        progress(PoseProgress::Warned(warning.clone()));
-        warnings.push(warning);
-    };
     let scale = match reconstruction.models.first_mut() {
         // What is known keeps its unit.
         Some(model) if is_new => {
-            let by_places = place::scale(folder, &work, model, &mut warn);
+            let by_places = place::scale(folder, &mut work, model);
             place::scale_by_distances(&input.distances, &infos, model)?.or(by_places)
         }
         _ => None,
@@ -407,7 +407,6 @@ pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Resu
     report.pairs = pairs.len();
     report.warnings = work.warnings().to_vec();
     report.warnings.extend(told);
-    report.warnings.extend(warnings);
     report.stages = clock.stages;
     report.seconds = started.elapsed().as_secs_f64();
     write_atomic(&out.join(REPORT), |file| file.write_all(&to_json(&report)))?;

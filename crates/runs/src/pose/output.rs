@@ -1,12 +1,12 @@
 //! The dataset that was reconstructed.
 
-use super::brought::{self, IMAGES, MASKS, belongings, is_same};
+use super::brought;
 use super::stages::Work;
 use super::{CameraReport, LeftOutPhoto, PoseReport};
 use crate::RunError;
 use irradia_formats::{
-    ColmapCamera, ColmapImage, ColmapModel, ColmapPoint, PANORAMA_MASKS, PANORAMAS, PhotoEntry, PhotoFolder,
-    PosedImage, TrackedPoint, write_colmap,
+    ColmapCamera, ColmapImage, ColmapModel, ColmapPoint, PhotoEntry, PhotoFolder, PosedImage, TrackedPoint,
+    write_colmap,
 };
 use irradia_sfm::geometry::camera::DCamera;
 use irradia_sfm::map::{Model, ModelPoint, PhotoInfo, Reconstruction};
@@ -29,7 +29,7 @@ pub(super) fn write(
             .then_some(&folder.photos[*i])
     };
     let posed: Vec<&PhotoEntry> = work.photos().iter().enumerate().filter_map(has_pose).collect();
-    posed.iter().try_for_each(|photo| link_photo(out, photo))?;
+    posed.iter().try_for_each(|photo| brought::bring_photo(out, photo))?;
     let written = begin_models(out)?;
     for (number, model) in found.models.iter().enumerate() {
         let to = written.join(number.to_string());
@@ -57,43 +57,6 @@ pub(super) fn end_models(out: &Path, written: &Path) -> Result<(), RunError> {
         fs::remove_dir_all(&sparse).map_err(RunError::io("clear", &sparse))?;
     }
     fs::rename(written, &sparse).map_err(RunError::io("rename", written))
-}
-
-/// Brings a photograph, its mask and its maps of depth and normals into the folders `images`, `masks`, `depths` and `normals` of the dataset.
-pub(super) fn link_photo(out: &Path, photo: &PhotoEntry) -> Result<(), RunError> {
-    for file in belongings(photo) {
-        bring(file.from, &out.join(file.folder), &file.name)?;
-    }
-    Ok(())
-}
-
-/// Brings a panorama and its mask into the dataset, where training finds them beside their faces.
-pub(super) fn link_panorama(out: &Path, panorama: &PhotoEntry) -> Result<(), RunError> {
-    for file in belongings(panorama) {
-        match file.folder {
-            IMAGES => bring(file.from, &out.join(PANORAMAS), &file.name)?,
-            MASKS => bring(file.from, &out.join(PANORAMA_MASKS), &file.name)?,
-            _ => (),
-        }
-    }
-    Ok(())
-}
-
-/// Makes `name` in `folder`, which is created, the file `from`: a hard link where the file system allows it, else a copy, as of masks, which users edit in a dataset.
-fn bring(from: &Path, folder: &Path, name: &str) -> Result<(), RunError> {
-    fs::create_dir_all(folder).map_err(RunError::io("create", folder))?;
-    let to = &folder.join(name);
-    if is_same(from, to) {
-        return Ok(());
-    }
-    if to.exists() {
-        fs::remove_file(to).map_err(RunError::io("replace", to))?;
-    }
-    let is_mask = [MASKS, PANORAMA_MASKS].iter().any(|masks| folder.ends_with(masks));
-    if is_mask || fs::hard_link(from, to).is_err() {
-        fs::copy(from, to).map_err(RunError::io("write", to))?;
-    }
-    Ok(())
 }
 
 fn colmap_model(work: &Work, infos: &[PhotoInfo], model: &Model) -> ColmapModel {

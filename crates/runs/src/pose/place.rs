@@ -12,12 +12,7 @@ const RADIUS_M: f64 = 6_378_137.0;
 const ECCENTRICITY_SQUARED: f64 = 6.694_379_990_14e-3;
 
 /// Brings `model` to metres if enough photographs tell their place, and tells what is known of its scale; warns where that is too little.
-pub(super) fn scale(
-    folder: &PhotoFolder,
-    work: &Work,
-    model: &mut Model,
-    warn: &mut dyn FnMut(String),
-) -> Option<ScaleReport> {
+pub(super) fn scale(folder: &PhotoFolder, work: &mut Work, model: &mut Model) -> Option<ScaleReport> {
     let gps: Vec<Option<[f64; 3]>> = work.photos().iter().map(|i| folder.photos[*i].tags.gps).collect();
     match to_metres(model, &local(&gps)) {
         Ok(metric) => Some(ScaleReport {
@@ -28,10 +23,10 @@ pub(super) fn scale(
             scale_error: metric.scale_error,
         }),
         Err(Some(error)) => {
-            warn(format!(
+            work.warn(Some(format!(
                 "the places of the photographs leave the scale open by {:.0} %: the unit of the poses is arbitrary",
                 100.0 * error.min(10.0)
-            ));
+            )));
             None
         }
         Err(None) => None,

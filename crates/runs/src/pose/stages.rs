@@ -138,7 +138,8 @@ impl<'a> Work<'a> {
         &self.sift
     }
 
-    fn warn(&mut self, warning: Option<String>) {
+    /// Tells the user now, and the report at the end.
+    pub fn warn(&mut self, warning: Option<String>) {
         if let Some(warning) = warning {
             (self.progress)(PoseProgress::Warned(warning.clone()));
             self.warnings.push(warning);

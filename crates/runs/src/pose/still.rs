@@ -14,7 +14,7 @@ use std::collections::BTreeMap;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-/// The folder of masks, and what tells that they are of an earlier call.
+/// What tells that masks are of an earlier call, in their folder.
 const RECORD: &str = ".irradia";
 /// Longer side of the pictures in which masks are found, px.
 const SIDE: u32 = 480;

@@ -52,10 +52,7 @@ pub fn add_guided_points(
     let camera = |camera: &Option<DCamera>| (camera.unwrap_or(DCamera::centered(1, 1, 1.0)), Source::Prior);
     let cameras: verify::Cameras = model.cameras.iter().map(camera).collect();
     let mut working = Working::new(photos, &cameras, &tracks, options);
-    working.hold(&Known {
-        poses: model.poses.clone(),
-        cameras: model.cameras.clone(),
-    });
+    working.hold(&Known::from(&*model));
     let found = finish::collected(&working, photos).points;
     let (certain, of_two): (Vec<_>, Vec<_>) = found.into_iter().partition(|point| point.track.len() >= CERTAIN);
     let before = std::mem::replace(&mut model.points, certain);

@@ -322,11 +322,7 @@ pub fn complete(
     let mut photos = photos.to_vec();
     found.regroup(&mut photos);
     let (largest, others) = found.models.split_first().expect("a model");
-    let known = Known {
-        poses: largest.poses.clone(),
-        cameras: largest.cameras.clone(),
-    };
-    let mut completed = extend(&photos, features, pairs, &known, options, progress);
+    let mut completed = extend(&photos, features, pairs, &largest.into(), options, progress);
     let poses = &completed.models[0].poses;
     let shares = |other: &&Model| poses.iter().zip(&other.poses).any(|(a, b)| a.is_some() && b.is_some());
     let others: Vec<Model> = others.iter().filter(|other| !shares(other)).cloned().collect();

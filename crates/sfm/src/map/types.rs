@@ -65,6 +65,15 @@ pub struct Known {
     pub cameras: Vec<Option<DCamera>>,
 }
 
+impl From<&Model> for Known {
+    fn from(model: &Model) -> Self {
+        Self {
+            poses: model.poses.clone(),
+            cameras: model.cameras.clone(),
+        }
+    }
+}
+
 /// How to verify and map. The defaults are COLMAP's where it has the same parameter.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct MapOptions {

@@ -3,7 +3,7 @@
 use crate::color::ColorMap;
 use crate::draft::{append, gather};
 use crate::ground::ground;
-use crate::select::{select, select_among};
+use crate::select::{select, select_among, selectable};
 use crate::transform::{transform_scene, transform_splats};
 use crate::{Draft, Edit, EditError, Operation, Selection, Transform, UpAxis};
 use glam::{DQuat, DVec3};
@@ -128,7 +128,12 @@ impl Plan {
             (Operation::Show {}, steps) => among(draft, &draft.hidden, steps.as_deref())?,
             (Operation::Unlock {}, steps) => among(draft, &draft.locked, steps.as_deref())?,
             (_, Some(steps)) => select(draft, steps)?,
-            (_, None) => Selection::all(n),
+            // What moves with the whole scene.
+            (Operation::Move { .. } | Operation::Rotate { .. } | Operation::Scale { .. }, None)
+            | (Operation::Merge { .. } | Operation::Upright { .. } | Operation::SetLength { .. }, None) => {
+                Selection::all(n)
+            }
+            (_, None) => selectable(draft),
         };
         let is_scene = edit.select.is_none();
         let of = selection.clone();
@@ -219,7 +224,11 @@ impl Plan {
             },
             Operation::Opacity { factor } if *factor == 1.0 => Change::Nothing,
             Operation::Opacity { factor } => Change::Fade(selection, *factor),
-            Operation::Reduce { count } => Change::Remove(least_important(draft, selection, *count)),
+            Operation::Reduce { count } => {
+                // Of the whole scene, what is locked counts and stays.
+                let stay = if is_scene { locked_in_sight(draft) } else { 0 };
+                Change::Remove(least_important(draft, selection, count.saturating_sub(stay)))
+            }
             Operation::Hide {} => Change::Hide(selection, true),
             Operation::Show {} => Change::Hide(selection, false),
             Operation::Lock {} => Change::Lock(selection, true),
@@ -309,6 +318,13 @@ impl Plan {
 /// What `steps` select among `marked`; all of them if there are no steps.
 fn among(draft: &Draft, marked: &Selection, steps: Option<&[crate::SelectStep]>) -> Result<Selection, EditError> {
     steps.map_or_else(|| Ok(marked.clone()), |steps| select_among(draft, steps, marked))
+}
+
+/// Number of locked splats that are not hidden.
+fn locked_in_sight(draft: &Draft) -> usize {
+    let mut locked = draft.locked.clone();
+    locked.subtract(&draft.hidden);
+    locked.count()
 }
 
 fn remove(draft: &mut Draft, selection: Selection) -> Provenance {

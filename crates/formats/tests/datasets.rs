@@ -210,6 +210,28 @@ fn exif_orientation_is_applied_exactly_when_the_poses_include_it() {
 }
 
 #[test]
+fn photographs_of_another_shape_than_their_cameras_are_named() {
+    let folder = pictures(4, 40, 30);
+    let told = |keys: &str| {
+        fs::write(folder.path().join("transforms.json"), transforms(4, keys)).unwrap();
+        read(folder.path()).unwrap().warnings.join("\n")
+    };
+    let exchanged = told(r#""fl_x": 35, "w": 30, "h": 40"#);
+    assert!(
+        exchanged.contains("4 of 4 photographs have another shape"),
+        "{exchanged}"
+    );
+    assert!(exchanged.contains("40x30 pixels for 30x40"), "{exchanged}");
+    for same in [
+        r#""fl_x": 35, "w": 80, "h": 60"#,
+        r#""fl_x": 35, "w": 80, "h": 61"#,
+        r#""fl_x": 35"#,
+    ] {
+        assert_eq!(told(same), "");
+    }
+}
+
+#[test]
 fn maps_of_depth_are_found_where_files_name_them_and_in_their_folder() {
     let folder = pictures(4, 120, 90);
     let root = folder.path();

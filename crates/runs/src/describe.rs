@@ -1,24 +1,28 @@
 //! Descriptions of files and folders.
 
 use crate::RunError;
-use crate::folder::RESIDUAL;
+use crate::folder::{RESIDUAL, holds_run};
 use crate::scene_file::{is_field, read_field, residual_beside, scene_of};
 use irradia_field::encoding::PositionEncoding;
 use irradia_field::{Field, Outside, Sampler};
-use irradia_formats::Description;
+use irradia_formats::{Description, FormatError};
 use std::path::Path;
 
 /// A summary of the scene, run, dataset or point cloud at `path`.
 ///
 /// # Errors
-/// When it does not exist, cannot be read, or is none of these.
+/// When it does not exist, cannot be read, is none of these, or is a run whose scene is not written yet.
 pub fn describe(path: impl AsRef<Path>) -> Result<Description, RunError> {
     let scene = scene_of(path.as_ref());
     if is_field(&scene) {
         let bytes = std::fs::metadata(&scene).map_or(0, |file| file.len());
         return Ok(describe_field(&read_field(&scene)?, bytes));
     }
-    let mut description = irradia_formats::describe(&scene)?;
+    let mut description =
+        irradia_formats::describe(&scene).map_err(|error| match scene.is_dir() && holds_run(&scene) {
+            true => FormatError::NoScene(scene.clone()),
+            false => error,
+        })?;
     if let Some(field) = residual_beside(&scene)? {
         let adds = format!("{RESIDUAL}, {} parameters", field.len());
         description.facts.push(("reflections", adds));

@@ -69,7 +69,7 @@ const EARLY: [&str; 4] = ["recipe.toml", "cameras.json", VIEWS, WORLD];
 
 /// Whether the folder `path` contains a run, or may contain one; not if it contains only the files of a process that died
 /// before its run had begun.
-fn holds_run(path: &Path) -> bool {
+pub(crate) fn holds_run(path: &Path) -> bool {
     let is_early = |file: &&str| EARLY.contains(file) && FolderLock::was_taken(path);
     FILES.iter().any(|file| path.join(file).exists() && !is_early(file))
 }

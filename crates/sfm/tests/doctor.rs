@@ -49,7 +49,7 @@ fn examine(world: &World, appearances: &[Appearance], colors: &[Vec<[u8; 3]>]) -
 }
 
 fn sharp(world: &World) -> Vec<Appearance> {
-    vec![Appearance::from_array([0.1, 0.5, 0.0, 0.0]); world.photos.len()]
+    vec![Appearance::from_array([0.1, 0.5, 0.0, 0.0, 0.0]); world.photos.len()]
 }
 
 fn grey(world: &World) -> Vec<Vec<[u8; 3]>> {
@@ -357,6 +357,26 @@ fn a_background_with_most_of_the_features_stands_still() {
         .iter()
         .filter(|diagnosis| matches!(diagnosis, Diagnosis::Twice { .. }));
     assert_eq!(twice.count(), 12, "{alone:?}");
+}
+
+#[test]
+fn a_mask_that_hides_all_is_named_in_place_of_darkness_and_texture() {
+    let mut world = ring(24, 2500, 0..0);
+    world.features[7] = Features::default();
+    world.pairs.retain(|pair| !pair.photos.contains(&7));
+    let mut appearances = sharp(&world);
+    // As of a picture of which nothing is left.
+    appearances[7] = Appearance::from_array([0.0, 0.0, 0.0, 0.0, 1.0]);
+    // What is hidden of one with features is no fault.
+    appearances[11].hidden = 0.95;
+    for found in examine(&world, &appearances, &grey(&world)) {
+        let looks = [Kind::Hidden, Kind::FewFeatures, Kind::Exposure, Kind::Blurred];
+        let told: Vec<&Diagnosis> = found.iter().filter(|d| looks.contains(&d.kind())).collect();
+        assert!(
+            matches!(told[..], [Diagnosis::Hidden { photo: 7, fraction }] if *fraction == 1.0),
+            "{found:?}"
+        );
+    }
 }
 
 #[test]

@@ -28,6 +28,9 @@ pub enum ViewerError {
     /// A scene without splats was to be shared.
     #[error("a radiance field has no splats, which a shared page draws; train splats, or share a film of it")]
     NoSplats,
+    /// A scene of which nothing is left was to be shared.
+    #[error("the scene has no splats: there is nothing to show")]
+    Empty,
     /// No scene fits into a limit of bytes.
     #[error("no scene fits into {bytes} bytes: the page around it takes {around}; choose a larger --max")]
     TooSmall {

@@ -70,9 +70,12 @@ pub struct Shared {
 /// Writes `scene` as a page at `output`, or as the folder `output`.
 ///
 /// # Errors
-/// When the scene is a field, which the page cannot draw, a limit of bytes is too small for any scene, or a file cannot be written.
+/// When the scene is a field, which the page cannot draw, or empty, a limit of bytes is too small for any scene, or a file cannot be written.
 pub fn share(scene: &Scene, output: &Path, options: &ShareOptions) -> Result<Shared, ViewerError> {
     let splats = scene.model.splats().ok_or(ViewerError::NoSplats)?;
+    if splats.is_empty() {
+        return Err(ViewerError::Empty);
+    }
     // What does not depend on the scene, and the text that holds it.
     let around = page(scene, options, None).len() as u64;
     let cost = |packed: &[u8]| match options.folder {

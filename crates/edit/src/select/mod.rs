@@ -14,10 +14,15 @@ use crate::{Draft, EditError, Mode, SelectStep, Selection, Shape};
 /// # Errors
 /// When a number is out of range, or a step needs cameras that are not known.
 pub fn select(draft: &Draft, steps: &[SelectStep]) -> Result<Selection, EditError> {
+    select_among(draft, steps, &selectable(draft))
+}
+
+/// The splats that are neither hidden nor locked.
+pub(crate) fn selectable(draft: &Draft) -> Selection {
     let mut selectable = draft.hidden.clone();
     selectable.add(&draft.locked);
     selectable.invert();
-    select_among(draft, steps, &selectable)
+    selectable
 }
 
 /// As [`select`], among other splats.

@@ -135,6 +135,18 @@ fn locked_and_hidden_splats_are_left_alone_but_move_with_the_scene() {
                 .count(),
             upper
         );
+        let faded = edited(&marked, &["opacity factor=0.5", "recolor exposure=1"]).cloud;
+        let of_same = |i: &usize| faded.opacity_logits[*i] == before.cloud.opacity_logits[*i];
+        let stayed: Vec<usize> = (0..200).filter(of_same).collect();
+        assert_eq!(stayed.len(), upper, "{mark}: the whole scene without them");
+        let width = 3 * before.cloud.sh_coefficients();
+        let sh = |cloud: &irradia_scene::GaussianCloud, i: usize| cloud.sh[i * width..][..width].to_vec();
+        assert!(stayed.iter().all(|i| sh(&faded, *i) == sh(&before.cloud, *i)));
+        let fewest = edited(&marked, &["reduce count=1"]);
+        match mark {
+            "lock" => assert_eq!(fewest.len(), upper, "what is locked counts and stays"),
+            _ => assert_eq!((fewest.len(), fewest.shown().len()), (upper + 1, 1)),
+        }
         let moved = edited(&marked, &["move by=0,0,1"]);
         assert!(
             moved

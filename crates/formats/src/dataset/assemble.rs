@@ -24,6 +24,8 @@ use std::sync::Arc;
 
 /// Minimum number of views of a scene.
 const MIN_VIEWS: usize = 3;
+/// The ratio of the shapes of a photograph and of its camera from which on they differ, beyond the rounding of small copies.
+const STRETCHED: f64 = 1.03;
 /// Maximum number of names in a warning.
 const MAX_NAMES: usize = 20;
 /// Photographs of a camera in which its image circle is searched.
@@ -144,6 +146,7 @@ pub(super) fn assemble(declared: Declared, options: &DatasetOptions) -> Result<D
     }
     warnings.extend(reasons);
     warnings.extend(indices.warning);
+    warnings.extend(stretched_warning(&usable));
     let max_side = options.max_side;
     if max_side == Some(DEFAULT_MAX_SIDE) {
         warnings.extend(scaled_warning(&usable));
@@ -266,6 +269,24 @@ enum Plan {
 fn usable_bounds([near, far]: [f64; 2]) -> Option<[f32; 2]> {
     let bounds = [near as f32, far as f32];
     (bounds[0] > 0.0 && bounds[1] > bounds[0] && bounds[1].is_finite()).then_some(bounds)
+}
+
+/// The warning about photographs of another shape than their cameras, whose focal lengths are stretched with the picture.
+fn stretched_warning(usable: &[(DeclaredView, Probed)]) -> Option<String> {
+    let is_stretched = |(view, probed): &&(DeclaredView, Probed)| {
+        let (width, height) = (f64::from(probed.source.width), f64::from(probed.source.height));
+        let declared = view.camera.size.map_or(1.0, |[w, h]| w * height / (h * width));
+        !(1.0 / STRETCHED..=STRETCHED).contains(&declared)
+    };
+    let mut stretched = usable.iter().filter(is_stretched);
+    let (view, probed) = stretched.next()?;
+    let [width, height] = view.camera.size?;
+    let (count, of) = (1 + stretched.count(), usable.len());
+    Some(format!(
+        "{count} of {of} photographs have another shape than their cameras, such as {}, of {}x{} pixels for {width}x{height}: they were cut or turned, or \
+         width and height are exchanged; poses will not fit unless they were stretched",
+        view.name, probed.source.width, probed.source.height
+    ))
 }
 
 /// The warning about photographs downscaled by default.

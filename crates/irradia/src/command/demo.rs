@@ -31,7 +31,7 @@ pub struct Args {
 
 #[derive(clap::Args)]
 pub struct SynthArgs {
-    /// Folder for the dataset
+    /// Folder for the dataset; files of the same names are replaced
     pub out: PathBuf,
     /// Training views; one in eight more is held out
     #[arg(long, default_value_t = SynthOptions::default().views)]

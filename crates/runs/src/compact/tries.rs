@@ -71,6 +71,8 @@ const FINEST: SogDetail = SogDetail {
 };
 /// Share of the wanted bytes that all splats may take before their training to count as fitting with bytes to spare.
 const SPARE: f64 = 0.97;
+/// Tries to keep within a number of bytes: where the first three miss, harmonics or rounding cost more than the line of bytes by splats says.
+const MISSES: u32 = 6;
 /// Tries of a search for the smallest scene.
 const SEARCHES: u32 = 6;
 /// Neighbouring tries of a search that are not told apart: counts that differ by less than this factor.
@@ -316,7 +318,7 @@ impl<'a> Tries<'a> {
             let near = bytes_with(self, count.clamp(1, first))?;
             count = (count as f64 + (most as f64 - near) / slope).max(0.0) as usize;
         }
-        for _ in 0..4 {
+        for miss in 0..MISSES {
             if count == 0 {
                 break;
             }
@@ -324,8 +326,8 @@ impl<'a> Tries<'a> {
             if found.bytes <= most {
                 return Ok(found);
             }
-            // What is left is trained further with a little less; what a file has beside its splats stays.
-            let excess = 1.1 * (found.bytes - most) as f64 / slope;
+            // What is left is trained further with a little less, and at each miss with more of it less; what a file has beside its splats stays.
+            let excess = 1.1 * f64::from(1 << miss) * (found.bytes - most) as f64 / slope;
             let had = found.splats.len() as f64;
             count = (had - excess.max(1.0)).max(0.5 * had) as usize;
             self.begin = found.splats;

@@ -454,17 +454,28 @@ fn joined(paths: &[PathBuf]) -> String {
     paths.join(", ")
 }
 
-/// Why nothing could be posed, and what to do: too little texture if more than half of the photographs have it, else what the doctor says of the whole, else the first
-/// photograph's reason.
+/// Why nothing could be posed, and what to do: masks or too little texture if more than half of the photographs have these, else what the doctor says of the whole, else the
+/// first photograph's reason.
 fn no_model(paths: &[PathBuf], photos: &[PhotoInfo], found: &Reconstruction, examined: &DoctorReport) -> String {
-    let is_smooth = |finding: &&Finding| finding.kind == Kind::FewFeatures.name();
-    let smooth = examined.findings.iter().filter(is_smooth).count();
+    let count = |kind: Kind| {
+        examined
+            .findings
+            .iter()
+            .filter(|finding| finding.kind == kind.name())
+            .count()
+    };
+    let (smooth, hidden) = (count(Kind::FewFeatures), count(Kind::Hidden));
     let of_all = examined
         .findings
         .iter()
         .find(|finding| finding.kind != Kind::LeftOut.name());
     let overlap = "take more photographs that overlap by two thirds, from different places";
     let reason = match (of_all, found.left_out.first()) {
+        _ if 2 * hidden > photos.len() => {
+            format!(
+                "{hidden} are masked or transparent nearly everywhere; white parts of a mask count, black ones are hidden"
+            )
+        }
         _ if 2 * smooth > photos.len() => format!(
             "{smooth} show little texture, or are out of focus; put something textured, such as a newspaper, under or around what they show, \
              or go nearer"

@@ -1,6 +1,6 @@
 //! Features and matches on disk, by the hash of the photographs' bytes: renamed photographs keep theirs, changed ones lose them.
 //!
-//! Little-endian: the signature; the settings; u64 photographs, each u64 hash, four `f32` of its appearance, u64 features, each
+//! Little-endian: the signature; the settings; u64 photographs, each u64 hash, five `f32` of its appearance, u64 features, each
 //! `f32 x, y, scale, angle`, the descriptor, the frontal one if there are such, and `r, g, b`; u64 pairs, each the hashes of both photographs, u64 matches,
 //! each `u32, u32`.
 
@@ -12,7 +12,7 @@ use std::io::{self, Write};
 use std::path::Path;
 
 /// Ends in the version of everything that features and matches depend on beside the settings.
-const SIGNATURE: &[u8; 16] = b"irradia.sfm 0003";
+const SIGNATURE: &[u8; 16] = b"irradia.sfm 0004";
 /// What features depend on: settings of their extractor, and whether they have frontal descriptors.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(super) struct Settings {
@@ -123,8 +123,8 @@ fn parse(mut bytes: &[u8], settings: Settings) -> Option<Known> {
     let mut known = Known::default();
     for _ in 0..take_u64(&mut bytes)? {
         let hash = take_u64(&mut bytes)?;
-        let figures = take(&mut bytes, 16)?.as_chunks::<4>().0;
-        let figures: [f32; 4] = std::array::from_fn(|i| f32::from_le_bytes(figures[i]));
+        let figures = take(&mut bytes, 20)?.as_chunks::<4>().0;
+        let figures: [f32; 5] = std::array::from_fn(|i| f32::from_le_bytes(figures[i]));
         let count = usize::try_from(take_u64(&mut bytes)?).ok()?;
         let mut looks = Looks {
             appearance: Appearance::from_array(figures),
@@ -198,7 +198,7 @@ mod tests {
                 frontal: Vec::new(),
             },
             colors: (0..n).map(|i| [i, 1, 2]).collect(),
-            appearance: Appearance::from_array([0.1, 0.5, 0.0, f32::from(n)]),
+            appearance: Appearance::from_array([0.1, 0.5, 0.0, f32::from(n), 0.2]),
         }
     }
 

@@ -25,21 +25,24 @@ pub struct Appearance {
     pub white: f32,
     /// Fraction of the pixels that are black.
     pub black: f32,
+    /// Fraction of the pixels that are masked; they count for none of the figures before.
+    pub hidden: f32,
 }
 
 impl Appearance {
     /// The figures as they are stored.
-    pub fn to_array(self) -> [f32; 4] {
-        [self.sharpness, self.brightness, self.white, self.black]
+    pub fn to_array(self) -> [f32; 5] {
+        [self.sharpness, self.brightness, self.white, self.black, self.hidden]
     }
 
     /// From the figures as they are stored.
-    pub fn from_array([sharpness, brightness, white, black]: [f32; 4]) -> Self {
+    pub fn from_array([sharpness, brightness, white, black, hidden]: [f32; 5]) -> Self {
         Self {
             sharpness,
             brightness,
             white,
             black,
+            hidden,
         }
     }
 
@@ -64,6 +67,7 @@ impl Appearance {
             brightness: of(sum) / 255.0,
             white: of(white),
             black: of(black),
+            hidden: 1.0 - (count as f64 / grey.len().max(1) as f64) as f32,
         }
     }
 }

@@ -24,6 +24,8 @@ const BLACK: f64 = 0.4;
 /// Features below which a photograph has too few, and the fraction of the median below which it has.
 const FEATURES: usize = 150;
 pub(super) const FEATURES_BY_MEDIAN: f64 = 0.1;
+/// The hidden fraction of a photograph from which on that, not texture or light, is what it lacks.
+const HIDDEN: f32 = 0.9;
 
 /// The photographs that show most of what `photo` shows.
 fn neighbours(evidence: &Evidence, graph: &Graph, photo: usize) -> Vec<usize> {
@@ -122,7 +124,7 @@ pub(super) fn exposure(evidence: &Evidence, graph: &Graph) -> Vec<Diagnosis> {
                 fraction: own.black.into(),
                 bright: false,
             });
-        } else if stops.is_none() && !graph.is_on_rig(photo) {
+        } else if stops.is_none() && !graph.is_on_rig(photo) && own.hidden < HIDDEN {
             // Without matches, the brightness of the whole picture is all there is.
             let neighbours = neighbours(evidence, graph, photo);
             let brightness = |p: usize| f64::from(evidence.appearances[p].brightness.max(0.002));
@@ -140,17 +142,23 @@ pub(super) fn exposure(evidence: &Evidence, graph: &Graph) -> Vec<Diagnosis> {
     found
 }
 
-/// Photographs with little texture.
+/// Photographs with little texture, or of which too little is not hidden.
 pub(super) fn few_features(evidence: &Evidence, graph: &Graph) -> Vec<Diagnosis> {
     let counts: Vec<usize> = evidence.features.iter().map(|f| f.keypoints.len()).collect();
     let median = median(counts.iter().map(|c| *c as f64).collect()).unwrap_or(0.0);
     let least = (FEATURES_BY_MEDIAN * median).max(FEATURES as f64);
     (0..counts.len())
         .filter(|photo| (counts[*photo] as f64) < least && !graph.is_on_rig(*photo))
-        .map(|photo| Diagnosis::FewFeatures {
-            photo,
-            features: counts[photo],
-            median: median as usize,
+        .map(|photo| match evidence.appearances[photo].hidden {
+            hidden if hidden >= HIDDEN => Diagnosis::Hidden {
+                photo,
+                fraction: hidden.into(),
+            },
+            _ => Diagnosis::FewFeatures {
+                photo,
+                features: counts[photo],
+                median: median as usize,
+            },
         })
         .collect()
 }

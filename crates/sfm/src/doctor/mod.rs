@@ -195,6 +195,7 @@ fn left_out(evidence: &Evidence, known: &[Diagnosis]) -> Vec<Diagnosis> {
                 if *bright { "white" } else { "black" }
             ),
             Diagnosis::FewFeatures { features, .. } => format!("only {features} features: it shows little texture"),
+            Diagnosis::Hidden { fraction, .. } => format!("{:.0} % of it are masked or transparent", 100.0 * fraction),
             Diagnosis::Zoom { ratio, .. } => format!("it has {ratio:.2} times the focal length of the others"),
             _ => continue,
         };

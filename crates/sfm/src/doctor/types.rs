@@ -12,6 +12,8 @@ pub enum Kind {
     Exposure,
     /// [`Diagnosis::FewFeatures`]
     FewFeatures,
+    /// [`Diagnosis::Hidden`]
+    Hidden,
     /// [`Diagnosis::Zoom`], [`Diagnosis::OwnFocals`] and [`Diagnosis::ZoomSettings`]
     Zoom,
     /// [`Diagnosis::Cut`]
@@ -51,6 +53,7 @@ impl Kind {
             Kind::Blurred => "blurred",
             Kind::Exposure => "exposure",
             Kind::FewFeatures => "few-features",
+            Kind::Hidden => "hidden",
             Kind::Zoom => "zoom",
             Kind::Cut => "cut",
             Kind::FocalUnknown => "focal-unknown",
@@ -108,6 +111,13 @@ pub enum Diagnosis {
         features: usize,
         /// Those of half of the photographs.
         median: usize,
+    },
+    /// Hidden by its mask, or transparent, but for too little.
+    Hidden {
+        /// The photograph.
+        photo: usize,
+        /// The fraction that is hidden.
+        fraction: f64,
     },
     /// Taken with another focal length than the others of its camera.
     Zoom {
@@ -250,6 +260,7 @@ impl Diagnosis {
             Diagnosis::Blurred { .. } => Kind::Blurred,
             Diagnosis::ExposureJump { .. } | Diagnosis::Clipped { .. } => Kind::Exposure,
             Diagnosis::FewFeatures { .. } => Kind::FewFeatures,
+            Diagnosis::Hidden { .. } => Kind::Hidden,
             Diagnosis::Zoom { .. } | Diagnosis::OwnFocals { .. } | Diagnosis::ZoomSettings { .. } => Kind::Zoom,
             Diagnosis::Cut { .. } => Kind::Cut,
             Diagnosis::FocalUnknown { .. } => Kind::FocalUnknown,
@@ -275,6 +286,7 @@ impl Diagnosis {
             | Diagnosis::ExposureJump { photo, .. }
             | Diagnosis::Clipped { photo, .. }
             | Diagnosis::FewFeatures { photo, .. }
+            | Diagnosis::Hidden { photo, .. }
             | Diagnosis::CutPoint { photo, .. }
             | Diagnosis::FewPartners { photo, .. }
             | Diagnosis::LeftOut { photo, .. } => vec![*photo],
@@ -391,6 +403,12 @@ impl Display for Sentence<'_> {
                 }
                 write!(f, ": it shows little texture; include something textured")
             }
+            Diagnosis::Hidden { photo, fraction } => write!(
+                f,
+                "{:.0} % of {} are masked or transparent: white parts of a mask count, black ones are hidden",
+                100.0 * fraction,
+                name(photo)
+            ),
             Diagnosis::Zoom { photos, ratio } => write!(
                 f,
                 "{} {} taken with {ratio:.2} times the focal length of the others; do not zoom",

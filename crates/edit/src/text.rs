@@ -5,19 +5,23 @@
 //! ```
 //!
 //! `+` adds a shape to the selection (as no sign does), `-` subtracts it, `&` intersects. Values are numbers, words, vectors
-//! (`1,2,3`) and lists of vectors (`0,0;1,0;1,1`, a single one as `0,0;`); `camera.size=640,480` is a key of a table. The words stand for the same keys
-//! as in TOML, so that a new operation or shape needs nothing here.
+//! (`1,2,3`) and lists of vectors (`0,0;1,0;1,1`, a single one as `0,0;`); `camera.size=640,480` is a key of a table. What is in quotes, `"my scene.ply"`, is
+//! one word and no number. The words stand for the same keys as in TOML, so that a new operation or shape needs nothing here.
 
 use crate::{Edit, EditError};
 use std::fmt;
 use std::str::FromStr;
 use toml::{Table, Value};
 
+/// What keeps spaces within a word.
+const QUOTE: char = '"';
+
 impl FromStr for Edit {
     type Err = EditError;
 
     fn from_str(text: &str) -> Result<Self, EditError> {
-        let mut words = text.split_whitespace();
+        let words = words(text)?;
+        let mut words = words.iter().map(String::as_str);
         let op = words.next().ok_or_else(|| {
             EditError::Words("an empty edit: name an operation, such as: delete sphere center=0,0,0 radius=1".into())
         })?;
@@ -55,6 +59,24 @@ impl FromStr for Edit {
     }
 }
 
+/// The words of `text`, with their quotes.
+fn words(text: &str) -> Result<Vec<String>, EditError> {
+    let (mut words, mut word, mut quoted) = (Vec::new(), String::new(), false);
+    for c in text.chars() {
+        quoted ^= c == QUOTE;
+        match c.is_whitespace() && !quoted {
+            true => words.push(std::mem::take(&mut word)),
+            false => word.push(c),
+        }
+    }
+    if quoted {
+        return Err(EditError::Words(format!("{word}: a quote is not closed")));
+    }
+    words.push(word);
+    words.retain(|word| !word.is_empty());
+    Ok(words)
+}
+
 /// Puts `value` under `key`, whose dots open tables.
 fn insert(table: &mut Table, key: &str, value: Value) -> Result<(), &'static str> {
     let reserved = ["op", "select", "mode", "shape"];
@@ -71,8 +93,11 @@ fn insert(table: &mut Table, key: &str, value: Value) -> Result<(), &'static str
     insert(entry.as_table_mut().ok_or("given twice")?, inner, value)
 }
 
-/// A number, a vector, a list of vectors, a truth value, otherwise a word.
+/// A number, a vector, a list of vectors, a truth value, otherwise a word, as anything in quotes.
 fn value(text: &str) -> Value {
+    if text.contains(QUOTE) {
+        return text.replace(QUOTE, "").into();
+    }
     let number = |text: &str| {
         let whole = text.parse().map(Value::Integer);
         whole.or_else(|_| text.parse().map(Value::Float)).ok()
@@ -93,7 +118,7 @@ fn value(text: &str) -> Value {
 }
 
 impl fmt::Display for Edit {
-    /// The edit in one line, which parses to the same edit unless a name contains spaces.
+    /// The edit in one line, which parses to the same edit unless a name contains quotes.
     fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
         let mut edit = Table::try_from(self).map_err(|_| fmt::Error)?;
         f.write_str(self.op.name())?;
@@ -135,6 +160,9 @@ fn write_keys(f: &mut fmt::Formatter, prefix: &str, table: &Table) -> fmt::Resul
 
 fn in_words(value: &Value) -> String {
     match value {
+        Value::String(text) if text.contains(char::is_whitespace) || !self::value(text).is_str() => {
+            format!("{QUOTE}{text}{QUOTE}")
+        }
         Value::String(text) => text.clone(),
         Value::Float(number) => number.to_string(),
         Value::Array(items) => items.iter().map(in_words).collect::<Vec<_>>().join(","),

@@ -352,6 +352,23 @@ fn nerfstudio_splits_points_and_frames_with_their_own_camera() {
 }
 
 #[test]
+fn masks_and_maps_that_are_not_there_are_told() {
+    let folder = pictures(4, 40, 30);
+    let with = transforms(4, r#""fl_x": 35"#).replacen(
+        r#""transform_matrix""#,
+        r#""mask_path": "m/0.png", "depth_file_path": "d/0.png", "transform_matrix""#,
+        1,
+    );
+    fs::write(folder.path().join("transforms.json"), with).unwrap();
+    let told = read(folder.path()).unwrap().warnings.join("\n");
+    assert!(told.contains("1 masks are not there, such as m/0.png"), "{told}");
+    assert!(
+        told.contains("1 maps of depth are not there, such as d/0.png"),
+        "{told}"
+    );
+}
+
+#[test]
 fn a_photograph_that_is_listed_twice_is_one_view() {
     let folder = pictures(9, 8, 8);
     let root = folder.path();

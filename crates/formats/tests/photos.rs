@@ -175,6 +175,35 @@ fn other_kinds_of_pictures_and_masks_are_read() {
 }
 
 #[test]
+fn masks_of_turned_photographs_are_turned_with_them() {
+    let folder = tempfile::tempdir().unwrap();
+    let root = folder.path();
+    fs::create_dir(root.join("masks")).unwrap();
+    // Stored lying, seen standing: 30 x 40. The left half of what is seen is hidden, which is the lower half of what is stored.
+    save_turned(&root.join("a.jpg"), &picture(40, 30, 9), 6);
+    let half = |hides: fn(u32, u32) -> bool, width, height| {
+        image::GrayImage::from_fn(width, height, |x, y| image::Luma([if hides(x, y) { 0 } else { 255 }]))
+    };
+    let hidden = || {
+        let found = read_photo_folder(root).unwrap();
+        let mask = found.photos[0].read_mask(30, 40).unwrap().unwrap();
+        (0..1200).all(|p| mask[p] == if p % 30 < 15 { 0 } else { 255 })
+    };
+    half(|_, y| y >= 15, 40, 30).save(root.join("masks/a.png")).unwrap();
+    assert!(hidden(), "as stored");
+    half(|x, _| x < 15, 30, 40).save(root.join("masks/a.png")).unwrap();
+    assert!(hidden(), "as seen");
+    // Masks of other names are told.
+    fs::rename(root.join("masks/a.png"), root.join("masks/mask_a.png")).unwrap();
+    let found = read_photo_folder(root).unwrap();
+    assert!(found.photos[0].mask.is_none());
+    assert!(
+        matches!(&found.repeated[..], [(name, why)] if name == "masks" && why.contains("nothing is masked")),
+        "{found:?}"
+    );
+}
+
+#[test]
 fn phones_photographs_are_read_with_what_the_camera_wrote() {
     let folder = tempfile::tempdir().unwrap();
     // The turn stands in the container as well: what EXIF says must not turn the picture once more.

@@ -288,6 +288,21 @@ fn a_scene_far_from_the_origin_keeps_its_shape() {
         assert!((back.means[i][0] - 1000.0 * cloud.means[i][0]).abs() < 1e-3);
         assert!((back.log_scales[i][0] - cloud.log_scales[i][0] - 1000f32.ln()).abs() < 1e-5);
     }
+    // NumPy's arrays have no place for another coordinate system either.
+    let write = |name: &str, cloud: &GaussianCloud| {
+        let path = folder.path().join(name);
+        let notes = write_splats_with(&path, cloud, &WriteOptions::default()).unwrap();
+        (notes, std::fs::read(path).unwrap())
+    };
+    let (notes, far) = write("far.npz", &cloud);
+    assert!(notes[0].contains("relative to (500000000, 0, 0)"), "{notes:?}");
+    let world = std::mem::take(&mut cloud.world_from_dataset);
+    let (unit, log_unit) = (1.0 / world.scale, world.scale.ln());
+    let scaled = |v: &mut f32| *v = (f64::from(*v) * unit) as f32;
+    cloud.means.as_flattened_mut().iter_mut().for_each(scaled);
+    let grown = |v: &mut f32| *v = (f64::from(*v) - log_unit) as f32;
+    cloud.log_scales.as_flattened_mut().iter_mut().for_each(grown);
+    assert!(write("near.npz", &cloud).1 == far, "in the dataset's unit");
 }
 
 #[test]

@@ -1,6 +1,7 @@
 //! A scene from one splat format to another, and what it cost: bytes, splats and, for lossy formats, PSNR.
 
 use crate::folder::cameras_beside;
+use crate::levels::remove_levels;
 use crate::orbit::orbit;
 use crate::{RunError, scene_of};
 use irradia_formats::{SplatFormat, WriteOptions, read_splat_file, read_splats, splat_file_size, write_splats_with};
@@ -41,12 +42,14 @@ pub fn convert(input: &Path, output: &Path, options: &WriteOptions, compares: bo
     let to = SplatFormat::of(output)?;
     let input = scene_of(input);
     let file = read_splat_file(&input)?;
+    let before = splat_file_size(&input)?;
     let mut notes = file.warnings();
+    remove_levels(output)?;
     notes.extend(write_splats_with(output, &file.cloud, options)?);
     let is_compared = compares && to.is_readable() && !to.is_lossless();
     Ok(Conversion {
         formats: [file.format, to],
-        bytes: [splat_file_size(&input)?, splat_file_size(output)?],
+        bytes: [before, splat_file_size(output)?],
         splats: file.cloud.len(),
         notes,
         psnr: is_compared.then(|| compare(&input, &file.cloud, output)).transpose()?,

@@ -1,6 +1,7 @@
 //! Edits of a scene on disk: read, replay a list, write.
 
-use crate::folder::{cameras_beside, cameras_moved};
+use crate::folder::{SKY, VIGNETTE, cameras_beside, cameras_moved};
+use crate::levels::remove_levels;
 use crate::lock::FolderLock;
 use crate::photographs::photographs_of;
 use crate::scene_file::is_field;
@@ -128,10 +129,7 @@ impl Editing {
             true => output.to_owned(),
             false => output.join(SCENE),
         };
-        if same_file(&file, &self.path) {
-            let message = format!("{} would be replaced: name another output", self.path.display());
-            return Err(RunError::Refused(message));
-        }
+        check_kept(&self.path, &file)?;
         if !is_file && output.join("run.json").exists() {
             let message = format!("{} holds a run: name another folder", output.display());
             return Err(RunError::Refused(message));
@@ -144,8 +142,11 @@ impl Editing {
             if let Some(cameras) = cameras_moved(&self.path, &self.moved) {
                 folder.write("cameras.json", &cameras)?;
             }
-            if let Ok(recipe) = fs::read(self.path.with_file_name("recipe.toml")) {
-                folder.write("recipe.toml", &recipe)?;
+            // By these it is rendered.
+            for name in ["recipe.toml", SKY, VIGNETTE] {
+                if let Ok(content) = fs::read(self.path.with_file_name(name)) {
+                    folder.write(name, &content)?;
+                }
             }
             folder.write(EDITS, self.list.to_toml().as_bytes())?;
             if self.path.with_file_name(crate::RESIDUAL).is_file() {
@@ -159,6 +160,7 @@ impl Editing {
             notes.extend(write_splats_with(path, cloud, options)?);
             notes.push(format!("{}: {} splats split off", path.display(), cloud.len()));
         }
+        remove_levels(&file)?;
         notes.extend(write_splats_with(&file, &self.draft.shown(), options)?);
         match self.draft.hidden.count() {
             0 => {}
@@ -299,6 +301,21 @@ fn open_scene(file: &str, path: &Path) -> Result<GaussianCloud, String> {
         false => scene_of(&path.with_file_name(file)),
     };
     Ok(read_splat_file(&path).map_err(|error| error.to_string())?.cloud)
+}
+
+/// Refuses an output that would replace the scene that is read.
+///
+/// # Errors
+/// When `output` is `scene`, or the file of the scene in it.
+pub fn check_kept(scene: &Path, output: &Path) -> Result<(), RunError> {
+    let scene = scene_of(scene);
+    match same_file(output, &scene) {
+        true => Err(RunError::Refused(format!(
+            "{} would be replaced: name another output",
+            scene.display()
+        ))),
+        false => Ok(()),
+    }
 }
 
 fn same_file(a: &Path, b: &Path) -> bool {

@@ -64,7 +64,10 @@ pub enum RunError {
         source: io::Error,
     },
     /// A folder contains no run.
-    #[error("{0} holds no run to resume: cannot read {0}/run.json: {source}", path.display())]
+    #[error(
+        "{0} holds no run to resume: cannot read {0}/run.json: {source}; one that was stopped before its training goes on by the command that began it",
+        path.display()
+    )]
     NoRun {
         /// The folder.
         path: PathBuf,

@@ -8,6 +8,7 @@ use irradia_scene::{Camera, GaussianCloud, resize_area};
 use irradia_splat::levels::merged;
 use irradia_splat::{RenderOptions, Renderer, Splats};
 use irradia_train::model::Model;
+use std::fs;
 use std::path::{Path, PathBuf};
 
 /// Levels beside a scene; each has half of the splats of the one before.
@@ -50,6 +51,17 @@ pub fn level_file(path: &Path, level: u32) -> Result<PathBuf, RunError> {
         ))),
         (_, Some(stem)) => Ok(path.with_file_name(format!("{stem}.lod{level}{}", format.suffix()))),
     }
+}
+
+/// Removes the levels beside `path`, to which another scene is written.
+pub(crate) fn remove_levels(path: &Path) -> Result<(), RunError> {
+    for level in 1..=LEVELS {
+        let Ok(file) = level_file(path, level) else { break };
+        if file.is_file() {
+            fs::remove_file(&file).map_err(RunError::io("remove", &file))?;
+        }
+    }
+    Ok(())
 }
 
 /// Writes the levels of the scene `input` beside `output`, and compares them from where its training cameras are.

@@ -70,7 +70,7 @@ pub use background::Background;
 pub use compact::{CompactEvent, CompactInput, CompactTarget, Compacted, compact};
 pub use convert::{COMPARED_VIEWS, Conversion, convert};
 pub use describe::describe;
-pub use edit::{EDITS, Editing, Made};
+pub use edit::{EDITS, Editing, Made, check_kept};
 pub use error::RunError;
 pub use evaluate::{distinct, evaluate, file_stem, file_stems, unmeasured};
 pub use folder::{FIELD, RESIDUAL, RunFolder, RunRecord, SCENE};

@@ -5,8 +5,8 @@
 //! times; rotations are interpolated by squad (Shoemake, "Quaternion calculus and fast animation", 1987).
 
 use crate::{RunError, Scene};
-use glam::{Mat3, Quat, Vec3};
-use irradia_scene::{Camera, Intrinsics, Pose};
+use glam::{DVec3, Mat3, Quat, Vec3};
+use irradia_scene::{Camera, Intrinsics, Pose, Similarity};
 use serde::{Deserialize, Serialize};
 use std::f32::consts::TAU;
 use std::fs;
@@ -65,7 +65,7 @@ struct Nerfstudio {
 #[derive(Deserialize)]
 struct NerfstudioCamera {
     /// Row-major 4 x 4, OpenGL's axes (x right, y up, z backward).
-    camera_to_world: Vec<f32>,
+    camera_to_world: Vec<f64>,
     /// Vertical, degrees.
     fov: f32,
 }
@@ -80,12 +80,12 @@ pub struct Film {
 }
 
 impl Film {
-    /// Reads a path that the viewer has saved, or a `camera_path.json` of nerfstudio in the coordinates of the scene; frames have
-    /// `width` x `height` pixels.
+    /// Reads a path that the viewer has saved, or a `camera_path.json` of nerfstudio in the coordinates of the dataset, of which `world` tells those of the scene;
+    /// frames have `width` x `height` pixels.
     ///
     /// # Errors
     /// When the file cannot be read or is no such path.
-    pub fn read(path: &Path, (width, height): (u32, u32)) -> Result<Self, RunError> {
+    pub fn read(path: &Path, world: &Similarity, (width, height): (u32, u32)) -> Result<Self, RunError> {
         let text = fs::read_to_string(path).map_err(RunError::io("read", path))?;
         let wrong = |reason: &str| RunError::Damaged {
             path: path.to_owned(),
@@ -99,7 +99,7 @@ impl Film {
                 .camera_path
                 .iter()
                 .take(MAX_FRAMES)
-                .map(|c| c.camera(width, height))
+                .map(|c| c.camera(world, width, height))
                 .collect();
             let cameras = cameras.filter(|cameras| !cameras.is_empty());
             return Ok(Self {
@@ -213,16 +213,16 @@ fn sized(k: Intrinsics, size: Option<(u32, u32)>) -> Intrinsics {
 }
 
 impl NerfstudioCamera {
-    fn camera(&self, width: u32, height: u32) -> Option<Camera> {
+    fn camera(&self, world: &Similarity, width: u32, height: u32) -> Option<Camera> {
         let m = &self.camera_to_world;
         if m.len() < 12 || m.iter().any(|v| !v.is_finite()) || !(self.fov > 0.0 && self.fov < 180.0) {
             return None;
         }
-        let column = |c: usize| Vec3::new(m[c], m[4 + c], m[8 + c]);
-        let [x, y, z] = [column(0), -column(1), -column(2)].map(Vec3::normalize_or_zero);
+        let column = |c: usize| DVec3::new(m[c], m[4 + c], m[8 + c]);
+        let [x, y, z] = [column(0), -column(1), -column(2)].map(|axis| axis.normalize_or_zero().as_vec3());
         let pose = Pose {
             rotation: Quat::from_mat3(&Mat3::from_cols(x, y, z)).normalize(),
-            position: column(3),
+            position: world.apply(column(3)).as_vec3(),
         };
         pose.is_valid()
             .then(|| seen(pose, self.fov.to_radians(), width, height))
@@ -365,7 +365,8 @@ impl CameraPath {
             time: seconds,
             position: [0, 1, 2].map(|c| spline(&|key: &PathKey| key.position[c])),
             rotation: [rotation.w, rotation.x, rotation.y, rotation.z],
-            fov: spline(&|key: &PathKey| key.fov),
+            // A spline that goes beyond its ends would turn pictures over.
+            fov: spline(&|key: &PathKey| key.fov).clamp(k1.fov.min(k2.fov), k1.fov.max(k2.fov)),
         }
     }
 }
@@ -404,7 +405,6 @@ fn slerp(a: Quat, b: Quat, t: f32) -> Quat {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use irradia_scene::Similarity;
     use irradia_splat::{RenderOptions, Splats};
     use irradia_train::model::Model;
 
@@ -482,18 +482,35 @@ mod tests {
     }
 
     #[test]
+    fn a_field_of_view_stays_between_those_of_its_keys() {
+        let mut zoom = path(false);
+        for (key, fov) in zoom.keys.iter_mut().zip([1.9, 0.17, 0.17, 1.9]) {
+            key.fov = fov;
+        }
+        let seconds = zoom.seconds();
+        let between = |i: i32| zoom.at(seconds * i as f32 / 100.0).fov;
+        assert!((0..=100).map(between).all(|fov| (0.17..=1.9).contains(&fov)));
+    }
+
+    #[test]
     fn files_of_the_viewer_and_of_nerfstudio_are_read() {
         let folder = tempfile::tempdir().expect("a folder");
         let file = folder.path().join("path.json");
         let write = |text: &str| fs::write(&file, text).expect("written");
         write(&serde_json::to_string(&path(false)).expect("plain data"));
-        let film = Film::read(&file, (64, 48)).expect("a path");
+        let film = Film::read(&file, &Similarity::IDENTITY, (64, 48)).expect("a path");
         assert_eq!((film.cameras.len(), film.fps), (46, 10.0));
         write(
             r#"{"fps": 24, "render_width": 5, "camera_path": [
                 {"camera_to_world": [1,0,0,3, 0,1,0,4, 0,0,1,5, 0,0,0,1], "fov": 90, "aspect": 1.5}]}"#,
         );
-        let film = Film::read(&file, (64, 48)).expect("a path");
+        let world = Similarity {
+            scale: 0.5,
+            center: DVec3::new(1.0, 0.0, -1.0),
+        };
+        let scaled = Film::read(&file, &world, (64, 48)).expect("a path").cameras[0];
+        assert_eq!(scaled.pose.position, Vec3::new(1.0, 2.0, 3.0));
+        let film = Film::read(&file, &Similarity::IDENTITY, (64, 48)).expect("a path");
         let camera = film.cameras[0];
         assert_eq!((film.fps, camera.pose.position), (24.0, Vec3::new(3.0, 4.0, 5.0)));
         // OpenGL looks along -z with y up.
@@ -520,7 +537,9 @@ mod tests {
             good.replacen("\"fov\":0.8", "\"fov\":4", 1),
         ] {
             fs::write(&file, &text).expect("written");
-            let error = Film::read(&file, (8, 8)).expect_err(&text).to_string();
+            let error = Film::read(&file, &Similarity::IDENTITY, (8, 8))
+                .expect_err(&text)
+                .to_string();
             assert!(!error.contains('\n') && error.contains("path.json"), "{error}");
         }
     }

@@ -291,6 +291,8 @@ fn scene(edition: &Edition) -> Value {
             "rotation": [rotation.w, rotation.x, rotation.y, rotation.z],
             "translation": edition.placement.translation.to_array(),
         },
+        // To the coordinates of the dataset.
+        "world": { "scale": scene.world_from_dataset.scale, "center": scene.world_from_dataset.center.to_array() },
         "step": edition.step(),
         "kind": kind,
         "count": count,

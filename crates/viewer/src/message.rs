@@ -6,8 +6,8 @@ use irradia_edit::{Edit, EditError, EditList, Operation, SelectStep};
 use irradia_scene::{Camera, Intrinsics, Pose};
 use serde::{Deserialize, Serialize};
 
-/// Largest message accepted from a page, bytes: a lasso of [`MAX_POINTS`] takes that much, other requests a few hundred.
-pub const MAX_REQUEST: usize = 64 << 10;
+/// Largest message accepted from a page, bytes: a list of some hundred lassos of [`MAX_POINTS`], each 64 kB; other requests take a few hundred.
+pub const MAX_REQUEST: usize = 16 << 20;
 /// Corners of a polygon and points of a stroke.
 pub const MAX_POINTS: usize = 2000;
 /// Steps of one request to select.

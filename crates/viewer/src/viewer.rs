@@ -103,7 +103,9 @@ impl Viewer {
                     let told = json!({ "tell": "problem", "text": line });
                     shared.desk.tell(seat, told.to_string());
                 };
-                work(editing, &shared.subject, &tell, &|| shared.desk.wake());
+                if let Some(line) = work(editing, &shared.subject, &tell, &|| shared.desk.wake()) {
+                    shared.notices.always(format_args!("{line}"));
+                }
             }
         };
         let begin = |name: &str, run: Box<dyn FnOnce() + Send>| {

@@ -114,6 +114,7 @@ fn words_are_checked_too() {
         ("move by=0,0,nan", "move by"),
         ("delete all op=keep", "not a key"),
         ("delete all =3", "not a key"),
+        ("merge file=\"my scene.ply", "not closed"),
     ] {
         let error: EditError = line.parse::<Edit>().expect_err(line);
         let message = error.to_string();
@@ -127,6 +128,9 @@ fn every_edit_survives_its_words_and_its_toml_and_its_json() {
     let camera = "camera.position=0,0,-3 camera.rotation=1,0,0,0 camera.focal=100,100.5 camera.principal=50,40 camera.size=100,80";
     for line in [
         "delete floaters",
+        "merge file=\"my scene/of words é.ply\"",
+        "split name=\"5\" all",
+        "split name=\"true\" all",
         "delete floaters score=0.5 -sphere center=1,2,3 radius=0.25",
         "keep subject margin=1.5 &views min=3 max=10",
         &format!("hide polygon {camera} points=0,0;10.5,0;10,10 visible=true"),

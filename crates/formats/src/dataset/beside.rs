@@ -46,6 +46,11 @@ impl Beside {
         })
     }
 
+    /// The folder's name.
+    pub fn folder(&self) -> &str {
+        &self.folder
+    }
+
     /// The file of the image with this path below its folder: the same name, `NAME_mask`, or the full file name with another
     /// extension appended (COLMAP's `0001.jpg.png`).
     pub fn of(&self, image: &str) -> Option<PathBuf> {

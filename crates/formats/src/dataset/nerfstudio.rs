@@ -3,7 +3,7 @@
 use super::beside::Beside;
 use super::declared::{Declared, DeclaredView, Split};
 use super::files::{find_image, relative_name};
-use super::transforms::{Transforms, parse_transforms};
+use super::transforms::{Frame, Transforms, parse_transforms};
 use crate::FormatError;
 use crate::error::read_and_parse;
 use crate::points_ply::read_declared_points;
@@ -33,7 +33,7 @@ pub(super) fn read(path: &Path, downscale: f32) -> Result<Declared, FormatError>
         _ => PathBuf::from("."),
     };
     let mut views = declared_views(&file, &root, &transforms)?;
-    let mut warnings = Vec::new();
+    let mut warnings = missing_files(&root, &transforms);
 
     let masks = Beside::masks(&root, "images");
     if let Some(masks) = &masks {
@@ -57,6 +57,38 @@ pub(super) fn read(path: &Path, downscale: f32) -> Result<Declared, FormatError>
         downscale,
         warnings,
     })
+}
+
+/// A file that is named beside a photograph, if it is there.
+fn file_beside(root: &Path, path: &str) -> Option<PathBuf> {
+    Some(root.join(path.replace('\\', "/"))).filter(|path| path.is_file())
+}
+
+/// Warnings about masks and maps that frames name and that are not there.
+fn missing_files(root: &Path, transforms: &Transforms) -> Vec<String> {
+    type FileOf = fn(&Frame) -> &Option<String>;
+    let named: [(&str, FileOf); 3] = [
+        ("masks", |frame| &frame.mask_path),
+        ("maps of depth", |frame| &frame.depth_file_path),
+        ("maps of normals", |frame| &frame.normal_file_path),
+    ];
+    let missing = named.into_iter().map(|(what, path)| {
+        let paths = transforms.frames.iter().filter_map(|frame| path(frame).as_ref());
+        (
+            what,
+            paths
+                .filter(|path| file_beside(root, path).is_none())
+                .collect::<Vec<_>>(),
+        )
+    });
+    let line = |(what, missing): (&str, Vec<&String>)| {
+        let first = missing.first()?;
+        Some(format!(
+            "{} {what} are not there, such as {first}: their photographs are used without them",
+            missing.len()
+        ))
+    };
+    missing.filter_map(line).collect()
 }
 
 /// The frames of a transforms file.
@@ -88,11 +120,7 @@ pub(super) fn declared_views(
             Some(Split::Left)
         }
     };
-    // A file beside the photograph, if it is there.
-    let beside = |path: &Option<String>| {
-        let path = path.as_ref().map(|path| root.join(path.replace('\\', "/")));
-        path.filter(|path| path.is_file())
-    };
+    let beside = |path: &Option<String>| path.as_ref().and_then(|path| file_beside(root, path));
     transforms
         .frames
         .iter()

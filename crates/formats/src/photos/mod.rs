@@ -91,9 +91,8 @@ impl PhotoEntry {
     /// When the file cannot be read or decoded.
     pub fn read_mask(&self, width: u32, height: u32) -> Result<Option<Vec<u8>>, FormatError> {
         let Some(path) = &self.mask else { return Ok(None) };
-        // A mask has the orientation of the picture as it is seen.
-        let header = read_header(path)?;
-        let mask = decode(path, header.orientation, Colour::Grey)?;
+        let orientation = read_header(path)?.turned_with(self.orientation, (self.width, self.height));
+        let mask = decode(path, orientation, Colour::Grey)?;
         Ok(Some(resize_area(
             &mask.data,
             1,
@@ -157,7 +156,9 @@ pub fn read_photo_folder(folder: &Path) -> Result<PhotoFolder, FormatError> {
 /// When a folder cannot be read.
 pub fn read_photo_folders(folders: &[impl AsRef<Path>]) -> Result<PhotoFolder, FormatError> {
     let mut files: Vec<Found> = Vec::new();
+    let mut found = PhotoFolder::default();
     for folder in folders.iter().map(AsRef::as_ref) {
+        let before = files.len();
         let Pictures {
             root,
             images,
@@ -182,8 +183,15 @@ pub fn read_photo_folders(folders: &[impl AsRef<Path>]) -> Result<PhotoFolder, F
                 normals,
             }
         }));
+        let here = &files[before..];
+        if let [Some(masks), ..] = &beside
+            && !here.is_empty()
+            && here.iter().all(|file| file.mask.is_none())
+        {
+            let why = "none of its files has the name of a photograph, so that nothing is masked";
+            found.repeated.push((masks.folder().to_owned(), why.to_owned()));
+        }
     }
-    let mut found = PhotoFolder::default();
     let read: HashSet<PathBuf> = (files.iter().map(|file| &file.path))
         .filter(|path| is_unread(path).is_none())
         .map(|path| path.with_extension(""))

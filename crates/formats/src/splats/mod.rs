@@ -133,6 +133,11 @@ impl SplatFormat {
         matches!(self, Self::Ply | Self::Npz)
     }
 
+    /// Whether the format holds the coordinate system of the splats, and splats that cannot be drawn.
+    fn holds_all(self) -> bool {
+        self == Self::Ply
+    }
+
     /// Whether the format can be read as splats.
     pub fn is_readable(self) -> bool {
         !matches!(self, Self::PointsPly | Self::Npz)
@@ -338,7 +343,7 @@ pub fn parse_splats(format: SplatFormat, bytes: &[u8]) -> Result<GaussianCloud, 
 /// When the cloud's columns have unequal lengths: a bug in the caller.
 pub fn encode_splats(format: SplatFormat, cloud: &GaussianCloud, options: &WriteOptions) -> io::Result<Vec<u8>> {
     assert!(cloud.is_consistent(), "the columns of the cloud have unequal lengths");
-    let prepared = match format.is_lossless() {
+    let prepared = match format.holds_all() {
         true => Cow::Borrowed(cloud),
         false => prepared(cloud, &mut Vec::new()),
     };
@@ -451,7 +456,7 @@ pub fn write_splats_with(
     assert!(cloud.is_consistent(), "the columns of the cloud have unequal lengths");
     let format = SplatFormat::of(path)?;
     let mut notes = Vec::new();
-    let cloud = match format.is_lossless() {
+    let cloud = match format.holds_all() {
         true => Cow::Borrowed(cloud),
         false => prepared(cloud, &mut notes),
     };

@@ -3,9 +3,9 @@
 use super::convert::QualityArg;
 use super::{note_lines, thread_count, use_threads, warn};
 use crate::Usage;
-use crate::terminal::say;
+use crate::terminal::{note, say};
 use anyhow::{Context, Result};
-use irradia_edit::{Edit, EditList};
+use irradia_edit::{Edit, EditList, Shape};
 use irradia_runs::formats::{WriteOptions, write_atomic};
 use irradia_runs::{Editing, Made};
 use std::path::PathBuf;
@@ -53,7 +53,7 @@ Operations: delete, keep, move by=X,Y,Z, rotate axis=X,Y,Z degrees=D [about=X,Y,
 [exposure=] [temperature=] [tint=] [saturation=] [contrast=], opacity factor=F, reduce count=N, hide, show, lock, unlock, split name=NAME
 
 Shapes: all, box center=X,Y,Z size=X,Y,Z [rotation=W,X,Y,Z], sphere center=X,Y,Z radius=R, half-space point=X,Y,Z normal=X,Y,Z, \
-polygon, brush, color low=R,G,B high=R,G,B, opacity|size|elongation|views [min=] [max=], clusters [min=] [max=] [gap=], floaters \
+polygon camera.*=.. points=X,Y;X,Y;.. [visible=true], brush camera.*=.. points=X,Y;.. radius=R (docs/edit.md), color low=R,G,B high=R,G,B, opacity|size|elongation|views [min=] [max=], clusters [min=] [max=] [gap=], floaters \
 [score=], subject [margin=]; of what is selected so far: invert, grow by=R, connected [gap=]
 
 Examples:
@@ -79,6 +79,15 @@ pub fn run(args: &Args) -> Result<()> {
     }
     let mut editing = Editing::open(&args.input)?;
     warn(&editing.notes);
+    let finds_floaters = |edit: &Edit| {
+        let steps = edit.select.iter().flatten();
+        steps
+            .into_iter()
+            .any(|step| matches!(step.shape, Shape::Floaters { .. }))
+    };
+    if editing.draft().photographs.is_some() && list.edits.iter().any(finds_floaters) {
+        note("floaters are judged by the photographs of the run, which takes a minute or more");
+    }
     editing.apply(&list)?;
     let mut notes = Vec::new();
     if let Some(out) = &args.out {

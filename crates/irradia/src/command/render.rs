@@ -110,7 +110,7 @@ pub(super) fn film_of(path: &Path, scene: &Scene, frames: u32, size: Option<(u32
         }
         _ => {
             let k = scene.outlook().intrinsics;
-            Film::read(path, size.unwrap_or((k.width, k.height)))?
+            Film::read(path, &scene.world_from_dataset, size.unwrap_or((k.width, k.height)))?
         }
     })
 }

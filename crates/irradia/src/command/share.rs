@@ -4,7 +4,8 @@ use super::render::film_of;
 use crate::Usage;
 use crate::terminal::say;
 use anyhow::Result;
-use irradia_runs::{Film, Scene};
+use irradia_runs::formats::SplatFormat;
+use irradia_runs::{Film, Scene, check_kept};
 use irradia_viewer::{ShareOptions, share};
 use std::path::{Path, PathBuf};
 
@@ -84,6 +85,14 @@ pub fn run(args: &Args) -> Result<()> {
     if args.folder && args.out.is_file() {
         return Err(Usage(format!(
             "--out {} is a file; name a folder for --folder",
+            args.out.display()
+        ))
+        .into());
+    }
+    check_kept(&args.scene, &args.out)?;
+    if !args.folder && SplatFormat::of(&args.out).is_ok() {
+        return Err(Usage(format!(
+            "--out {}: a page is .html; irradia convert writes scenes",
             args.out.display()
         ))
         .into());

@@ -77,10 +77,10 @@ pub struct Args {
     #[arg(long, value_name = "TIME", value_parser = parse_seconds)]
     pub budget: Option<f64>,
     /// Resume an interrupted run from its latest checkpoint; the result is that of an uninterrupted run
-    #[arg(long, value_name = "RUN", conflicts_with_all = ["out", "overwrite", "downscale", "max_side", "full_size", "holdout", "format"])]
+    #[arg(long, value_name = "RUN", conflicts_with_all = ["out", "overwrite", "downscale", "max_side", "full_size", "holdout", "format", "lenses", "readout"])]
     pub resume: Option<PathBuf>,
     /// Repeat RUN into --out, each step at its recorded pace: the same bytes, even for a run with a --budget
-    #[arg(long, value_name = "RUN", conflicts_with_all = ["resume", "recipe", "set", "steps", "max_splats", "seed", "until_psnr", "budget", "downscale", "max_side", "full_size", "holdout", "format", "background", "from"])]
+    #[arg(long, value_name = "RUN", conflicts_with_all = ["resume", "recipe", "set", "steps", "max_splats", "seed", "until_psnr", "budget", "downscale", "max_side", "full_size", "holdout", "format", "lenses", "readout", "background", "from"])]
     pub replay: Option<PathBuf>,
     /// Replace an existing run in --out
     #[arg(long)]
@@ -202,6 +202,7 @@ fn replay(run: &Path, args: &Args) -> Result<TrainInput> {
     if let Some(data) = &args.data {
         input.data.clone_from(data);
     }
+    input.reading.images = args.reading.images.clone().or(input.reading.images);
     input.memory = args.memory.or(input.memory);
     input.device = args.device.clone().unwrap_or(input.device);
     input.lpips = lpips_for(input.lpips, args)?;
@@ -355,6 +356,7 @@ fn resume(folder: &Path, args: &Args) -> Result<()> {
     if let Some(data) = &args.data {
         input.data.clone_from(data);
     }
+    input.reading.images = args.reading.images.clone().or(input.reading.images);
     if args.budget.is_some() {
         (input.budget, input.steps) = (args.budget, None);
     }

@@ -8,7 +8,8 @@
 mod between;
 mod tries;
 
-use crate::{Reading, RunError, Scene, read_vignette, scene_of};
+use crate::levels::remove_levels;
+use crate::{Reading, RunError, Scene, check_kept, read_vignette, scene_of};
 use between::with_views_between;
 use irradia_formats::{SplatFormat, WriteOptions, splat_file_size, write_splats_with};
 use std::path::PathBuf;
@@ -138,6 +139,7 @@ pub enum CompactEvent {
 pub fn compact(input: &CompactInput, see: &mut dyn FnMut(CompactEvent)) -> Result<Compacted, RunError> {
     let format = input.check()?;
     let file = scene_of(&input.scene);
+    check_kept(&file, &input.out)?;
     let scene = Scene::read(&file)?;
     let Some(splats) = scene.model.splats().cloned() else {
         let message = format!("{} is a radiance field: only splats can be compacted", file.display());
@@ -175,6 +177,7 @@ pub fn compact(input: &CompactInput, see: &mut dyn FnMut(CompactEvent)) -> Resul
     }
     let model = tries.model(&found.splats);
     let held_out_after = measure.of_held_out(&model)?;
+    remove_levels(&input.out)?;
     notes.extend(write_splats_with(
         &input.out,
         &tries.cloud(&found.splats),

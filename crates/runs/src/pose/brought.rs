@@ -10,7 +10,7 @@ use std::path::{Component, Path};
 /// The record of what was brought, in the folder of the dataset.
 const RECORD: &str = "files.json";
 /// Where files go that the capture does not have any more: they may be the last ones.
-const UNUSED: &str = "unused";
+pub(super) const UNUSED: &str = "unused";
 /// Where photographs lie.
 pub(super) const IMAGES: &str = "images";
 /// Where masks lie.

@@ -33,6 +33,8 @@ struct Sources {
     beside: Vec<PathBuf>,
     /// Those of them that a phone takes with a photograph of the same name.
     live: Vec<PathBuf>,
+    /// Folders with photographs in folders of photographs.
+    below: Vec<PathBuf>,
 }
 
 impl Sources {
@@ -62,14 +64,19 @@ impl Sources {
         let (live, films): (Vec<_>, Vec<_>) = films.cloned().partition(is_live);
         self.live.extend(live);
         self.beside.extend(films);
+        let is_beside = |entry: &Path| {
+            let name = entry.file_name().unwrap_or_default().to_string_lossy();
+            ["masks", "depths", "depth", "normals", "normal"].contains(&&*name) || name.starts_with("masks_")
+        };
+        entries.retain(|entry| entry.is_dir() && !is_beside(entry));
         if !photos.is_empty() {
             self.folders.push(path.to_owned());
+            // They may hold smaller copies, or what was sorted out; datasets have folders of their own.
+            if photos[0].parent() == Some(path) {
+                let below = entries.into_iter().filter(|entry| !photo_files(entry).is_empty());
+                self.below.extend(below);
+            }
         } else if depth > 0 {
-            let is_beside = |entry: &Path| {
-                let name = entry.file_name().unwrap_or_default().to_string_lossy();
-                ["masks", "depths", "depth", "normals", "normal"].contains(&&*name) || name.starts_with("masks_")
-            };
-            entries.retain(|entry| entry.is_dir() && !is_beside(entry));
             // A folder of datasets is no capture.
             if !entries.iter().any(|entry| DatasetFormat::recognise(entry).is_some()) {
                 for folder in &entries {
@@ -134,10 +141,15 @@ impl Capture {
             sources.add(path, DEPTH)?;
         }
         let mut repeated: Vec<(String, String)> = Vec::new();
-        let mut unused = |films: Vec<PathBuf>, why: &str| {
-            let name = |film: PathBuf| film.file_name().unwrap_or_default().to_string_lossy().into_owned();
-            repeated.extend(films.into_iter().map(|film| (name(film), why.to_owned())));
+        let mut unused = |paths: Vec<PathBuf>, why: &str| {
+            let name = |path: PathBuf| path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+            repeated.extend(paths.into_iter().map(|path| (name(path), why.to_owned())));
         };
+        sources.below.retain(|folder| !sources.folders.contains(folder));
+        unused(
+            sources.below,
+            "a folder beside photographs: name it as well if its photographs are of the same scene",
+        );
         unused(sources.live, "a film that was taken with the photograph of its name");
         let named = sources.films.len();
         match sources.beside.is_empty() || sources.folders.is_empty() || film::can_be_read() {

@@ -85,7 +85,7 @@ pub(super) fn run(
 
 /// What became of the photographs, as far as COLMAP's files tell.
 fn report(out: &Path, folder: &PhotoFolder) -> Result<PoseReport, RunError> {
-    let (_, images) = read_colmap_poses(out)?;
+    let (_, _, images) = read_colmap_poses(out)?;
     let mut points: Vec<u64> = images.iter().flat_map(|image| image.points.iter().copied()).collect();
     points.sort_unstable();
     points.dedup();

@@ -12,6 +12,8 @@ use std::path::{Path, PathBuf};
 /// Cameras and poses of a dataset in COLMAP's format.
 pub(super) struct KnownPoses {
     data: PathBuf,
+    /// The folder of its model.
+    pub model: PathBuf,
     cameras: HashMap<u32, ColmapCamera>,
     images: HashMap<String, ColmapImage>,
 }
@@ -19,9 +21,10 @@ pub(super) struct KnownPoses {
 impl KnownPoses {
     /// Reads the dataset in `data`.
     pub fn read(data: &Path) -> Result<Self, RunError> {
-        let (cameras, images) = read_colmap_poses(data)?;
+        let (model, cameras, images) = read_colmap_poses(data)?;
         Ok(Self {
             data: data.to_owned(),
+            model,
             cameras: cameras.into_iter().map(|camera| (camera.id, camera)).collect(),
             images: images.into_iter().map(|image| (image.name.clone(), image)).collect(),
         })

@@ -325,6 +325,7 @@ pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Resu
     }
 
     let is_new = known.is_none();
+    let into = known.as_ref().map(|known| known.model.clone());
     let work = Work::new(input.max_features, Some(out), folder, progress);
     let mut matched = Matched::find(work, &capture, false, &mut clock)?;
     let masked = match is_new && !capture.has_panoramas() {
@@ -379,7 +380,7 @@ pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Resu
         // What is known keeps its unit.
         Some(model) if is_new => {
             let by_places = place::scale(folder, &mut work, model);
-            place::scale_by_distances(&input.distances, &infos, model)?.or(by_places)
+            place::scale_by_distances(&input.distances, &infos, &mut work, model)?.or(by_places)
         }
         _ => None,
     };
@@ -397,7 +398,7 @@ pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Resu
             &examined,
         )));
     }
-    output::write(out, folder, &work, &infos, &reconstruction, input.into)?;
+    output::write(out, folder, &work, &infos, &reconstruction, into.as_deref())?;
     clock.end("writing");
 
     let mut report = output::report(folder, &work, &infos, &reconstruction);

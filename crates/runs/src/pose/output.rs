@@ -2,7 +2,7 @@
 
 use super::brought;
 use super::stages::Work;
-use super::{CameraReport, LeftOutPhoto, PoseReport};
+use super::{CameraReport, LeftOutPhoto, PoseReport, is_posed_here};
 use crate::RunError;
 use irradia_formats::{
     ColmapCamera, ColmapImage, ColmapModel, ColmapPoint, PhotoEntry, PhotoFolder, PosedImage, TrackedPoint,
@@ -11,16 +11,18 @@ use irradia_formats::{
 use irradia_sfm::geometry::camera::DCamera;
 use irradia_sfm::map::{Model, ModelPoint, PhotoInfo, Reconstruction};
 use std::fs;
+use std::io;
 use std::path::{Path, PathBuf};
 
-/// Writes `images` and `sparse`. What an earlier call brought of other photographs is put away, unless these were `added` to it.
+/// Writes `images` and `sparse`, or in place of the model in the folder `into`, to which photographs were added. Without it, what an earlier call brought of other
+/// photographs is put away.
 pub(super) fn write(
     out: &Path,
     folder: &PhotoFolder,
     work: &Work,
     infos: &[PhotoInfo],
     found: &Reconstruction,
-    added: bool,
+    into: Option<&Path>,
 ) -> Result<(), RunError> {
     let has_pose = |(photo, i): (usize, &usize)| {
         let mut models = found.models.iter();
@@ -36,8 +38,11 @@ pub(super) fn write(
         fs::create_dir_all(&to).map_err(RunError::io("create", &to))?;
         write_colmap(&to, &colmap_model(work, infos, model))?;
     }
-    end_models(out, &written)?;
-    brought::record(out, &posed, added)
+    match into {
+        Some(model) => replace_model(out, model, &written)?,
+        None => end_models(out, &written)?,
+    }
+    brought::record(out, &posed, into.is_some())
 }
 
 /// An empty folder for models, beside those of an earlier call, which may have been more and remain until these are complete.
@@ -53,10 +58,49 @@ pub(super) fn begin_models(out: &Path) -> Result<PathBuf, RunError> {
 /// Puts the complete models of [`begin_models`] into their place.
 pub(super) fn end_models(out: &Path, written: &Path) -> Result<(), RunError> {
     let sparse = out.join("sparse");
-    if sparse.exists() {
-        fs::remove_dir_all(&sparse).map_err(RunError::io("clear", &sparse))?;
-    }
+    fs::remove_dir_all(&sparse)
+        .or_else(absent)
+        .map_err(RunError::io("clear", &sparse))?;
     fs::rename(written, &sparse).map_err(RunError::io("rename", written))
+}
+
+/// Puts the first model of `written` in place of that in the folder `model`, which is put away if another program made it. Other models and files stay.
+fn replace_model(out: &Path, model: &Path, written: &Path) -> Result<(), RunError> {
+    let (ours, first) = (is_posed_here(out), written.join("0"));
+    for table in ["cameras", "images", "points3D", "rigs", "frames"] {
+        for file in ["bin", "txt"].map(|extension| format!("{table}.{extension}")) {
+            let (old, new) = (model.join(&file), first.join(&file));
+            match ours {
+                true => fs::remove_file(&old)
+                    .or_else(absent)
+                    .map_err(RunError::io("replace", &old))?,
+                false => put_away(out, &old)?,
+            }
+            if new.exists() {
+                fs::rename(&new, &old).map_err(RunError::io("rename", &new))?;
+            }
+        }
+    }
+    fs::remove_dir_all(written).map_err(RunError::io("clear", written))
+}
+
+/// Moves the file `old` of a dataset, if it is there, into the dataset's folder `unused`.
+fn put_away(out: &Path, old: &Path) -> Result<(), RunError> {
+    if !old.exists() {
+        return Ok(());
+    }
+    let to = out.join(brought::UNUSED).join(old.strip_prefix(out).unwrap_or(old));
+    let folder = to.parent().expect("in a folder");
+    fs::create_dir_all(folder).map_err(RunError::io("create", folder))?;
+    fs::rename(old, &to).map_err(RunError::io("rename", old))
+}
+
+/// What is not there need not be removed.
+fn absent(error: io::Error) -> io::Result<()> {
+    match error.kind() {
+        io::ErrorKind::NotFound => Ok(()),
+        _ => Err(error),
+    }
 }
 
 fn colmap_model(work: &Work, infos: &[PhotoInfo], model: &Model) -> ColmapModel {

@@ -11,6 +11,9 @@ use irradia_sfm::map::{Distance, Model, PhotoInfo, to_distances, to_metres};
 const RADIUS_M: f64 = 6_378_137.0;
 const ECCENTRICITY_SQUARED: f64 = 6.694_379_990_14e-3;
 
+/// The ratio between known distances from which on they contradict each other: a tape measure is better, and what is left is of the poses.
+const CONTRADICTS: f64 = 1.1;
+
 /// Brings `model` to metres if enough photographs tell their place, and tells what is known of its scale; warns where that is too little.
 pub(super) fn scale(folder: &PhotoFolder, work: &mut Work, model: &mut Model) -> Option<ScaleReport> {
     let gps: Vec<Option<[f64; 3]>> = work.photos().iter().map(|i| folder.photos[*i].tags.gps).collect();
@@ -56,10 +59,11 @@ fn refused(distance: &KnownDistance, message: String) -> RunError {
     RunError::setting("distance", format!("{a},{b},{}", distance.metres), message)
 }
 
-/// Brings `model` to metres by known distances; `None` if there are none.
+/// Brings `model` to metres by known distances, and warns of one that contradicts the others; `None` if there are none.
 pub(super) fn scale_by_distances(
     distances: &[KnownDistance],
     infos: &[PhotoInfo],
+    work: &mut Work,
     model: &mut Model,
 ) -> Result<Option<ScaleReport>, RunError> {
     if distances.is_empty() {
@@ -82,12 +86,20 @@ pub(super) fn scale_by_distances(
         });
     }
     match to_distances(model, infos, &known) {
-        Some(metric) => Ok(Some(ScaleReport {
-            distances: known.len(),
-            residual_m: metric.residual_m,
-            scale_error: metric.scale_error,
-            ..ScaleReport::default()
-        })),
+        Some(metric) => {
+            let lengths = known.iter().map(|distance| length(model, distance));
+            let ratios = distances
+                .iter()
+                .zip(lengths)
+                .map(|(distance, length)| distance.metres / length);
+            work.warn(contradicting(distances, &ratios.collect::<Vec<_>>()));
+            Ok(Some(ScaleReport {
+                distances: known.len(),
+                residual_m: metric.residual_m,
+                scale_error: metric.scale_error,
+                ..ScaleReport::default()
+            }))
+        }
         None => Err(refused(
             &distances[0],
             "the two were taken from one place, as far as can be told: name photographs that are farther apart"
@@ -96,21 +108,47 @@ pub(super) fn scale_by_distances(
     }
 }
 
+/// The distance of the model between the cameras of `distance`, which have poses.
+fn length(model: &Model, distance: &Distance) -> f64 {
+    let [a, b] = distance
+        .photos
+        .map(|photo| model.poses[photo].as_ref().expect("posed").position);
+    a.distance(b)
+}
+
+/// The warning about the distance whose ratio to the model is farthest from the median, if it is far.
+fn contradicting(distances: &[KnownDistance], ratios: &[f64]) -> Option<String> {
+    let mut sorted = ratios.to_vec();
+    sorted.sort_unstable_by(f64::total_cmp);
+    let usual = *sorted.get(ratios.len().checked_sub(1)? / 2)?;
+    let off = ratios.iter().map(|ratio| ratio / usual).zip(distances);
+    let (off, distance) = off.max_by(|a, b| a.0.ln().abs().total_cmp(&b.0.ln().abs()))?;
+    let [a, b] = &distance.photos;
+    (off.ln().abs() > CONTRADICTS.ln()).then(|| {
+        format!(
+            "the distance {a},{b},{} is {off:.2} times what the other distances say: one of them is wrong, and the scale with it",
+            distance.metres
+        )
+    })
+}
+
 /// East, north and up, m, of latitudes, longitudes and altitudes, about their mean: on the plane that touches the earth there.
 fn local(gps: &[Option<[f64; 3]>]) -> Vec<Option<DVec3>> {
     let known: Vec<&[f64; 3]> = gps.iter().flatten().collect();
     let mean = |k: usize| known.iter().map(|place| place[k]).sum::<f64>() / known.len().max(1) as f64;
-    let [latitude, longitude, altitude] = [0, 1, 2].map(mean);
+    let [latitude, altitude] = [0, 2].map(mean);
+    // From the first place, across the date line as well.
+    let first = known.first().map_or(0.0, |place| place[1]);
+    let around = |from: f64, longitude: f64| (longitude - from + 540.0).rem_euclid(360.0) - 180.0;
+    let longitude = first + known.iter().map(|place| around(first, place[1])).sum::<f64>() / known.len().max(1) as f64;
     let (sin, cos) = latitude.to_radians().sin_cos();
     // Radii of curvature along the parallel and along the meridian.
     let flattened = 1.0 - ECCENTRICITY_SQUARED * sin * sin;
     let east = RADIUS_M / flattened.sqrt() * cos;
     let north = RADIUS_M * (1.0 - ECCENTRICITY_SQUARED) / flattened.powf(1.5);
     let place = |[lat, lon, up]: [f64; 3]| {
-        // Across the date line.
-        let around = (lon - longitude + 540.0).rem_euclid(360.0) - 180.0;
         DVec3::new(
-            east * around.to_radians(),
+            east * around(longitude, lon).to_radians(),
             north * (lat - latitude).to_radians(),
             up - altitude,
         )
@@ -134,5 +172,24 @@ mod tests {
             (d.x - 78_847.0).abs() < 10.0 && (d.y - 111_132.0).abs() < 10.0 && d.z == 200.0,
             "{d}"
         );
+        let across = local(&[Some([0.0, 179.999, 0.0]), Some([0.0, -179.999, 0.0])]);
+        let [Some(west), Some(east)] = across[..] else {
+            panic!("{across:?}");
+        };
+        assert!((east.x - west.x - 222.6).abs() < 0.1, "{west} {east}");
+    }
+
+    #[test]
+    fn a_distance_that_contradicts_the_others_is_named() {
+        let of = |n: usize| KnownDistance {
+            photos: [format!("{n}.jpg"), format!("{}.jpg", n + 1)],
+            metres: 1.0,
+        };
+        let distances: Vec<KnownDistance> = (0..3).map(of).collect();
+        let told = contradicting(&distances, &[1.0, 2.0, 1.02]).unwrap();
+        assert!(told.contains("1.jpg,2.jpg,1 is 1.96 times"), "{told}");
+        assert_eq!(contradicting(&distances, &[1.0, 1.05, 0.97]), None);
+        assert!(contradicting(&distances[..2], &[1.0, 2.0]).is_some());
+        assert_eq!(contradicting(&distances[..1], &[1.0]), None);
     }
 }

@@ -1,7 +1,7 @@
 //! Features and matches, with those of an earlier call.
 
-use super::PoseProgress;
 use super::store::{self, Known, Looks, Settings};
+use super::{ENOUGH_POSED, PoseProgress};
 use crate::RunError;
 use irradia_formats::{PhotoEntry, PhotoFolder, Pixels};
 use irradia_scene::resize_area;
@@ -66,14 +66,15 @@ impl<'a> Work<'a> {
         Self::with(sift, out.map(|out| out.join(STORE)), folder, progress)
     }
 
-    /// The same photographs for a second attempt: with frontal descriptors and, unless their number was wanted, with twice the features if half of those
-    /// `left_out` or more have as many as were allowed.
+    /// The same photographs for a second attempt: with frontal descriptors and, unless their number was wanted or a fifth of them at most are `left_out`, with twice
+    /// the features if half of those or more have as many as were allowed. Twice as many take four times as long to match.
     pub fn again(&self, wanted: Option<usize>, left_out: &[usize], out: &Path) -> Self {
         let most = self.sift.max_features;
         let full = left_out
             .iter()
             .filter(|photo| self.features[**photo].keypoints.len() >= most);
-        let more = wanted.is_none() && 2 * full.count() >= left_out.len();
+        let few = !left_out.is_empty() && left_out.len() as f64 <= (1.0 - ENOUGH_POSED) * self.used.len() as f64;
+        let more = wanted.is_none() && !few && 2 * full.count() >= left_out.len();
         let sift = Sift {
             max_features: if more { 2 * most } else { most },
             frontal: true,

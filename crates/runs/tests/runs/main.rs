@@ -7,6 +7,7 @@ mod every_recipe;
 mod gpu;
 mod points;
 mod pose;
+mod pose_into;
 mod requests;
 mod scenes;
 mod snapshots;

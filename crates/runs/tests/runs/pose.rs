@@ -27,7 +27,7 @@ pub(crate) const OPTIONS: SynthOptions = SynthOptions {
 };
 
 /// The training photographs of a ray-traced scene, and their true cameras by name.
-fn photographs(folder: &Path) -> Vec<(String, Camera)> {
+pub(crate) fn photographs(folder: &Path) -> Vec<(String, Camera)> {
     let capture = Capture::new(&OPTIONS).unwrap();
     let scene = OPTIONS.scene.build(OPTIONS.seed).0;
     let shots = capture.shots().iter().filter(|shot| shot.part == Part::Train);
@@ -57,7 +57,7 @@ fn turned_off(dataset: &Dataset, truth: &[(String, Camera)]) -> Vec<f32> {
     dataset.views.windows(2).map(off).collect()
 }
 
-fn quietly(input: &PoseInput) -> Result<PoseReport, RunError> {
+pub(crate) fn quietly(input: &PoseInput) -> Result<PoseReport, RunError> {
     pose(input, &|_| {})
 }
 
@@ -606,47 +606,6 @@ fn panoramas_in_folders_are_posed_by_their_faces() {
         ..PoseInput::new(&photos, &out)
     };
     assert!(quietly(&into).unwrap_err().to_string().contains("panoramas"));
-}
-
-#[test]
-fn photographs_are_added_to_a_dataset_whose_poses_stay() {
-    let folder = tempfile::tempdir().unwrap();
-    let at = |name: &str| folder.path().join(name);
-    for name in ["photos", "more"] {
-        fs::create_dir(at(name)).unwrap();
-    }
-    let truth = photographs(&at("photos"));
-    let later = &truth[truth.len() - 5..];
-    for (name, _) in later {
-        fs::rename(at("photos").join(name), at("more").join(name)).unwrap();
-    }
-    fs::copy(at("photos").join("00.png"), at("more").join("again.png")).unwrap();
-    let data = at("data");
-    let first = quietly(&PoseInput::new(at("photos"), &data)).unwrap();
-    let positions = || {
-        let dataset = read_dataset(&data, &DatasetOptions::default()).unwrap();
-        let place = |view: &irradia_runs::scene::View| {
-            (view.name.clone(), dataset.world_from_dataset, view.camera.pose.position)
-        };
-        dataset.views.iter().map(place).collect::<Vec<_>>()
-    };
-    let before = positions();
-    let mut input = PoseInput::new(at("more"), &data);
-    input.into = true;
-    let second = quietly(&input).unwrap();
-    assert_eq!(second.registered, first.registered + later.len(), "{second:#?}");
-    let copy = second.left_out.iter().find(|left| left.name == "again.png").unwrap();
-    assert!(copy.reason.contains("already, as 00.png"), "{copy:?}");
-    let after = positions();
-    assert_eq!(after.len(), before.len() + later.len());
-    assert!(before.iter().all(|view| after.contains(view)), "poses stay");
-    // Nothing new, and no dataset at all, are told in one line.
-    let error = quietly(&input).unwrap_err().to_string();
-    assert!(error.contains("no photograph to add"), "{error}");
-    let mut nowhere = PoseInput::new(at("more"), at("photos"));
-    nowhere.into = true;
-    let error = quietly(&nowhere).unwrap_err().to_string();
-    assert!(error.contains("no COLMAP model"), "{error}");
 }
 
 #[cfg(unix)]

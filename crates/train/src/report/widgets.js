@@ -92,7 +92,8 @@ const chart = (title, lines, { smooth = false, zero = false, digits = 0, unit = 
   box.append(picture);
   const all = lines.flatMap((line) => line.points.map((p) => ({ ...p, line })));
   if (all.length < 2) {
-    picture.append(svg("text", { x: width / 2, y: height / 2, "text-anchor": "middle" }, "not measured during the run"));
+    const told = all.length ? `measured once, at ${all[0].x}` : "not measured during the run";
+    picture.append(svg("text", { x: width / 2, y: height / 2, "text-anchor": "middle" }, told));
     return box;
   }
   const [xs, ys] = [all.map((p) => p.x), all.map((p) => p.y)];

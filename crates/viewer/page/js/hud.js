@@ -1,6 +1,6 @@
 // Small things on the stage: status, legend, axes, comparison, hints.
 
-import { AXIS_COLORS, distanceText } from "./overlay.js";
+import { AXIS_COLORS, distanceText, world } from "./overlay.js";
 import { axes, length, subtract } from "./math.js";
 import { MODES, stage } from "./commands.js";
 import { choose, el, segments, short } from "./dom.js";
@@ -97,7 +97,7 @@ function legendOf(header) {
   const name = error ? "Mean error" : (MODES.find(([value]) => value === mode)?.[1] ?? "");
   const [low, high] = header.range;
   const metres = mode === "depth" ? state.get("metres") : null;
-  const text = (/** @type {number} */ value) => short(metres ? value * metres : Number(value.toPrecision(3)));
+  const text = (/** @type {number} */ value) => short(metres ? value * metres : Number((mode === "depth" ? value / world().scale : value).toPrecision(3)));
   const ramp = el("div", { className: "ramp" });
   ramp.style.background = error ? RAMPS.heat : mode === "alpha" ? RAMPS.grey : RAMPS.even;
   // Near is light.

@@ -167,10 +167,13 @@ function drawMeasured(draw, pixel) {
   context.shadowBlur = 0;
 }
 
-/** @param {number} units */
+/** The scene's coordinates are those of its dataset, centred and scaled. @returns {{ scale: number, center: Vec3 }} */
+export const world = () => state.get("scene")?.world ?? { scale: 1, center: [0, 0, 0] };
+
+/** In metres, or in units of the dataset. @param {number} units of the scene */
 export function distanceText(units) {
   const metres = state.get("metres");
-  if (!metres) return `${units.toPrecision(4)} units`;
+  if (!metres) return `${(units / world().scale).toPrecision(4)} units`;
   const value = units * metres;
   return value < 1 ? `${(100 * value).toPrecision(4)} cm` : `${value.toPrecision(4)} m`;
 }

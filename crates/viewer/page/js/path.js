@@ -104,7 +104,9 @@ class Path extends EventTarget {
       return multiply(q, exp([-(a[0] + b[0]) / 4, -(a[1] + b[1]) / 4, -(a[2] + b[2]) / 4]));
     };
     const rotation = slerp(slerp(q1, q2, t), slerp(inner(q0, q1, q2), inner(q1, q2, q3), t), 2 * t * (1 - t));
-    return { position, rotation, fov: spline(k0.fov, k1.fov, k2.fov, k3.fov) };
+    // A spline that goes beyond its ends would turn pictures over.
+    const fov = clamp(spline(k0.fov, k1.fov, k2.fov, k3.fov), Math.min(k1.fov, k2.fov), Math.max(k1.fov, k2.fov));
+    return { position, rotation, fov };
   }
 
   /** As it is saved and read by irradia render --path. */

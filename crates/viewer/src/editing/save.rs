@@ -12,6 +12,8 @@ pub(super) struct Saved {
     list: PathBuf,
     scene: PathBuf,
     parts: usize,
+    /// The list as it was written.
+    text: String,
 }
 
 impl Saved {
@@ -95,5 +97,60 @@ pub(super) fn save(session: &Session, source: &Path, before: Option<&Saved>) -> 
         list,
         scene,
         parts: parts.len(),
+        text,
     })
+}
+
+/// Writes the list of a session that ends, if it has edits that were not saved, as a new file beside the scene's; returns that.
+pub(super) fn save_rest(
+    session: &Session,
+    source: &Path,
+    saved: Option<&Saved>,
+) -> Result<Option<PathBuf>, EditingError> {
+    let list = session.list();
+    let text = list.to_toml();
+    if list.edits.is_empty() || saved.is_some_and(|saved| saved.text == text) {
+        return Ok(None);
+    }
+    let (folder, stem) = (folder_of(source), stem_of(source));
+    let name = |number: usize| folder.join(format!("{stem}.unsaved-{number}.toml"));
+    let path = (1..)
+        .map(name)
+        .find(|path| !path.exists())
+        .expect("some number is free");
+    session.save_merged()?;
+    write_atomic(&path, |out| out.write_all(text.as_bytes()))?;
+    Ok(Some(path))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::editing::uploads::Uploads;
+    use irradia_edit::{Draft, Operation};
+    use irradia_runs::scene::GaussianCloud;
+    use std::sync::Arc;
+
+    #[test]
+    fn edits_that_were_not_saved_are_kept_once() {
+        let folder = tempfile::tempdir().unwrap();
+        let source = folder.path().join("a.ply");
+        let cloud = GaussianCloud {
+            means: vec![[0.0; 3]],
+            quats: vec![[1.0, 0.0, 0.0, 0.0]],
+            log_scales: vec![[-2.0; 3]],
+            opacity_logits: vec![1.0],
+            sh: vec![0.3; 3],
+            ..GaussianCloud::default()
+        };
+        let mut session = Session::new(Draft::new(cloud, Vec::new()), Arc::new(Uploads::new(folder.path())));
+        assert_eq!(save_rest(&session, &source, None).unwrap(), None, "nothing was done");
+        session.edit(1, true, Operation::Opacity { factor: 0.5 }).unwrap();
+        let saved = save(&session, &source, None).unwrap();
+        assert_eq!(save_rest(&session, &source, Some(&saved)).unwrap(), None);
+        session.edit(2, true, Operation::Opacity { factor: 0.25 }).unwrap();
+        let rest = save_rest(&session, &source, Some(&saved)).unwrap().expect("a file");
+        assert_eq!(rest, folder.path().join("a.unsaved-1.toml"));
+        assert_eq!(std::fs::read_to_string(rest).unwrap(), session.list().to_toml());
+    }
 }

@@ -1,6 +1,6 @@
 //! The thread that edits.
 
-use super::save::{Saved, save};
+use super::save::{Saved, save, save_rest};
 use super::session::Session;
 use super::{Editing, EditingError};
 use crate::message::EditRequest;
@@ -36,8 +36,8 @@ pub(super) fn untouched(splats: usize) -> Value {
     })
 }
 
-/// Does what pages ask for until it closes. `tell` gives a page a line, `wake` wakes who draws.
-pub(crate) fn work(editing: &Editing, subject: &Subject, tell: &dyn Fn(u64, &str), wake: &dyn Fn()) {
+/// Does what pages ask for until it closes. `tell` gives a page a line, `wake` wakes who draws. Returns what became of edits that were not saved.
+pub(crate) fn work(editing: &Editing, subject: &Subject, tell: &dyn Fn(u64, &str), wake: &dyn Fn()) -> Option<String> {
     let mut bench: Option<Bench> = None;
     while let Some((seat, request)) = editing.next() {
         let mut told = (*editing.told.borrow()).as_ref().clone();
@@ -60,6 +60,14 @@ pub(crate) fn work(editing: &Editing, subject: &Subject, tell: &dyn Fn(u64, &str
         }
         wake();
         editing.tell(told);
+    }
+    let Bench { session, saved, .. } = bench.as_ref()?;
+    match save_rest(session, &editing.source, saved.as_ref()) {
+        Ok(path) => Some(format!(
+            "edits that were not saved are in {}: Open edits makes them again",
+            path?.display()
+        )),
+        Err(error) => Some(format!("edits that were not saved are lost: {error}")),
     }
 }
 

@@ -153,15 +153,16 @@ impl ModelFiles {
     }
 }
 
-/// Cameras and images of the model in `root`, of several the one with most images.
+/// The folder of the model in `root`, of several the one with most images, its cameras and its images.
 ///
 /// # Errors
 /// When there is no complete model, or its files are damaged.
-pub fn read_colmap_poses(root: &Path) -> Result<(Vec<ColmapCamera>, Vec<ColmapImage>), FormatError> {
+pub fn read_colmap_poses(root: &Path) -> Result<(PathBuf, Vec<ColmapCamera>, Vec<ColmapImage>), FormatError> {
     let (files, _) =
         largest_model(root)?.ok_or_else(|| FormatError::malformed(root, "contains no COLMAP model (sparse/0)"))?;
     let cameras = files.read("cameras", binary::parse_cameras, text::parse_cameras)?;
-    Ok((cameras, files.images()?))
+    let images = files.images()?;
+    Ok((files.folder, cameras, images))
 }
 
 pub(super) fn read(root: &Path, downscale: f32) -> Result<Declared, FormatError> {

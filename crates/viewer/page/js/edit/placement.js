@@ -1,6 +1,7 @@
 // An edit may move the whole scene, and with it what stands in it: cameras of views, and what this page looks at.
 
 import { add, length, multiply, rotate, scale, subtract, unit } from "../math.js";
+import { path } from "../path.js";
 import { state } from "../state.js";
 
 /** @typedef {import("../math.js").Vec3} Vec3 */
@@ -65,4 +66,7 @@ function follow(by) {
     clip: null,
     view,
   });
+  const key = (/** @type {import("../path.js").Key} */ k) => ({ ...k, position: placed(by, k.position), rotation: unit(multiply(by.rotation, k.rotation)) });
+  path.keys = path.keys.map(key);
+  path.changed();
 }

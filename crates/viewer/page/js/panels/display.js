@@ -2,8 +2,8 @@
 
 import { el, facts, row, section, segments, short } from "../dom.js";
 import { connection } from "../connection.js";
-import { distanceText } from "../overlay.js";
-import { length, lookAt, scale, subtract } from "../math.js";
+import { distanceText, world } from "../overlay.js";
+import { add, length, lookAt, scale, subtract } from "../math.js";
 import { stage } from "../commands.js";
 import { state } from "../state.js";
 
@@ -142,7 +142,7 @@ class DisplayPanel extends HTMLElement {
       result.textContent = a && b ? distanceText(length(subtract(a, b))) : state.get("tool") === "measure" ? "Click two points" : "";
       truth.hidden = !(a && b);
       const metres = state.get("metres");
-      kept.textContent = metres ? `One unit is ${short(metres)} m` : "The scale is unknown";
+      kept.textContent = metres ? `One unit is ${short(metres * world().scale)} m` : "The scale is unknown";
     });
     return section("Measure", el("div", { className: "row" }, start, result), truth, kept);
   }
@@ -154,12 +154,16 @@ class DisplayPanel extends HTMLElement {
     state.watch(["picked"], () => {
       const picked = /** @type {any} */ (state.get("picked"));
       const splat = picked?.splat;
-      const list = (/** @type {number[]} */ values) => values.map((value) => value.toPrecision(3)).join("  ");
+      const list = (/** @type {readonly number[]} */ values) => values.map((value) => value.toPrecision(3)).join("  ");
+      const unit = 1 / world().scale;
+      // In the dataset's coordinates, to a ten thousandth of the scene.
+      const digits = Math.min(9, Math.max(0, Math.ceil(4 - Math.log10(unit * (state.get("scene")?.radius || 1)))));
+      const place = (/** @type {Vec3} */ point) => add(scale(point, unit), world().center).map((value) => value.toFixed(digits)).join("  ");
       body.replaceChildren(!picked ? el("p", { className: "note", textContent: "Shows the splat under a click: size, opacity, colour, depth." }) : facts([
-        ["Depth", short(picked.depth)], ["Point", picked.point ? list(picked.point) : "–"],
+        ["Depth", short(Number((unit * picked.depth).toPrecision(6)))], ["Point", picked.point ? place(picked.point) : "–"],
         ...(splat ? /** @type {[string, string][]} */ ([
-          ["Splat", `${splat.index} of ${splat.of} here`], ["Share of the pixel", `${(100 * splat.weight).toFixed(1)} %`], ["Mean", list(splat.mean)],
-          ["Sizes (1 σ)", list(splat.scales)], ["Opacity", splat.opacity.toFixed(3)], ["Colour", list(splat.color)],
+          ["Splat", `${splat.index} of ${splat.of} here`], ["Share of the pixel", `${(100 * splat.weight).toFixed(1)} %`], ["Mean", place(splat.mean)],
+          ["Sizes (1 σ)", list(scale(splat.scales, unit))], ["Opacity", splat.opacity.toFixed(3)], ["Colour", list(splat.color)],
         ]) : []),
       ]));
     });

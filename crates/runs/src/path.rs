@@ -445,6 +445,7 @@ mod tests {
                 options: RenderOptions::default(),
                 cameras: Some(ring(part).into()),
                 world_from_dataset: Similarity::IDENTITY,
+                notes: Vec::new(),
             };
             let film = Film::spiral(&scene, 40, None);
             let nearest = film

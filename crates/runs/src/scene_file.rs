@@ -5,7 +5,7 @@ use crate::folder::{APPEARANCE, EXPOSURES, FIELD, RESIDUAL, SCENE, SKY, VIGNETTE
 use crate::orbit::{Outlook, orbit, outlook};
 use irradia_edit::Draft;
 use irradia_field::{Field, Sampler};
-use irradia_formats::{SplatFormat, is_sog_folder, read_splats};
+use irradia_formats::{SplatFormat, is_sog_folder, read_splat_file};
 use irradia_scene::{Camera, Dataset, Similarity};
 use irradia_splat::{RenderOptions, Renderer, Splats};
 use irradia_train::lights::Lights;
@@ -48,6 +48,8 @@ pub struct Scene {
     pub cameras: Option<Arc<[Camera]>>,
     /// From the coordinates of the dataset to those of `model` and `cameras`.
     pub world_from_dataset: Similarity,
+    /// What was left out when it was read, a line each.
+    pub notes: Vec<String>,
 }
 
 impl Scene {
@@ -58,7 +60,7 @@ impl Scene {
     /// When it cannot be read, or is a residual field without its splats.
     pub fn read(path: impl AsRef<Path>) -> Result<Self, RunError> {
         let path = &scene_of(path.as_ref());
-        let (model, antialiased, world_from_dataset) = read_model(path)?;
+        let (model, antialiased, world_from_dataset, notes) = read_model(path)?;
         let knobs = render_knobs_beside(path);
         Ok(Self {
             model,
@@ -69,6 +71,7 @@ impl Scene {
             },
             cameras: cameras_beside(path, &world_from_dataset).map(Into::into),
             world_from_dataset,
+            notes,
         })
     }
 
@@ -79,6 +82,7 @@ impl Scene {
             options,
             cameras: (!draft.cameras.is_empty()).then(|| draft.cameras.clone().into()),
             world_from_dataset: draft.cloud.world_from_dataset,
+            notes: Vec::new(),
         }
     }
 
@@ -127,20 +131,21 @@ pub(crate) fn is_field(path: &Path) -> bool {
     path.extension().is_some_and(|extension| extension == "safetensors")
 }
 
-/// The model in a file: a field by its extension, otherwise splats; whether its opacities require antialiasing; and its world.
-fn read_model(path: &Path) -> Result<(Model<'static>, bool, Similarity), RunError> {
+/// The model in a file: a field by its extension, otherwise splats; whether its opacities require antialiasing; its world; and what was left out.
+fn read_model(path: &Path) -> Result<(Model<'static>, bool, Similarity, Vec<String>), RunError> {
     if is_field(path) {
         let field = read_field(path)?;
         if matches!(field.config.sampler, Sampler::Given { .. }) {
             return Err(RunError::Residual(path.to_owned()));
         }
-        return Ok((Model::Field(Cow::Owned(field)), false, world_beside(path)?));
+        return Ok((Model::Field(Cow::Owned(field)), false, world_beside(path)?, Vec::new()));
     }
-    let cloud = read_splats(path)?;
+    let file = read_splat_file(path)?;
+    let (notes, cloud) = (file.warnings(), file.cloud);
     let splats = Cow::Owned(Splats::from_cloud(&cloud));
     let residual = residual_beside(path)?.map(Box::new);
     let model = Model::Splats { splats, residual };
-    Ok((model, cloud.antialiased, cloud.world_from_dataset))
+    Ok((model, cloud.antialiased, cloud.world_from_dataset, notes))
 }
 
 /// The file `name` beside the scene of a run, if there is one.

@@ -150,6 +150,7 @@ impl SnapshotServer {
                     options: trainer.render_options(plan(&trainer.recipe, &trainer.clock).sh_degree),
                     cameras: Some(cameras.clone()),
                     world_from_dataset: trainer.dataset.world_from_dataset,
+                    notes: Vec::new(),
                 },
                 lights: trainer.lights().map(Arc::new),
                 recipe: recipe.clone(),

@@ -101,8 +101,8 @@ impl Subject {
             }
             return Ok(Self::of_dataset(path, reading.read(path)?));
         }
-        let scene = Scene::read(&file)?;
-        let mut warnings = Vec::new();
+        let mut scene = Scene::read(&file)?;
+        let mut warnings = std::mem::take(&mut scene.notes);
         let dataset = match (data, &folder) {
             (Some(data), _) => Some(reading.read(data)?),
             // A run's photographs may have moved: its scene can be looked at without them.
@@ -175,6 +175,7 @@ impl Subject {
             options: RenderOptions::default(),
             cameras: Some(cameras),
             world_from_dataset: dataset.world_from_dataset,
+            notes: Vec::new(),
         };
         let warnings = dataset.warnings.clone();
         Self {

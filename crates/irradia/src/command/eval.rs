@@ -75,6 +75,7 @@ impl Args {
 pub fn run(args: &Args) -> Result<()> {
     use_threads(args.threads)?;
     let mut scene = Scene::read(&args.scene)?;
+    warn(&scene.notes);
     let run = RunFolder::around(&args.scene);
     let mut reading = args.reading.clone();
     if reading.holdout.is_none() {

@@ -1,7 +1,7 @@
 //! `irradia render`
 
 use super::film::{self, FilmWriter};
-use super::{DataArgs, Split, rendering_device, thread_count, use_threads};
+use super::{DataArgs, Split, rendering_device, thread_count, use_threads, warn};
 use crate::Usage;
 use crate::terminal::say;
 use anyhow::{Context, Result};
@@ -66,6 +66,7 @@ pub fn parse_size(text: &str) -> Result<(u32, u32), String> {
 pub fn run(args: &Args) -> Result<()> {
     use_threads(args.threads)?;
     let mut scene = Scene::read(&args.scene)?;
+    warn(&scene.notes);
     scene.options.depth = args.depth;
     if let Some(film) = film(args, &scene)? {
         if film::kind(&args.out).is_some() {

@@ -1,6 +1,7 @@
 //! `irradia share`
 
 use super::render::film_of;
+use super::warn;
 use crate::Usage;
 use crate::terminal::say;
 use anyhow::Result;
@@ -98,6 +99,7 @@ pub fn run(args: &Args) -> Result<()> {
         .into());
     }
     let scene = Scene::read(&args.scene)?;
+    warn(&scene.notes);
     let name = || {
         args.scene
             .file_stem()

@@ -142,11 +142,11 @@ test("a lasso, a brush and a deletion; undo, save and download agree with the pr
 
   await page.getByRole("button", { name: "Save" }).click();
   await edited(page, (e) => Boolean(e.saved));
-  assert.ok(existsSync(join(scene, "edits.toml")) && existsSync(join(scene, "scene.edited.ply")));
-  assert.match(readFileSync(join(scene, "edits.toml"), "utf8"), /op = "delete"/);
+  assert.ok(existsSync(join(scene, "scene.edits.toml")) && existsSync(join(scene, "scene.edited.ply")));
+  assert.match(readFileSync(join(scene, "scene.edits.toml"), "utf8"), /op = "delete"/);
   // The program makes the same scene of the list, and the page shows it as the same picture.
   const replayed = join(scratch, "replayed.ply");
-  run("edit", join(scene, "scene.ply"), "-o", replayed, "--edits", join(scene, "edits.toml"));
+  run("edit", join(scene, "scene.ply"), "-o", replayed, "--edits", join(scene, "scene.edits.toml"));
   assert.deepEqual(readFileSync(replayed), readFileSync(join(scene, "scene.edited.ply")));
   const again = await serve("view", replayed, "--port", "0");
   const shown = await open(browser, again.address);
@@ -325,7 +325,7 @@ test("another scene is merged, and the program makes the same of the saved list"
   await page.getByRole("button", { name: "Save" }).click();
   await edited(page, (e) => e.saved);
   const replayed = join(scratch, "merged.ply");
-  run("edit", scene, "--edits", join(scene, "edits.toml"), "-o", replayed);
+  run("edit", scene, "--edits", join(scene, "scene.edits.toml"), "-o", replayed);
   assert.deepEqual(readFileSync(replayed), readFileSync(join(scene, "scene.edited.ply")));
   await page.getByLabel("Scene to merge").setInputFiles({ name: "broken.ply", mimeType: "", buffer: Buffer.from("ply") });
   await until(page, () => document.querySelector("main, body")?.textContent?.includes("broken.ply"));

@@ -2,8 +2,8 @@
 
 use super::EditingError;
 use super::session::Session;
-use irradia_runs::RunFolder;
-use irradia_runs::formats::{write_atomic, write_splats};
+use irradia_runs::formats::{FormatError, write_atomic, write_splats};
+use std::fs;
 use std::path::{Path, PathBuf};
 
 /// Where a session has been saved.
@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 pub(super) struct Saved {
     list: PathBuf,
     scene: PathBuf,
-    parts: usize,
+    parts: Vec<PathBuf>,
     /// The list as it was written.
     text: String,
 }
@@ -24,7 +24,7 @@ impl Saved {
                 .map(|name| name.to_string_lossy().into_owned())
                 .unwrap_or_default()
         };
-        let parts = match self.parts {
+        let parts = match self.parts.len() {
             0 => String::new(),
             1 => " and a part".to_owned(),
             count => format!(" and {count} parts"),
@@ -64,18 +64,14 @@ pub(crate) fn stem_of(source: &Path) -> String {
 pub(super) fn save(session: &Session, source: &Path, before: Option<&Saved>) -> Result<Saved, EditingError> {
     let stem = stem_of(source);
     let folder = folder_of(source);
-    let is_run = RunFolder::containing(source).is_some();
     let names = |number: usize| {
         let end = if number == 1 {
             String::new()
         } else {
             format!("-{number}")
         };
-        let list = if is_run {
-            format!("edits{end}.toml")
-        } else {
-            format!("{stem}.edits{end}.toml")
-        };
+        // A run's own `edits.toml` is of its scene, edited in place.
+        let list = format!("{stem}.edits{end}.toml");
         (folder.join(list), folder.join(format!("{stem}.edited{end}.ply")))
     };
     let (list, scene) = match before {
@@ -87,8 +83,19 @@ pub(super) fn save(session: &Session, source: &Path, before: Option<&Saved>) -> 
     };
     let parts = session.parts()?;
     write_splats(&scene, &session.draft().shown())?;
+    let path_of = |name: &str| scene.with_extension(format!("{name}.ply"));
     for (name, part) in &parts {
-        write_splats(&scene.with_extension(format!("{name}.ply")), part)?;
+        write_splats(&path_of(name), part)?;
+    }
+    let parts: Vec<PathBuf> = parts.iter().map(|(name, _)| path_of(name)).collect();
+    // Of splits that were undone since.
+    for old in before.iter().flat_map(|before| &before.parts) {
+        if !parts.contains(old) && old.exists() {
+            fs::remove_file(old).map_err(|source| FormatError::Write {
+                path: old.clone(),
+                source,
+            })?;
+        }
     }
     session.save_merged()?;
     let text = session.list().to_toml();
@@ -96,7 +103,7 @@ pub(super) fn save(session: &Session, source: &Path, before: Option<&Saved>) -> 
     Ok(Saved {
         list,
         scene,
-        parts: parts.len(),
+        parts,
         text,
     })
 }

@@ -56,7 +56,7 @@ class EditPanel extends HTMLElement {
     const undo = tool("undo", "Undo (Ctrl Z)", () => session.undo());
     const redo = tool("redo", "Redo (Ctrl Shift Z)", () => session.redo());
     const before = button("Before", "Shows the scene as it was opened", () => session.compare(!state.get("editing")?.before));
-    const save = button("Save", "Writes the scene and edits.toml beside the scene's file, as new files", () => session.save());
+    const save = button("Save", "Writes the scene and its list of edits beside the scene's file, as new files", () => session.save());
     const format = el("select", { "aria-label": "Format of the download", title: "Format of the download" });
     const download = button("Download", "The edited scene as a file", () => fetchFile(format.value));
     state.watch(["hello"], () => {

@@ -67,7 +67,7 @@ impl Appearance {
             brightness: of(sum) / 255.0,
             white: of(white),
             black: of(black),
-            hidden: 1.0 - (count as f64 / grey.len().max(1) as f64) as f32,
+            hidden: ((grey.len() as u64 - count) as f64 / grey.len().max(1) as f64) as f32,
         }
     }
 }
@@ -187,7 +187,10 @@ mod tests {
             .filter(|(i, _)| i % 64 >= 32)
             .for_each(|(_, v)| *v = 100);
         let seen = Appearance::measure(64, 48, &grey, Some(&mask));
-        assert_eq!((seen.white, seen.black, seen.sharpness), (0.0, 0.0, 0.0));
+        assert_eq!(
+            (seen.white, seen.black, seen.sharpness, seen.hidden),
+            (0.0, 0.0, 0.0, 0.5)
+        );
         assert!((seen.brightness - 100.0 / 255.0).abs() < 1e-6);
         assert_eq!(Appearance::measure(0, 0, &[], None), Appearance::default());
         assert_eq!(Appearance::measure(3, 1, &[0, 255, 9], None).white, 1.0 / 3.0);

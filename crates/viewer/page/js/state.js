@@ -6,7 +6,7 @@
 
 /** What the server says of the scene.
  * @typedef {{ version: number, step: number | null, kind: string, count: number, sh_degree: number, travels: boolean, lights: boolean,
- *   placement: import("./edit/placement.js").Placement, antialias: boolean, background: Vec3, center: Vec3, up: Vec3, radius: number, height: number, fov: number }} Scene */
+ *   placement: import("./edit/placement.js").Placement, world: { scale: number, center: Vec3 }, antialias: boolean, background: Vec3, center: Vec3, up: Vec3, radius: number, height: number, fov: number }} Scene */
 
 /**
  * @typedef {object} Values

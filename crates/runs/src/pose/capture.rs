@@ -73,8 +73,9 @@ impl Sources {
             self.folders.push(path.to_owned());
             // They may hold smaller copies, or what was sorted out; datasets have folders of their own.
             if photos[0].parent() == Some(path) {
-                let below = entries.into_iter().filter(|entry| !photo_files(entry).is_empty());
-                self.below.extend(below);
+                let is_capture =
+                    |entry: &PathBuf| DatasetFormat::recognise(entry).is_none() && !photo_files(entry).is_empty();
+                self.below.extend(entries.into_iter().filter(is_capture));
             }
         } else if depth > 0 {
             // A folder of datasets is no capture.

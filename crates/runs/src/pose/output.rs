@@ -70,14 +70,14 @@ fn replace_model(out: &Path, model: &Path, written: &Path) -> Result<(), RunErro
     for table in ["cameras", "images", "points3D", "rigs", "frames"] {
         for file in ["bin", "txt"].map(|extension| format!("{table}.{extension}")) {
             let (old, new) = (model.join(&file), first.join(&file));
-            match ours {
-                true => fs::remove_file(&old)
-                    .or_else(absent)
-                    .map_err(RunError::io("replace", &old))?,
-                false => put_away(out, &old)?,
+            if !ours {
+                put_away(out, &old)?;
             }
-            if new.exists() {
-                fs::rename(&new, &old).map_err(RunError::io("rename", &new))?;
+            match new.exists() {
+                true => fs::rename(&new, &old).map_err(RunError::io("rename", &new))?,
+                false => fs::remove_file(&old)
+                    .or_else(absent)
+                    .map_err(RunError::io("remove", &old))?,
             }
         }
     }

@@ -129,10 +129,15 @@ impl Plan {
             (Operation::Unlock {}, steps) => among(draft, &draft.locked, steps.as_deref())?,
             (_, Some(steps)) => select(draft, steps)?,
             // What moves with the whole scene.
-            (Operation::Move { .. } | Operation::Rotate { .. } | Operation::Scale { .. }, None)
-            | (Operation::Merge { .. } | Operation::Upright { .. } | Operation::SetLength { .. }, None) => {
-                Selection::all(n)
-            }
+            (
+                Operation::Move { .. }
+                | Operation::Rotate { .. }
+                | Operation::Scale { .. }
+                | Operation::Merge { .. }
+                | Operation::Upright { .. }
+                | Operation::SetLength { .. },
+                None,
+            ) => Selection::all(n),
             (_, None) => selectable(draft),
         };
         let is_scene = edit.select.is_none();

@@ -1,10 +1,10 @@
 //! A scene from one splat format to another, and what it cost: bytes, splats and, for lossy formats, PSNR.
 
 use crate::folder::cameras_beside;
-use crate::levels::remove_levels;
+use crate::levels::write_scene;
 use crate::orbit::orbit;
 use crate::{RunError, scene_of};
-use irradia_formats::{SplatFormat, WriteOptions, read_splat_file, read_splats, splat_file_size, write_splats_with};
+use irradia_formats::{SplatFormat, WriteOptions, read_splat_file, read_splats, splat_file_size};
 use irradia_measure::psnr;
 use irradia_scene::{GaussianCloud, Similarity};
 use irradia_splat::{RenderOptions, Renderer, Splats};
@@ -44,8 +44,7 @@ pub fn convert(input: &Path, output: &Path, options: &WriteOptions, compares: bo
     let file = read_splat_file(&input)?;
     let before = splat_file_size(&input)?;
     let mut notes = file.warnings();
-    remove_levels(output)?;
-    notes.extend(write_splats_with(output, &file.cloud, options)?);
+    notes.extend(write_scene(output, &file.cloud, options)?);
     let is_compared = compares && to.is_readable() && !to.is_lossless();
     Ok(Conversion {
         formats: [file.format, to],

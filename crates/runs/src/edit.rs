@@ -1,10 +1,10 @@
 //! Edits of a scene on disk: read, replay a list, write.
 
 use crate::folder::{SKY, VIGNETTE, cameras_beside, cameras_moved};
-use crate::levels::remove_levels;
+use crate::levels::write_scene;
 use crate::lock::FolderLock;
 use crate::photographs::photographs_of;
-use crate::scene_file::is_field;
+use crate::scene_file::{check_kept, is_field, same_file};
 use crate::{RunError, RunFolder, SCENE, Scene, scene_of, write_image};
 use irradia_edit::{Applied, Draft, Edit, EditList, Provenance, Transform, apply};
 use irradia_formats::{SplatFormat, WriteOptions, read_splat_file, write_atomic, write_splats, write_splats_with};
@@ -160,8 +160,7 @@ impl Editing {
             notes.extend(write_splats_with(path, cloud, options)?);
             notes.push(format!("{}: {} splats split off", path.display(), cloud.len()));
         }
-        remove_levels(&file)?;
-        notes.extend(write_splats_with(&file, &self.draft.shown(), options)?);
+        notes.extend(write_scene(&file, &self.draft.shown(), options)?);
         match self.draft.hidden.count() {
             0 => {}
             hidden => notes.push(format!("{hidden} hidden splats left out")),
@@ -301,26 +300,4 @@ fn open_scene(file: &str, path: &Path) -> Result<GaussianCloud, String> {
         false => scene_of(&path.with_file_name(file)),
     };
     Ok(read_splat_file(&path).map_err(|error| error.to_string())?.cloud)
-}
-
-/// Refuses an output that would replace the scene that is read.
-///
-/// # Errors
-/// When `output` is `scene`, or the file of the scene in it.
-pub fn check_kept(scene: &Path, output: &Path) -> Result<(), RunError> {
-    let scene = scene_of(scene);
-    match same_file(output, &scene) {
-        true => Err(RunError::Refused(format!(
-            "{} would be replaced: name another output",
-            scene.display()
-        ))),
-        false => Ok(()),
-    }
-}
-
-fn same_file(a: &Path, b: &Path) -> bool {
-    match (a.canonicalize(), b.canonicalize()) {
-        (Ok(a), Ok(b)) => a == b,
-        _ => false,
-    }
 }

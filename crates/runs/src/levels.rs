@@ -53,15 +53,15 @@ pub fn level_file(path: &Path, level: u32) -> Result<PathBuf, RunError> {
     }
 }
 
-/// Removes the levels beside `path`, to which another scene is written.
-pub(crate) fn remove_levels(path: &Path) -> Result<(), RunError> {
+/// Writes a scene as [`write_splats_with`] does; the levels beside the one that was there go.
+pub(crate) fn write_scene(path: &Path, cloud: &GaussianCloud, options: &WriteOptions) -> Result<Vec<String>, RunError> {
     for level in 1..=LEVELS {
         let Ok(file) = level_file(path, level) else { break };
         if file.is_file() {
             fs::remove_file(&file).map_err(RunError::io("remove", &file))?;
         }
     }
-    Ok(())
+    Ok(write_splats_with(path, cloud, options)?)
 }
 
 /// Writes the levels of the scene `input` beside `output`, and compares them from where its training cameras are.

@@ -117,6 +117,29 @@ pub fn scene_of(path: &Path) -> PathBuf {
     found.or(meta).unwrap_or(path.to_owned())
 }
 
+/// Refuses an output that would replace the scene that is read.
+///
+/// # Errors
+/// When `output` is `scene`, or the file of the scene in it.
+pub fn check_kept(scene: &Path, output: &Path) -> Result<(), RunError> {
+    let scene = scene_of(scene);
+    match same_file(output, &scene) {
+        true => Err(RunError::Refused(format!(
+            "{} would be replaced: name another output",
+            scene.display()
+        ))),
+        false => Ok(()),
+    }
+}
+
+/// Whether both paths lead to one file or folder that is there.
+pub(crate) fn same_file(a: &Path, b: &Path) -> bool {
+    match (a.canonicalize(), b.canonicalize()) {
+        (Ok(a), Ok(b)) => a == b,
+        _ => false,
+    }
+}
+
 /// The field in a file.
 pub(crate) fn read_field(path: &Path) -> Result<Field, RunError> {
     let bytes = fs::read(path).map_err(RunError::io("read", path))?;

@@ -33,7 +33,7 @@ pub(super) fn read(path: &Path, downscale: f32) -> Result<Declared, FormatError>
         _ => PathBuf::from("."),
     };
     let mut views = declared_views(&file, &root, &transforms)?;
-    let mut warnings = missing_files(&root, &transforms);
+    let mut warnings = missing_files(&transforms.frames, &views);
 
     let masks = Beside::masks(&root, "images");
     if let Some(masks) = &masks {
@@ -59,36 +59,25 @@ pub(super) fn read(path: &Path, downscale: f32) -> Result<Declared, FormatError>
     })
 }
 
-/// A file that is named beside a photograph, if it is there.
-fn file_beside(root: &Path, path: &str) -> Option<PathBuf> {
-    Some(root.join(path.replace('\\', "/"))).filter(|path| path.is_file())
-}
-
-/// Warnings about masks and maps that frames name and that are not there.
-fn missing_files(root: &Path, transforms: &Transforms) -> Vec<String> {
-    type FileOf = fn(&Frame) -> &Option<String>;
-    let named: [(&str, FileOf); 3] = [
-        ("masks", |frame| &frame.mask_path),
-        ("maps of depth", |frame| &frame.depth_file_path),
-        ("maps of normals", |frame| &frame.normal_file_path),
+/// Warnings about masks and maps that frames name and that their views, in the same order, do not have, since they are not there.
+fn missing_files(frames: &[Frame], views: &[DeclaredView]) -> Vec<String> {
+    type Named = fn(&Frame) -> &Option<String>;
+    type Found = fn(&DeclaredView) -> &Option<PathBuf>;
+    let kinds: [(&str, Named, Found); 3] = [
+        ("masks", |frame| &frame.mask_path, |view| &view.mask),
+        ("maps of depth", |frame| &frame.depth_file_path, |view| &view.depth),
+        ("maps of normals", |frame| &frame.normal_file_path, |view| &view.normals),
     ];
-    let missing = named.into_iter().map(|(what, path)| {
-        let paths = transforms.frames.iter().filter_map(|frame| path(frame).as_ref());
-        (
-            what,
-            paths
-                .filter(|path| file_beside(root, path).is_none())
-                .collect::<Vec<_>>(),
-        )
-    });
-    let line = |(what, missing): (&str, Vec<&String>)| {
+    let line = |(what, named, found): (&str, Named, Found)| {
+        let lacks = |(frame, view)| named(frame).as_ref().filter(|_| found(view).is_none());
+        let missing: Vec<&String> = frames.iter().zip(views).filter_map(lacks).collect();
         let first = missing.first()?;
         Some(format!(
             "{} {what} are not there, such as {first}: their photographs are used without them",
             missing.len()
         ))
     };
-    missing.filter_map(line).collect()
+    kinds.into_iter().filter_map(line).collect()
 }
 
 /// The frames of a transforms file.
@@ -120,7 +109,11 @@ pub(super) fn declared_views(
             Some(Split::Left)
         }
     };
-    let beside = |path: &Option<String>| path.as_ref().and_then(|path| file_beside(root, path));
+    // A file beside the photograph, if it is there.
+    let beside = |path: &Option<String>| {
+        let path = path.as_ref().map(|path| root.join(path.replace('\\', "/")));
+        path.filter(|path| path.is_file())
+    };
     transforms
         .frames
         .iter()

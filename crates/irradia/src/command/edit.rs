@@ -80,10 +80,8 @@ pub fn run(args: &Args) -> Result<()> {
     let mut editing = Editing::open(&args.input)?;
     warn(&editing.notes);
     let finds_floaters = |edit: &Edit| {
-        let steps = edit.select.iter().flatten();
-        steps
-            .into_iter()
-            .any(|step| matches!(step.shape, Shape::Floaters { .. }))
+        let mut steps = edit.select.iter().flatten();
+        steps.any(|step| matches!(step.shape, Shape::Floaters { .. }))
     };
     if editing.draft().photographs.is_some() && list.edits.iter().any(finds_floaters) {
         note("floaters are judged by the photographs of the run, which takes a minute or more");

@@ -198,7 +198,14 @@ pub fn run(args: &Args) -> Result<()> {
 /// The input that repeats `run`.
 fn replay(run: &Path, args: &Args) -> Result<TrainInput> {
     let out = args.out.clone().expect("required by clap");
-    let mut input = TrainInput::replay_of(run, out)?;
+    let mut input = placed_by(args, TrainInput::replay_of(run, out)?)?;
+    input.unseen_lpips = input.unseen_lpips.filter(|path| path.exists());
+    input.overwrite = args.overwrite;
+    Ok(input)
+}
+
+/// The input of a run with what may be elsewhere now, or of another machine: its files, memory and device.
+fn placed_by(args: &Args, mut input: TrainInput) -> Result<TrainInput> {
     if let Some(data) = &args.data {
         input.data.clone_from(data);
     }
@@ -206,8 +213,6 @@ fn replay(run: &Path, args: &Args) -> Result<TrainInput> {
     input.memory = args.memory.or(input.memory);
     input.device = args.device.clone().unwrap_or(input.device);
     input.lpips = lpips_for(input.lpips, args)?;
-    input.unseen_lpips = input.unseen_lpips.filter(|path| path.exists());
-    input.overwrite = args.overwrite;
     Ok(input)
 }
 
@@ -352,18 +357,11 @@ fn resume(folder: &Path, args: &Args) -> Result<()> {
             report.display()
         ));
     }
-    let mut input = TrainInput::of_run(folder)?;
-    if let Some(data) = &args.data {
-        input.data.clone_from(data);
-    }
-    input.reading.images = args.reading.images.clone().or(input.reading.images);
+    let mut input = placed_by(args, TrainInput::of_run(folder)?)?;
     if args.budget.is_some() {
         (input.budget, input.steps) = (args.budget, None);
     }
     input.until_psnr = args.until_psnr.or(input.until_psnr);
-    input.memory = args.memory.or(input.memory);
-    input.device = args.device.clone().unwrap_or(input.device);
-    input.lpips = lpips_for(input.lpips, args)?;
     let request = input.check().map_err(by_option)?;
     let dataset = request.read_dataset()?;
     warn(&dataset.warnings);

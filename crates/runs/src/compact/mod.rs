@@ -8,10 +8,10 @@
 mod between;
 mod tries;
 
-use crate::levels::remove_levels;
+use crate::levels::write_scene;
 use crate::{Reading, RunError, Scene, check_kept, read_vignette, scene_of};
 use between::with_views_between;
-use irradia_formats::{SplatFormat, WriteOptions, splat_file_size, write_splats_with};
+use irradia_formats::{SplatFormat, WriteOptions, splat_file_size};
 use std::path::PathBuf;
 use tries::{Measure, Tries};
 
@@ -177,12 +177,7 @@ pub fn compact(input: &CompactInput, see: &mut dyn FnMut(CompactEvent)) -> Resul
     }
     let model = tries.model(&found.splats);
     let held_out_after = measure.of_held_out(&model)?;
-    remove_levels(&input.out)?;
-    notes.extend(write_splats_with(
-        &input.out,
-        &tries.cloud(&found.splats),
-        &found.write,
-    )?);
+    notes.extend(write_scene(&input.out, &tries.cloud(&found.splats), &found.write)?);
     Ok(Compacted {
         formats: [SplatFormat::of(&file)?, format],
         bytes: [splat_file_size(&file)?, splat_file_size(&input.out)?],

@@ -2,6 +2,7 @@
 
 use crate::RunError;
 use crate::folder::to_json;
+use crate::scene_file::same_file;
 use irradia_formats::{PANORAMA_MASKS, PANORAMAS, PhotoEntry, write_atomic};
 use std::collections::BTreeSet;
 use std::fs;
@@ -10,7 +11,7 @@ use std::path::{Component, Path};
 /// The record of what was brought, in the folder of the dataset.
 const RECORD: &str = "files.json";
 /// Where files go that the capture does not have any more: they may be the last ones.
-pub(super) const UNUSED: &str = "unused";
+const UNUSED: &str = "unused";
 /// Where photographs lie.
 pub(super) const IMAGES: &str = "images";
 /// Where masks lie.
@@ -56,7 +57,7 @@ impl Belonging<'_> {
 
     /// Whether it is the file `to` already, and not a link or copy.
     fn is(&self, to: &Path) -> bool {
-        fs::canonicalize(self.from).is_ok_and(|from| fs::canonicalize(to).is_ok_and(|to| from == to))
+        same_file(self.from, to)
     }
 
     /// Brings it into `folder`, which is created: as a hard link where the file system allows it, else, and masks, which users edit in a dataset, as a copy.
@@ -123,7 +124,8 @@ fn before(out: &Path) -> Files {
 }
 
 /// Moves `files` into [`UNUSED`], and removes folders that are empty then. What a record names outside of the dataset is ignored.
-fn put_away(out: &Path, files: impl Iterator<Item = String>) -> Result<(), RunError> {
+/// Moves `files` of the dataset, those that are there, into its folder `unused`.
+pub(super) fn put_away(out: &Path, files: impl Iterator<Item = String>) -> Result<(), RunError> {
     let is_inside = |file: &str| {
         Path::new(file)
             .components()

@@ -66,33 +66,28 @@ pub(super) fn end_models(out: &Path, written: &Path) -> Result<(), RunError> {
 
 /// Puts the first model of `written` in place of that in the folder `model`, which is put away if another program made it. Other models and files stay.
 fn replace_model(out: &Path, model: &Path, written: &Path) -> Result<(), RunError> {
-    let (ours, first) = (is_posed_here(out), written.join("0"));
-    for table in ["cameras", "images", "points3D", "rigs", "frames"] {
-        for file in ["bin", "txt"].map(|extension| format!("{table}.{extension}")) {
-            let (old, new) = (model.join(&file), first.join(&file));
-            if !ours {
-                put_away(out, &old)?;
-            }
-            match new.exists() {
-                true => fs::rename(&new, &old).map_err(RunError::io("rename", &new))?,
-                false => fs::remove_file(&old)
-                    .or_else(absent)
-                    .map_err(RunError::io("remove", &old))?,
-            }
+    let tables = ["cameras", "images", "points3D", "rigs", "frames"];
+    let names = tables
+        .into_iter()
+        .flat_map(|table| ["bin", "txt"].map(|extension| format!("{table}.{extension}")));
+    let names: Vec<String> = names.collect();
+    if !is_posed_here(out) {
+        let place = model.strip_prefix(out).unwrap_or(model);
+        let files = names.iter().map(|name| place.join(name).to_string_lossy().into_owned());
+        brought::put_away(out, files)?;
+        // It went with the last of its files.
+        fs::create_dir_all(model).map_err(RunError::io("create", model))?;
+    }
+    for name in names {
+        let (old, new) = (model.join(&name), written.join("0").join(&name));
+        match new.exists() {
+            true => fs::rename(&new, &old).map_err(RunError::io("rename", &new))?,
+            false => fs::remove_file(&old)
+                .or_else(absent)
+                .map_err(RunError::io("remove", &old))?,
         }
     }
     fs::remove_dir_all(written).map_err(RunError::io("clear", written))
-}
-
-/// Moves the file `old` of a dataset, if it is there, into the dataset's folder `unused`.
-fn put_away(out: &Path, old: &Path) -> Result<(), RunError> {
-    if !old.exists() {
-        return Ok(());
-    }
-    let to = out.join(brought::UNUSED).join(old.strip_prefix(out).unwrap_or(old));
-    let folder = to.parent().expect("in a folder");
-    fs::create_dir_all(folder).map_err(RunError::io("create", folder))?;
-    fs::rename(old, &to).map_err(RunError::io("rename", old))
 }
 
 /// What is not there need not be removed.

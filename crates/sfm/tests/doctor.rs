@@ -424,6 +424,35 @@ fn something_that_moves_is_named_and_nothing_else() {
 }
 
 #[test]
+fn what_stands_on_a_flat_ground_does_not_move() {
+    let mut rng = irradia_scene::Rng::new(9, 9);
+    let mut uniform = |from: f32, to: f32| f64::from(rng.range(from, to));
+    let ground: Vec<(DVec3, DVec3)> = (0..1500)
+        .map(|_| (DVec3::new(uniform(-2.5, 2.5), uniform(-2.5, 2.5), 0.0), DVec3::Z))
+        .collect();
+    // The one side of a thing that the cameras see.
+    let side: Vec<(DVec3, DVec3)> = (0..100)
+        .map(|_| (DVec3::new(0.0, uniform(-0.6, 0.6), uniform(0.1, 0.8)), DVec3::X))
+        .collect();
+    let poses = (0..12).map(|i| {
+        let angle = 0.12 * (f64::from(i) - 5.5);
+        world::look(DVec3::new(4.0 * angle.cos(), 4.0 * angle.sin(), 3.0), DVec3::ZERO)
+    });
+    let world = World::of_points(
+        world::CAMERA,
+        poses.collect(),
+        &[ground, side].concat(),
+        0,
+        0.3,
+        0.0,
+        21,
+    );
+    for found in plainly(&world) {
+        assert!(!kinds(&found).contains(&Kind::Moving), "{found:?}");
+    }
+}
+
+#[test]
 fn places_that_are_one_by_a_part_alone_are_mapped_apart() {
     let mut rng = irradia_scene::Rng::new(4, 4);
     let mut uniform = move || f64::from(rng.range(-1.0, 1.0));

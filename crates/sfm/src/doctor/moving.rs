@@ -9,12 +9,13 @@ use super::motion::most_named;
 use super::{Diagnosis, Evidence};
 use crate::PairMatches;
 use crate::geometry::correspondences::{Correspondences, sampson_squared};
+use crate::geometry::essential::cross_matrix;
 use crate::geometry::fundamental::Fundamental;
 use crate::geometry::homography::Homography;
 use crate::geometry::ransac::estimate;
 use crate::map::{AGREES, centered_points, limits, showing};
 use crate::median;
-use glam::DVec2;
+use glam::{DMat3, DVec2, DVec3};
 use rayon::prelude::*;
 use std::collections::BTreeMap;
 
@@ -31,6 +32,11 @@ const PLANES: usize = 3;
 const OFF: f64 = 0.012;
 /// Largest part of the long side, along each axis, of what moves.
 const PART: f64 = 0.5;
+/// Matches on what stands out whose lines of parallax are tried, fraction of the matches that one motion explains, and of the scene's,
+/// where it is parallax.
+const PARALLAX_LINES: usize = 20;
+const EXPLAINED: f64 = 0.5;
+const AS_MANY: f64 = 0.9;
 /// Fraction of the third photographs that must show one thing.
 const ONE_THING: f64 = 0.8;
 /// Pairs, and their fraction, from which on something moves. Four captures with a moving board reach 0.22 to 0.76, clean ones 0.1 (before
@@ -115,7 +121,40 @@ fn is_off(pair: &PairMatches, group: &[Match], scene: &[Match]) -> bool {
     let spread: Vec<Match> = scene.iter().filter(agrees).copied().collect();
     let enough = spread.len() >= SCENE_MATCHES && spread.len() as f64 >= SCENE_FRACTION * scene.len() as f64;
     let distances = group.iter().map(|m| sampson_squared(&found.model, m.1).sqrt());
-    enough && !is_compact(&spread) && median(distances.collect()).is_some_and(|distance| distance > OFF)
+    enough
+        && !is_compact(&spread)
+        && median(distances.collect()).is_some_and(|distance| distance > OFF)
+        && !is_parallax(pair, group, scene, spread.len())
+}
+
+/// Whether another motion explains `group` and nearly as many matches of `scene` as the one that explains `agreeing` of them. It does where
+/// the scene is one plane, which leaves the motion open: what stands before that plane then shows parallax (Hartley and Zisserman 2004,
+/// 13.3).
+fn is_parallax(pair: &PairMatches, group: &[Match], scene: &[Match], agreeing: usize) -> bool {
+    let points = Correspondences::new(scene.iter().map(|m| m.1).collect());
+    let problem = Homography {
+        points: &points,
+        threshold: AGREES,
+    };
+    let Some(found) = estimate(&problem, Vec::new(), limits(pair, 500)) else {
+        return false;
+    };
+    let plane = found.model;
+    // The lines along which points leave the plane meet in the epipole.
+    let lines: Vec<DVec3> = group
+        .iter()
+        .step_by(group.len().div_ceil(PARALLAX_LINES))
+        .map(|(_, [a, b])| (plane * a.extend(1.0)).cross(b.extend(1.0)))
+        .collect();
+    let agree = |f: &DMat3, matches: &[Match]| {
+        let agrees = |m: &&Match| sampson_squared(f, m.1) < AGREES * AGREES;
+        matches.iter().filter(agrees).count() as f64
+    };
+    let pairs = (0..lines.len()).flat_map(|i| (0..i).map(move |j| [i, j]));
+    pairs
+        .map(|[i, j]| cross_matrix(lines[i].cross(lines[j])) * plane)
+        .filter(|f| agree(f, group) >= EXPLAINED * group.len() as f64)
+        .any(|f| agree(&f, scene) >= AS_MANY * agreeing as f64)
 }
 
 fn keypoints(matches: Vec<Match>) -> Vec<[u32; 2]> {

@@ -198,6 +198,10 @@ impl Editing {
         };
         list.edits.extend(self.list.edits.iter().cloned());
         let splits = self.split_files(&self.path)?;
+        // The run no longer has what an earlier edit split off.
+        if let Some((path, _)) = splits.iter().find(|(path, _)| path.exists()) {
+            return refused(format!("split: {} exists already; choose another name", path.display()));
+        }
         let mut notes = Vec::new();
         for (path, cloud) in &splits {
             write_splats(path, cloud)?;

@@ -3,12 +3,13 @@
 mod world;
 
 use glam::{DQuat, DVec3};
+use irradia_scene::Rng;
 use irradia_sfm::Features;
 use irradia_sfm::PairMatches;
 use irradia_sfm::doctor::{Appearance, Diagnosis, Evidence, Kind, diagnose};
 use irradia_sfm::geometry::pose::DPose;
 use irradia_sfm::map::{MapOptions, Model, verify};
-use world::{World, around, look};
+use world::{CAMERA, World, around, look};
 
 /// All diagnoses of a world: with the model, and from its pairs alone.
 fn examine(world: &World, appearances: &[Appearance], colors: &[Vec<[u8; 3]>]) -> [Vec<Diagnosis>; 2] {
@@ -29,7 +30,7 @@ fn examine(world: &World, appearances: &[Appearance], colors: &[Vec<[u8; 3]>]) -
         masked: None,
         pairs: &pairs,
         cameras: &cameras,
-        model: found.models.first(),
+        models: &found.models,
         zooms: &found.zooms,
         own_focals: found.own_focals,
         absent: &found.absent,
@@ -37,7 +38,7 @@ fn examine(world: &World, appearances: &[Appearance], colors: &[Vec<[u8; 3]>]) -
         left_out: &found.left_out,
     };
     let alone = Evidence {
-        model: None,
+        models: &[],
         zooms: &[],
         own_focals: false,
         absent: &[],
@@ -166,6 +167,42 @@ fn turning_on_the_spot_is_named_and_is_the_one_reason() {
             .iter()
             .all(|d| matches!(d, Diagnosis::LeftOut { reason, .. } if reason.contains("same place")))
     );
+}
+
+#[test]
+fn a_turn_on_the_spot_between_two_walks_is_why_there_are_two_models() {
+    // Sideways past what is ahead, a turn to the right, sideways again.
+    let (walk, turn) = (12, 12);
+    let toward = |degrees: f64| DVec3::new(degrees.to_radians().sin(), degrees.to_radians().cos(), 0.0);
+    let pose = |degrees: f64, aside: f64| {
+        let eye = aside * toward(degrees + 90.0);
+        look(eye, eye + toward(degrees))
+    };
+    let poses = (0..walk)
+        .map(|i| pose(0.0, 0.12 * (i - walk) as f64))
+        .chain((0..=turn).map(|i| pose(10.0 * f64::from(i), 0.0)))
+        .chain((1..=walk).map(|i| pose(10.0 * f64::from(turn), 0.12 * i as f64)));
+    let mut rng = Rng::new(8, 1);
+    let points: Vec<(DVec3, DVec3)> = (0..3000)
+        .map(|_| {
+            let far = f64::from(rng.range(4.0, 7.0)) * toward(f64::from(rng.range(-60.0, 200.0)));
+            let place = far + DVec3::new(0.0, 0.0, f64::from(rng.range(-2.0, 2.0)));
+            (place, -place.normalize())
+        })
+        .collect();
+    let world = World::of_points(CAMERA, poses.collect(), &points, 0, 0.5, 0.1, 8);
+    let [mapped, _] = plainly(&world);
+    let turns: Vec<&Diagnosis> = mapped
+        .iter()
+        .filter(|found| matches!(found, Diagnosis::TurnOnly { .. }))
+        .collect();
+    let [Diagnosis::TurnOnly { ends, sides }] = turns[..] else {
+        panic!("{mapped:?}")
+    };
+    let in_turn = walk as usize..=(walk + turn) as usize;
+    assert!(ends.iter().all(|end| in_turn.contains(end)), "{ends:?}");
+    // A photograph in the middle of the turn may be in neither.
+    assert!(sides.iter().all(|side| (17..20).contains(side)), "{sides:?}");
 }
 
 #[test]

@@ -153,7 +153,7 @@ pub(super) fn examine(
         masked,
         pairs: &found.pairs,
         cameras: &found.cameras,
-        model,
+        models: &found.models,
         zooms: &found.zooms,
         own_focals: found.own_focals,
         absent: &found.absent,

@@ -156,8 +156,18 @@ fn a_run_edited_in_place_resumes_with_the_edited_splats() {
     edited(&path, &["opacity factor=0.9 all"])
         .write_in_place()
         .expect("writes");
+    // What was split off is nowhere else.
+    let split = |half: &str| edited(&path, &[&format!("split name=part {half}")]).write_in_place();
+    split("half-space point=0,0,0.3 normal=0,0,1").expect("writes");
+    let part = fs::read(path.join("part.ply")).expect("was split off");
+    let error = split("half-space point=0,0,0 normal=0,0,1")
+        .expect_err("exists")
+        .to_string();
+    assert!(error.contains("part.ply exists already"), "{error}");
+    assert_eq!(fs::read(path.join("part.ply")).expect("is kept"), part);
+    let left = read_splats(&path.join("scene.ply")).unwrap().len();
     let listed = EditList::parse(&fs::read_to_string(path.join(EDITS)).unwrap()).unwrap();
-    assert_eq!(listed.edits.len(), 3);
+    assert_eq!(listed.edits.len(), 4);
 
     let request = TrainInput::of_run(&path).unwrap().check().unwrap();
     let mut run = Run::resume_on(request, dataset()).expect("resumes");

@@ -8,7 +8,7 @@ use crate::Features;
 use crate::geometry::camera::DCamera;
 use crate::geometry::correspondences::sampson_squared;
 use crate::geometry::essential::{Motion, refine_motion};
-use crate::map::{PhotoInfo, Source, VerifiedPair, agreement, contradictions, strengths};
+use crate::map::{PhotoInfo, Source, VerifiedPair, agreement, contradictions, on_planes, strengths};
 use glam::{DQuat, DVec2};
 use irradia_scene::Rng;
 use rayon::prelude::*;
@@ -17,8 +17,6 @@ use rayon::prelude::*;
 const DOUBTFUL: f64 = 0.17;
 /// Farthest from the prediction that such a motion may be, radians.
 const NEAR: f64 = 0.26;
-/// Matches of a pair that are looked at.
-const MATCHES: usize = 100;
 /// Directions of the translation that are tried.
 const TRIES: usize = 50;
 /// Errors at which matches agree, on the plane z = 1: roughly with a predicted rotation a few degrees off, then in steps.
@@ -63,8 +61,8 @@ pub fn consistency(
                 if settled.disagreement[i] < DOUBTFUL {
                     return (1.0, None);
                 }
-                let camera = |photo: usize| &cameras[photos[photo].group].0;
-                let points = on_plane(pair, features, &camera);
+                let camera = |photo: u32| &cameras[photos[photo as usize].group].0;
+                let points = on_planes(pair, features, pair.photos.map(camera));
                 near_prediction(&points, b.inverse() * a, i as u64)
             })
             .collect();
@@ -90,19 +88,6 @@ impl Consistency {
         let off = self.agree.iter().filter(|agree| **agree < 0.5).count();
         (off as f64) < UNSETTLED * self.agree.len() as f64
     }
-}
-
-/// Some of the matches of a pair on the planes z = 1.
-fn on_plane<'a>(pair: &VerifiedPair, features: &[Features], camera: &dyn Fn(usize) -> &'a DCamera) -> Vec<[DVec2; 2]> {
-    let thin = pair.matches.len().div_ceil(MATCHES).max(1);
-    let place = |side: usize, keypoint: u32| {
-        let photo = pair.photos[side] as usize;
-        camera(photo).unproject(features[photo].keypoints[keypoint as usize].at())
-    };
-    let matches = pair.matches.iter().step_by(thin);
-    matches
-        .filter_map(|[i, j]| Some([place(0, *i)?, place(1, *j)?]))
-        .collect()
 }
 
 /// The fraction of the matches that agree with a motion, in front of both cameras.
@@ -156,7 +141,9 @@ fn near_prediction(points: &[[DVec2; 2]], predicted: DQuat, seed: u64) -> (f64, 
 
 /// Repeated structures: neighbours that disagree with the model, unless something moves in both: `moving` are such photographs.
 pub(super) fn contradiction(evidence: &Evidence, moving: &[usize]) -> Vec<Diagnosis> {
-    let Some(model) = evidence.model else { return Vec::new() };
+    let Some(model) = evidence.model() else {
+        return Vec::new();
+    };
     let pairs = evidence.pairs;
     let agreement = agreement(evidence.photos, evidence.features, pairs, model);
     let strengths = strengths(evidence.photos, evidence.features, pairs);

@@ -48,7 +48,7 @@ pub(super) fn zoom(evidence: &Evidence) -> Vec<Diagnosis> {
 
 /// Photographs that became cameras of their own.
 pub(super) fn own_focals(evidence: &Evidence) -> Vec<Diagnosis> {
-    let model = evidence.model.filter(|_| evidence.own_focals);
+    let model = evidence.model().filter(|_| evidence.own_focals);
     let cameras = model.map_or(&[][..], |model| &model.cameras);
     let focals = cameras.iter().enumerate();
     let mut focals: Vec<(f64, usize)> = focals
@@ -66,7 +66,9 @@ pub(super) fn own_focals(evidence: &Evidence) -> Vec<Diagnosis> {
 
 /// Photographs whose principal point the mapper found away from the middle.
 pub(super) fn cut(evidence: &Evidence) -> Vec<Diagnosis> {
-    let Some(model) = evidence.model else { return Vec::new() };
+    let Some(model) = evidence.model() else {
+        return Vec::new();
+    };
     let off = |photo: usize| {
         let camera = model.cameras[evidence.photos[photo].group].as_ref()?;
         let is_told = evidence.photos[photo].camera.is_some();
@@ -92,7 +94,7 @@ pub(super) fn focal_unknown(evidence: &Evidence) -> Vec<Diagnosis> {
     let mut found = Vec::new();
     for (group, (_, source)) in evidence.cameras.iter().enumerate() {
         let held = evidence
-            .model
+            .model()
             .is_some_and(|model| model.focal_held.get(group) == Some(&true));
         let of_group = |photo: usize| evidence.photos[photo].group == group;
         let photos: Vec<usize> = (0..evidence.photos.len()).filter(|p| of_group(*p)).collect();
@@ -106,7 +108,7 @@ pub(super) fn focal_unknown(evidence: &Evidence) -> Vec<Diagnosis> {
         let open = *source == Source::Guess && (general as f64) < GENERAL * pairs().count() as f64;
         // What the pairs leave open, many photographs of a scene with depth may still determine together.
         let determined = || {
-            let model = evidence.model.filter(|model| model.cameras[group].is_some());
+            let model = evidence.model().filter(|model| model.cameras[group].is_some());
             model.is_some_and(|model| determines_focal(evidence.photos, evidence.features, model, group))
         };
         if photos.len() > 2 && (held || open && !determined()) {

@@ -46,8 +46,8 @@ pub struct Evidence<'a> {
     pub pairs: &'a [VerifiedPair],
     /// `[groups]` the camera of each group before any adjustment, and where its focal length comes from.
     pub cameras: &'a [(DCamera, Source)],
-    /// The largest model, if the photographs were mapped.
-    pub model: Option<&'a Model>,
+    /// The models, largest first, if the photographs were mapped.
+    pub models: &'a [Model],
     /// What the mapper found of focal lengths that no metadata tell.
     pub zooms: &'a [Zoom],
     /// Whether the mapper made each photograph a camera of its own.
@@ -58,6 +58,13 @@ pub struct Evidence<'a> {
     pub apart: Option<usize>,
     /// What became of photographs without a pose, if the photographs were mapped.
     pub left_out: &'a [LeftOut],
+}
+
+impl<'a> Evidence<'a> {
+    /// The largest model.
+    fn model(&self) -> Option<&'a Model> {
+        self.models.first()
+    }
 }
 
 /// The partners of each photograph.
@@ -148,7 +155,7 @@ pub fn diagnose(evidence: &Evidence) -> Vec<Diagnosis> {
     ]
     .concat();
     let overlap = overlap::overlap(evidence, &graph);
-    let ring = match evidence.model {
+    let ring = match evidence.model() {
         Some(_) => ring::ring(evidence, &graph, &[]),
         None => {
             let found = consistency(evidence.photos, evidence.features, evidence.cameras, evidence.pairs);
@@ -163,6 +170,7 @@ pub fn diagnose(evidence: &Evidence) -> Vec<Diagnosis> {
         contradiction,
         missing::missing(evidence),
         rotation_only,
+        motion::turn_only(evidence),
         still,
         overlap,
         ring,

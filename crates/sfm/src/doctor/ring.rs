@@ -72,7 +72,7 @@ fn is_spanned(seen: &[(f64, usize)], graph: &Graph, i: usize) -> bool {
 /// part of the pairs.
 fn azimuths(evidence: &Evidence, graph: &Graph, turns: &[Option<DQuat>]) -> Vec<(f64, usize)> {
     let largest = graph.parts().into_iter().next().unwrap_or_default();
-    let rotations: Vec<(usize, DQuat)> = match evidence.model {
+    let rotations: Vec<(usize, DQuat)> = match evidence.model() {
         Some(model) => (0..model.poses.len())
             .filter_map(|p| Some((p, model.poses[p]?.rotation)))
             .collect(),

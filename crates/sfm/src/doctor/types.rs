@@ -3,6 +3,9 @@
 use super::looks::FEATURES_BY_MEDIAN;
 use std::fmt::{self, Display, Formatter};
 
+/// Fraction of the matches that stands still, from which on the camera itself may: people walk before one on a tripod with 98 %.
+const CAMERA_AT_REST: f64 = 0.9;
+
 /// The family of a diagnosis, by which tests and reports count them.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Kind {
@@ -30,7 +33,7 @@ pub enum Kind {
     Gap,
     /// [`Diagnosis::OpenLoop`]
     OpenLoop,
-    /// [`Diagnosis::RotationOnly`]
+    /// [`Diagnosis::RotationOnly`] and [`Diagnosis::TurnOnly`]
     RotationOnly,
     /// [`Diagnosis::StandsStill`]
     StandsStill,
@@ -197,6 +200,13 @@ pub enum Diagnosis {
         /// Pairs among them.
         pairs: usize,
     },
+    /// Two models see the same, but from one place.
+    TurnOnly {
+        /// The photographs of either that share most.
+        ends: [usize; 2],
+        /// Photographs of the models.
+        sides: [usize; 2],
+    },
     /// A part of the pictures stands still while the rest moves.
     StandsStill {
         /// Photographs of such pairs.
@@ -269,7 +279,7 @@ impl Diagnosis {
             Diagnosis::FewPartners { .. } => Kind::FewPartners,
             Diagnosis::Gap { .. } => Kind::Gap,
             Diagnosis::OpenLoop { .. } => Kind::OpenLoop,
-            Diagnosis::RotationOnly { .. } => Kind::RotationOnly,
+            Diagnosis::RotationOnly { .. } | Diagnosis::TurnOnly { .. } => Kind::RotationOnly,
             Diagnosis::StandsStill { .. } => Kind::StandsStill,
             Diagnosis::Moving { .. } => Kind::Moving,
             Diagnosis::Twice { .. } => Kind::Twice,
@@ -302,6 +312,7 @@ impl Diagnosis {
             Diagnosis::Bridge { photos, .. } | Diagnosis::Twice { photos } => photos.to_vec(),
             Diagnosis::Gap { sides: ends, .. }
             | Diagnosis::OpenLoop { ends, .. }
+            | Diagnosis::TurnOnly { ends, .. }
             | Diagnosis::OwnFocals { ends, .. } => ends.to_vec(),
             Diagnosis::Contradiction { pairs, .. } => pairs.iter().flatten().copied().collect(),
         }
@@ -498,6 +509,12 @@ impl Display for Sentence<'_> {
                 "{} were taken from one place ({pairs} pairs only turn); step aside between photographs",
                 self.list(photos)
             ),
+            Diagnosis::TurnOnly { ends: [a, b], sides } => write!(
+                f,
+                "between {} and {} the camera only turned, so that the {} and {} photographs on either side have a model each; step \
+                 aside while turning there",
+                self.names[*a], self.names[*b], sides[0], sides[1]
+            ),
             Diagnosis::StandsStill {
                 photos,
                 pairs,
@@ -505,12 +522,17 @@ impl Display for Sentence<'_> {
                 masked,
             } => write!(
                 f,
-                "{:.0} % of the matches stand still while the rest moves, in {} of {} pairs, such as {}: a turntable before a fixed \
+                "{:.0} % of the matches stand still while the rest moves, in {} of {} pairs, such as {}: {}a turntable before a fixed \
                  background, what carries the camera, or writing on the pictures; {}",
                 100.0 * fraction,
                 pairs[0],
                 pairs[1],
                 self.list(photos),
+                if *fraction >= CAMERA_AT_REST {
+                    "a camera that did not move (walk around the scene with it), "
+                } else {
+                    ""
+                },
                 if *masked { "it is masked" } else { "mask it" }
             ),
             Diagnosis::Moving { photos, pairs, matches } => write!(

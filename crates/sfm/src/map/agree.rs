@@ -62,7 +62,7 @@ pub fn agreement(
 }
 
 /// Some of the matches of a pair on the planes z = 1.
-fn on_planes(pair: &VerifiedPair, features: &[Features], cameras: [&DCamera; 2]) -> Vec<[DVec2; 2]> {
+pub(crate) fn on_planes(pair: &VerifiedPair, features: &[Features], cameras: [&DCamera; 2]) -> Vec<[DVec2; 2]> {
     let thin = pair.matches.len().div_ceil(MATCHES).max(1);
     let place = |side: usize, keypoint: u32| {
         let features = &features[pair.photos[side] as usize];

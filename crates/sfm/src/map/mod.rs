@@ -30,6 +30,7 @@ mod verify;
 mod zoom;
 
 pub use absent::{ABSENT_PAIRS, absent};
+pub(crate) use agree::on_planes;
 pub use agree::{agreement, contradictions, strengths, telling};
 pub use distance::{Distance, DistanceFit, to_distances};
 pub use focal::Source;

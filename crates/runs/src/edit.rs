@@ -172,8 +172,8 @@ impl Editing {
     /// what did not change keeps its moments, and the run resumes with the edited splats. Returns what the reader should know, a line each.
     ///
     /// # Errors
-    /// When the scene is not that of a run, the whole scene was moved away from its photographs, the run is training, or a file cannot be
-    /// written.
+    /// When the scene is not that of a run, the whole scene was moved away from its photographs, the run is training, a file of the name of a
+    /// split exists, or a file cannot be written.
     pub fn write_in_place(&self) -> Result<Vec<String>, RunError> {
         let refused = |message: String| Err(RunError::Refused(message));
         let folder = match RunFolder::containing(&self.path) {

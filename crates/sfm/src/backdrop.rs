@@ -14,7 +14,7 @@ const PLAIN: f32 = 3.0;
 const ROUNDS: usize = 3;
 /// Pixels by which a passage from the border must be wider than twice: what turns touches the backdrop in single ones.
 const PASSAGE: usize = 3;
-/// Pixels from which on what looks the same in most pictures may turn all the same, such as a vase: thinner, it is an edge behind, such as the rim of the plate.
+/// Pixels by which what looks the same in most pictures must be wider than twice to turn all the same, such as a vase: else it is a line behind, such as the rim of the plate.
 const THIN: usize = 7;
 /// Variance of the difference to it, by that of the picture, of an edge behind: a camera at rest moves by a fraction of a pixel.
 const ALIKE: f32 = 0.25;
@@ -61,21 +61,18 @@ impl Backdrop {
         let shade = difference.each_ref().map(|d| means(self.width, d));
         let (varies, texture) = (variance(self.width, &difference), variance(self.width, &color));
         let plain = 3.0 * PLAIN * PLAIN;
-        let is_shown = |i: usize| shade.iter().all(|s| s[i].abs() < SHADE) && varies[i] < plain && texture[i] < plain;
+        let is_alike = |i: usize, most: f32| shade.iter().all(|s| s[i].abs() < SHADE) && varies[i] < most;
+        let is_shown = |i: usize| is_alike(i, plain) && texture[i] < plain;
         let mut shown: Vec<bool> = (0..texture.len()).map(is_shown).collect();
-        (0..PASSAGE).for_each(|_| shown = self.spread(&shown, false));
+        shown = self.spread(shown, PASSAGE, false);
         for region in self.regions(&shown) {
             let is_joined = region.iter().any(|at| self.is_border(*at));
             region.into_iter().for_each(|at| shown[at] &= is_joined);
         }
-        (0..PASSAGE).for_each(|_| shown = self.spread(&shown, true));
-        let mut thick: Vec<bool> = shown.iter().map(|shown| !shown).collect();
-        (0..THIN).for_each(|_| thick = self.spread(&thick, false));
-        (0..THIN).for_each(|_| thick = self.spread(&thick, true));
-        let is_line = |at: usize| {
-            let is_still = shade.iter().all(|s| s[at].abs() < SHADE) && varies[at] < plain.max(ALIKE * texture[at]);
-            is_still && !thick[at] && !shown[at]
-        };
+        shown = self.spread(shown, PASSAGE, true);
+        let hides = shown.iter().map(|shown| !shown).collect();
+        let thick = self.spread(self.spread(hides, THIN, false), THIN, true);
+        let is_line = |at: usize| is_alike(at, plain.max(ALIKE * texture[at])) && !thick[at] && !shown[at];
         let lines: Vec<bool> = (0..shown.len()).map(is_line).collect();
         // A stem that looks the same from all sides ends within the picture.
         for line in self.regions(&lines) {
@@ -135,14 +132,17 @@ impl Backdrop {
         light
     }
 
-    /// Pixels of `shown`, and those beside them if it `grows`; else only those with all beside them.
-    fn spread(&self, shown: &[bool], grows: bool) -> Vec<bool> {
-        let beside = |at: usize| adjacent(self.width, shown.len(), at);
-        let all = 0..shown.len();
-        match grows {
-            true => all.map(|at| shown[at] || beside(at).any(|to| shown[to])).collect(),
-            false => all.map(|at| shown[at] && beside(at).all(|to| shown[to])).collect(),
+    /// Pixels of `shown`, and those up to `pixels` beside them if it `grows`; else only those with all of these.
+    fn spread(&self, mut shown: Vec<bool>, pixels: usize, grows: bool) -> Vec<bool> {
+        for _ in 0..pixels {
+            let beside = |at: usize| adjacent(self.width, shown.len(), at);
+            let all = 0..shown.len();
+            shown = match grows {
+                true => all.map(|at| shown[at] || beside(at).any(|to| shown[to])).collect(),
+                false => all.map(|at| shown[at] && beside(at).all(|to| shown[to])).collect(),
+            };
         }
+        shown
     }
 
     /// Connected pixels that all are `shown`, or all are not; the largest first.

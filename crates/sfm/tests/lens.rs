@@ -68,7 +68,7 @@ fn wide(fisheye: bool) -> World {
         fisheye,
         ..CAMERA
     };
-    World::of_points(camera, poses.collect(), &points, 0, 0.5, 0.2, 4)
+    World::of_points(camera, poses.collect(), &points, 0, 0.5, 0.2, 3)
 }
 
 #[test]

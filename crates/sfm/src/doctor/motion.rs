@@ -1,10 +1,9 @@
 //! What the motion between photographs tells: none, turns only, something that stands still.
 
 use super::{Diagnosis, Evidence, Graph, HOLDS, turns_only};
-use crate::geometry::homography::rotation_between;
+use crate::geometry::homography::turned;
 use crate::map::{VerifiedPair, on_planes, same_place, stands_still};
 use crate::median;
-use glam::{DMat3, DVec2};
 use std::collections::BTreeMap;
 
 /// Photographs of one place from which on it is a fault of the capture.
@@ -60,7 +59,10 @@ pub(super) fn turn_only(evidence: &Evidence) -> Vec<Diagnosis> {
         let [Some(a), Some(b)] = pair.photos.map(camera) else {
             return 0.0;
         };
-        turned(&on_planes(pair, evidence.features, [a, b]), TURN_ERROR / b.focal())
+        let matches = on_planes(pair, evidence.features, [a, b]);
+        let threshold = TURN_ERROR / b.focal();
+        // Wrong matches tilt the first rotation.
+        turned(&matches, &[8.0 * threshold, 2.0 * threshold], threshold) as f64 / matches.len().max(1) as f64
     };
     let diagnosis = |(models, pairs): ([usize; 2], Vec<&VerifiedPair>)| {
         let first = pairs.iter().max_by_key(|pair| pair.matches.len())?;
@@ -74,22 +76,6 @@ pub(super) fn turn_only(evidence: &Evidence) -> Vec<Diagnosis> {
         })
     };
     between.into_iter().filter_map(diagnosis).collect()
-}
-
-/// The fraction of the matches, on the planes z = 1, that one rotation explains with errors below `threshold`.
-fn turned(matches: &[[DVec2; 2]], threshold: f64) -> f64 {
-    let mut rotation = rotation_between(matches.iter().copied());
-    let close = |rotation: &DMat3, [a, b]: &[DVec2; 2], threshold: f64| {
-        let turned = *rotation * a.extend(1.0);
-        turned.z > 0.0 && (turned.truncate() / turned.z - *b).length() < threshold
-    };
-    // Wrong matches tilt the first.
-    for coarser in [8.0, 2.0] {
-        let kept = matches.iter().filter(|m| close(&rotation, m, coarser * threshold));
-        rotation = rotation_between(kept.copied());
-    }
-    let turned = matches.iter().filter(|m| close(&rotation, m, threshold)).count();
-    turned as f64 / matches.len().max(1) as f64
 }
 
 /// Photographs by how many of `pairs` name them, most first.

@@ -53,6 +53,19 @@ pub fn rotation_between(points: impl Iterator<Item = [DVec2; 2]>) -> DMat3 {
     closest_rotation(sum)
 }
 
+/// How many of `points` one rotation explains with errors below `threshold` in the second photograph: the best of all, then of those within each distance of `coarser`.
+pub fn turned(points: &[[DVec2; 2]], coarser: &[f64], threshold: f64) -> usize {
+    let close = |rotation: &DMat3, [a, b]: &[DVec2; 2], within: f64| {
+        let turned = *rotation * a.extend(1.0);
+        turned.z > 0.0 && (turned.truncate() / turned.z - *b).length() < within
+    };
+    let mut rotation = rotation_between(points.iter().copied());
+    for within in coarser {
+        rotation = rotation_between(points.iter().copied().filter(|p| close(&rotation, p, *within)));
+    }
+    points.iter().filter(|p| close(&rotation, p, threshold)).count()
+}
+
 /// The problem of the homography over correspondences.
 pub struct Homography<'a> {
     /// The correspondences.

@@ -131,11 +131,11 @@ fn vote(
         let wider: Vec<f64> = (1..=WIDER).rev().map(|i| FIRST * STEP.powi(-i)).collect();
         total.splice(0..0, totals(&wider));
         focals.splice(0..0, wider);
+        if total[0] < RISES * total[lowest(&total)?] {
+            return None;
+        }
     }
     let best = lowest(&total)?;
-    if total.len() > CANDIDATES as usize && total[0] < RISES * total[best] {
-        return None;
-    }
     if prior.is_some_and(|prior| totals(&[prior])[0] < PRIOR * total[best]) {
         return None;
     }

@@ -6,7 +6,7 @@ use crate::geometry::camera::DCamera;
 use crate::geometry::correspondences::{Correspondences, sampson_squared};
 use crate::geometry::essential::{Essential, Motion, closest_essential, cross_matrix, motion_in_front, refine_motion};
 use crate::geometry::fundamental::Fundamental;
-use crate::geometry::homography::{Homography, rotation_between};
+use crate::geometry::homography::{Homography, turned};
 use crate::geometry::ransac::{Estimate, Limits, estimate};
 use crate::matching::{MatchOptions, TwoView, match_guided};
 use crate::{Features, PairMatches, median};
@@ -330,13 +330,7 @@ fn kind(points: &[[DVec2; 2]], threshold: f64, pair: &PairMatches) -> PairKind {
         return PairKind::General;
     }
     // Twice: the second time without what does not turn along. The lens may be unknown yet: twice the threshold.
-    let mut rotation = rotation_between(points.iter().copied());
-    let close = |rotation: &DMat3, [a, b]: &[DVec2; 2]| {
-        let turned = *rotation * a.extend(1.0);
-        turned.z > 0.0 && (turned.truncate() / turned.z - *b).length() < 2.0 * threshold
-    };
-    rotation = rotation_between(points.iter().copied().filter(|p| close(&rotation, p)));
-    let turned = points.iter().filter(|p| close(&rotation, p)).count();
+    let turned = turned(points, &[2.0 * threshold], 2.0 * threshold);
     if turned as f64 >= explained {
         PairKind::Rotation
     } else {

@@ -123,8 +123,7 @@ fn before(out: &Path) -> Files {
         .unwrap_or_default()
 }
 
-/// Moves `files` into [`UNUSED`], and removes folders that are empty then. What a record names outside of the dataset is ignored.
-/// Moves `files` of the dataset, those that are there, into its folder `unused`.
+/// Moves `files` of the dataset, those that are there, into [`UNUSED`], and removes folders that are empty then. What a record names outside of the dataset is ignored.
 pub(super) fn put_away(out: &Path, files: impl Iterator<Item = String>) -> Result<(), RunError> {
     let is_inside = |file: &str| {
         Path::new(file)

@@ -262,12 +262,12 @@ pub(super) fn write(out: &Path, folder: &PhotoFolder, work: &Work, report: &Doct
                 .zip(finding.pictured.iter().copied())
         })
         .collect();
-    if !shown.is_empty() {
-        fs::create_dir_all(&pictures).map_err(RunError::io("create", &pictures))?;
-    }
     for (name, photo) in shown {
         let (size, rgb) = small(&folder.photos[work.photos()[photo]])?;
-        write_png(&pictures.join(format!("{name}.png")), size[0], size[1], 3, &rgb)?;
+        let picture = pictures.join(format!("{name}.png"));
+        let around = picture.parent().unwrap_or(&pictures);
+        fs::create_dir_all(around).map_err(RunError::io("create", around))?;
+        write_png(&picture, size[0], size[1], 3, &rgb)?;
     }
     let json = to_json(report);
     // Within a script element only `<` can end the data; strings of JSON may escape any character.

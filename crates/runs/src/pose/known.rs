@@ -2,11 +2,12 @@
 
 use crate::RunError;
 use glam::{DQuat, DVec3};
-use irradia_formats::{ColmapCamera, ColmapImage, PhotoFolder, read_colmap_poses, read_photo_folder};
+use irradia_formats::{ColmapCamera, ColmapImage, PhotoFolder, read_colmap_poses, read_photo_folders};
 use irradia_sfm::geometry::camera::DCamera;
 use irradia_sfm::geometry::pose::DPose;
 use irradia_sfm::map::{Known, PhotoInfo};
-use std::collections::HashMap;
+use std::collections::{BTreeSet, HashMap};
+use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
 
 /// Cameras and poses of a dataset in COLMAP's format.
@@ -30,13 +31,28 @@ impl KnownPoses {
         })
     }
 
+    /// The photographs in the dataset's folder `images` and the folders in it that hold some with a pose, by their names in the model.
+    fn photographs(&self) -> Result<PhotoFolder, RunError> {
+        let images = self.data.join("images");
+        let folders = self.images.keys().map(|name| images.join(name));
+        let folders: BTreeSet<PathBuf> = folders.filter_map(|photo| Some(photo.parent()?.to_owned())).collect();
+        let folders: Vec<PathBuf> = folders.into_iter().filter(|folder| folder.is_dir()).collect();
+        let mut found = read_photo_folders(&folders)?;
+        for photo in &mut found.photos {
+            let inside = photo.path.strip_prefix(&images).unwrap_or(&photo.path);
+            let parts = inside.iter().map(OsStr::to_string_lossy);
+            photo.name = parts.collect::<Vec<_>>().join("/");
+        }
+        Ok(found)
+    }
+
     /// The dataset's photographs and those of `more`, by name.
     pub fn with(&self, more: PhotoFolder) -> Result<PhotoFolder, RunError> {
-        let mut folder = read_photo_folder(&self.data.join("images"))?;
+        let mut folder = self.photographs()?;
         let present = |name: &&String| folder.photos.iter().any(|photo| photo.name == **name);
         if let Some(name) = self.images.keys().filter(|name| !present(name)).min() {
             return Err(RunError::Refused(format!(
-                "{} has a pose for {name}, which is not in its folder images",
+                "{} has a pose for {name}, which is not in its folder images: add the photograph there, at the size of its camera",
                 self.data.display()
             )));
         }

@@ -56,6 +56,17 @@ fn photographs_are_added_to_a_dataset_whose_poses_stay() {
     assert!(sparse.join("0/project.ini").is_file() && sparse.join("1/images.bin").is_file());
     assert_eq!(fs::read(data.join("unused/sparse/0/images.bin")).unwrap(), theirs);
     assert!(before.iter().all(|view| positions().contains(view)), "poses stay");
+    // Photographs in folders of `images` are found there.
+    fs::create_dir(data.join("images/left")).unwrap();
+    fs::rename(data.join("images/00.png"), data.join("images/left/00.png")).unwrap();
+    let images = sparse.join("0/images.bin");
+    let bytes = fs::read(&images).unwrap();
+    let name = bytes.windows(7).position(|bytes| bytes == b"00.png\0").unwrap();
+    fs::write(&images, [&bytes[..name], b"left/", &bytes[name..]].concat()).unwrap();
+    let before = positions();
+    assert!(before.iter().any(|view| view.0.contains("left")), "{before:?}");
+    quietly(&input).unwrap();
+    assert!(before.iter().all(|view| positions().contains(view)), "poses stay");
     fs::remove_file(at("more").join("other.png")).unwrap();
     // Nothing new, and no dataset at all, are told in one line.
     let error = quietly(&input).unwrap_err().to_string();

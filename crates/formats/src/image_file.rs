@@ -210,6 +210,15 @@ pub(crate) fn decode(path: &Path, orientation: Orientation, colour: Colour) -> R
     Ok(upright(image, orientation, colour))
 }
 
+/// The pixels of a mask, 0 to 255, also where it has 0 and 1 for them.
+pub(crate) fn decode_mask(path: &Path, orientation: Orientation) -> Result<Pixels, FormatError> {
+    let mut mask = decode(path, orientation, Colour::Grey)?;
+    if mask.data.iter().max() == Some(&1) {
+        mask.data.iter_mut().for_each(|value| *value *= 255);
+    }
+    Ok(mask)
+}
+
 /// The pixels of a HEIC in memory.
 pub(crate) fn decode_heic(bytes: &[u8]) -> Result<Pixels, image::ImageError> {
     let image = DynamicImage::from_decoder(HeicDecoder::new(bytes.to_vec())?)?;

@@ -1,5 +1,5 @@
 use crate::DEFAULT_MAX_SIDE;
-use crate::image_file::{Colour, decode, decode_jpeg_at, read_header};
+use crate::image_file::{Colour, decode, decode_jpeg_at, decode_mask, read_header};
 use crate::shown::Shown;
 use crate::undistort::Undistortion;
 use crate::{FormatError, Pixels};
@@ -136,7 +136,7 @@ impl PhotoFile {
 
     fn read_mask(&self, path: &Path, size: (u32, u32)) -> Result<Vec<u8>, FormatError> {
         let orientation = read_header(path)?.turned_with(self.orientation, self.upright);
-        let mut mask = decode(path, orientation, Colour::Grey)?;
+        let mut mask = decode_mask(path, orientation)?;
         let upright = [self.upright.0, self.upright.1];
         if [mask.width, mask.height] != upright {
             mask.data = resize_area(&mask.data, mask.channels, [mask.width, mask.height], upright);

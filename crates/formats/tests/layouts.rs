@@ -297,6 +297,36 @@ fn metashape() {
 }
 
 #[test]
+fn masks_beside_are_found_in_any_layout_and_a_calibration_alone_is_no_pose() {
+    let folder = folder("images");
+    let images = folder.path().join("images");
+    let xmp = |pose: &str| {
+        format!(
+            r#"<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF><rdf:Description xcr:Version="3" xcr:FocalLength35mm="30">{pose}</rdf:Description></rdf:RDF></x:xmpmeta>"#
+        )
+    };
+    for i in 0..COUNT {
+        fs::write(images.join(format!("shot {i}.xmp")), xmp("")).unwrap();
+    }
+    assert_eq!(DatasetFormat::recognise(folder.path()), None);
+    fs::create_dir(folder.path().join("masks")).unwrap();
+    for i in 1..COUNT {
+        let pose = format!("<xcr:Rotation>1 0 0 0 1 0 0 0 1</xcr:Rotation><xcr:Position>{i} 0 0</xcr:Position>");
+        fs::write(images.join(format!("shot {i}.xmp")), xmp(&pose)).unwrap();
+        // 0 and 1, as some programs write them.
+        let mask = GrayImage::from_fn(WIDTH as u32, HEIGHT as u32, |x, _| Luma([u8::from(x < 20)]));
+        mask.save(folder.path().join("masks").join(name(i))).unwrap();
+    }
+    let dataset = read(folder.path(), DatasetFormat::RealityCapture);
+    assert_eq!(dataset.views.len(), COUNT - 1);
+    for view in &dataset.views {
+        let mask = view.photo.load().unwrap().mask.expect("a mask");
+        let shown = mask.iter().filter(|value| **value > 0).count();
+        assert_eq!(shown, 20 * HEIGHT as usize);
+    }
+}
+
+#[test]
 fn realitycapture() {
     for lens in [Lens::default(), BROWN] {
         let truth = Truth::new(lens);
@@ -315,7 +345,7 @@ fn realitycapture() {
             let [h, p, r] = [heading, pitch, roll].map(f64::to_degrees);
             writeln!(
                 rows,
-                "{},{},{},{},{h},{p},{r},{f},{px},{py},{k1},{k2},{k3},0,{p1},{p2}",
+                "{},{},{},{},{h},{p},{r},{f},{px},{py},{k1},{k2},{k3},0,{p2},{p1}",
                 name(i),
                 c.x,
                 c.y,
@@ -337,7 +367,7 @@ fn realitycapture() {
             let text = format!(
                 r#"<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF><rdf:Description xcr:Version="3" xcr:DistortionModel="brown3"
                 xcr:FocalLength35mm="{f}" xcr:PrincipalPointU="{u}" xcr:PrincipalPointV="{v}"><xcr:Rotation>{r}</xcr:Rotation>
-                <xcr:Position>{} {} {}</xcr:Position><xcr:DistortionCoeficients>{k1} {k2} {k3} 0 {p1} {p2}</xcr:DistortionCoeficients>
+                <xcr:Position>{} {} {}</xcr:Position><xcr:DistortionCoeficients>{k1} {k2} {k3} 0 {p2} {p1}</xcr:DistortionCoeficients>
                 </rdf:Description></rdf:RDF></x:xmpmeta>"#,
                 c.x, c.y, c.z
             );

@@ -12,6 +12,7 @@ use irradia_scene::GaussianCloud;
 use irradia_splat::Splats;
 use irradia_train::checkpoint::{splats_of, with_splats};
 use std::fs;
+use std::iter;
 use std::path::{Path, PathBuf};
 
 /// The list of edits beside an edited scene.
@@ -139,13 +140,18 @@ impl Editing {
         if !is_file {
             fs::create_dir_all(output).map_err(RunError::io("create", output))?;
             let folder = RunFolder::at(output);
-            if let Some(cameras) = cameras_moved(&self.path, &self.moved) {
-                folder.write("cameras.json", &cameras)?;
-            }
+            let cameras = ("cameras.json", cameras_moved(&self.path, &self.moved));
             // By these it is rendered.
-            for name in ["recipe.toml", SKY, VIGNETTE] {
-                if let Ok(content) = fs::read(self.path.with_file_name(name)) {
-                    folder.write(name, &content)?;
+            let others =
+                ["recipe.toml", SKY, VIGNETTE].map(|name| (name, fs::read(self.path.with_file_name(name)).ok()));
+            for (name, content) in iter::once(cameras).chain(others) {
+                let of_another_scene = folder.file(name);
+                match content {
+                    Some(content) => folder.write(name, &content)?,
+                    None if of_another_scene.exists() => {
+                        fs::remove_file(&of_another_scene).map_err(RunError::io("remove", &of_another_scene))?;
+                    }
+                    None => {}
                 }
             }
             folder.write(EDITS, self.list.to_toml().as_bytes())?;
@@ -203,15 +209,15 @@ impl Editing {
             return refused(format!("split: {} exists already; choose another name", path.display()));
         }
         let mut notes = Vec::new();
-        for (path, cloud) in &splits {
-            write_splats(path, cloud)?;
-            notes.push(format!("{}: {} splats split off", path.display(), cloud.len()));
-        }
         if let Some(path) = folder.newest_checkpoint()? {
             let kept = self.edit_checkpoint(&path)?;
             notes.push(format!("{}: {kept} splats keep their optimiser state", path.display()));
         }
-        write_splats(&self.path, &self.draft.shown())?;
+        for (path, cloud) in &splits {
+            write_splats(path, cloud)?;
+            notes.push(format!("{}: {} splats split off", path.display(), cloud.len()));
+        }
+        notes.extend(write_scene(&self.path, &self.draft.shown(), &WriteOptions::default())?);
         folder.write(EDITS, list.to_toml().as_bytes())?;
         notes.push("the figures of the run are those before the edit: irradia eval measures again".to_owned());
         Ok(notes)

@@ -1,5 +1,6 @@
 //! The folder of a run.
 
+use crate::edit::EDITS;
 use crate::lock::FolderLock;
 use crate::provenance::ViewList;
 use crate::{RunError, TrainInput};
@@ -12,6 +13,7 @@ use irradia_train::paces::Paces;
 use irradia_train::{Trainer, socket};
 use serde::{Deserialize, Serialize};
 use std::fs;
+use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
 /// The splats of a run.
@@ -40,7 +42,7 @@ const WORLD: &str = "world.json";
 pub(crate) const PACES: &str = "pace.txt";
 
 /// The files of a run.
-const FILES: [&str; 19] = [
+const FILES: [&str; 23] = [
     "run.json",
     VIEWS,
     WORLD,
@@ -60,6 +62,10 @@ const FILES: [&str; 19] = [
     "report.json",
     "report.html",
     UNIT,
+    EDITS,
+    "scene.lod1.ply",
+    "scene.lod2.ply",
+    "scene.lod3.ply",
 ];
 /// The subfolders of a run.
 const FOLDERS: [&str; 2] = ["eval", "checkpoints"];
@@ -386,7 +392,11 @@ impl RunFolder {
     /// Steps and paths of the checkpoints, oldest first.
     fn checkpoints(&self) -> Result<Vec<(u64, PathBuf)>, RunError> {
         let folder = self.file("checkpoints");
-        let entries = fs::read_dir(&folder).map_err(RunError::io("read", &folder))?;
+        let entries = match fs::read_dir(&folder) {
+            // A finished run from which they were deleted.
+            Err(error) if error.kind() == ErrorKind::NotFound => return Ok(Vec::new()),
+            entries => entries.map_err(RunError::io("read", &folder))?,
+        };
         let mut found: Vec<(u64, PathBuf)> = entries
             .filter_map(|entry| {
                 let path = entry.ok()?.path();

@@ -85,8 +85,8 @@ pub use path::{CameraPath, Film, PathKey};
 pub use photographs::photographs_of;
 pub use pose::{
     AttemptReport, CameraReport, DoctorInput, DoctorReport, ENOUGH_POSED, Finding, KnownDistance, LeftOutPhoto, Mapper,
-    PoseCheck, PoseInput, PoseProgress, PoseReport, ScaleReport, StageReport, by_reason, check_poses, doctor,
-    is_capture, is_film_name, is_posed_here, pose,
+    PoseCheck, PoseInput, PoseProgress, PoseReport, PosesBy, ScaleReport, StageReport, by_reason, check_poses, doctor,
+    is_capture, is_film_name, pose, poses_by,
 };
 pub use protocol::Protocol;
 pub use provenance::{data_fingerprint, program_fingerprint};

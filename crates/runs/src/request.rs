@@ -445,6 +445,10 @@ impl TrainRequest {
 
     /// Sets the background that is usual for the photographs, if neither the input nor its overrides of the recipe set one.
     pub(crate) fn choose_background(&mut self, dataset: &Dataset) -> Result<(), RunError> {
+        if self.input.replay.is_some() && self.input.background.is_none() {
+            // The recipe of the run to repeat has it.
+            return Ok(());
+        }
         let is_set = self
             .input
             .set
@@ -474,6 +478,17 @@ impl TrainRequest {
                 "{} has no splats to begin with",
                 path.display()
             )));
+        }
+        if let Some(most) = self.input.max_splats.filter(|most| *most < cloud.len()) {
+            return Err(RunError::setting(
+                "max_splats",
+                most,
+                format!(
+                    "{} has {} splats: reduce it first: irradia edit {0} -o fewer.ply \"reduce count={most}\"",
+                    path.display(),
+                    cloud.len()
+                ),
+            ));
         }
         cloud.bring_to_world(dataset.world_from_dataset);
         cloud.set_degree(sh::MAX_DEGREE);

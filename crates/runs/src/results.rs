@@ -1,10 +1,11 @@
 //! The results of a finished run: its scene, the held-out views, and the report.
 
 use crate::folder::{FIELD, SCENE, to_json};
+use crate::levels::write_scene;
 use crate::request::has_perceptual_loss;
 use crate::{Run, RunError, RunFolder, evaluate, file_stems, unmeasured};
 use irradia_compute::Level;
-use irradia_formats::{write_png, write_splats};
+use irradia_formats::{WriteOptions, write_png};
 use irradia_measure::{Lpips, Networks};
 use irradia_scene::{Image, sh};
 use irradia_train::Trainer;
@@ -30,7 +31,7 @@ impl Run {
                 let mut cloud = splats.to_cloud();
                 cloud.antialiased = self.trainer.recipe.render.antialias;
                 cloud.world_from_dataset = self.trainer.dataset.world_from_dataset;
-                write_splats(&folder.file(SCENE), &cloud)?;
+                write_scene(&folder.file(SCENE), &cloud, &WriteOptions::default())?;
                 for (name, bytes) in self.trainer.sockets.files() {
                     folder.write(&name, &bytes)?;
                 }

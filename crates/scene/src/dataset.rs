@@ -277,6 +277,9 @@ impl Dataset {
         for view in &mut self.views {
             moved(&mut view.camera.pose.position);
             view.depth_bounds = view.depth_bounds.map(|bounds| bounds.map(|depth| depth * factor));
+            if let Some(shutter) = &mut view.camera.shutter {
+                shutter.translation *= factor;
+            }
         }
         self.points
             .iter_mut()

@@ -43,7 +43,7 @@ impl Trainer {
         let plan = plan(&self.recipe, &self.clock);
         let mut errors = Vec::with_capacity(self.trained.len());
         self.show_training_views(self.trained.len(), &plan, false, |trainer, view, photo| {
-            errors.push((view, [trainer.error_of_frame(photo), trainer.trimmed_error()]));
+            errors.push((view, trainer.errors_of_frame(photo)));
         })?;
         Ok(errors)
     }

@@ -9,6 +9,7 @@ pub(crate) mod tests;
 pub use edited::{splats_of, with_splats};
 
 use crate::field_file;
+use crate::first_splats::first_count;
 use crate::recipe::{Choice, Recipe};
 use crate::schedule::{Clock, ConvergenceMonitor};
 use crate::socket::Exposure;
@@ -345,6 +346,7 @@ pub fn from_bytes(bytes: &[u8], dataset: Arc<Dataset>, options: TrainOptions) ->
     };
     let carried = carried::read(&file, unnamed)?;
     let mut trainer = Trainer::unfilled(dataset, recipe, TrainOptions { seed, ..options }, state.len())?;
+    trainer.splats_at_first = first_count(&trainer.dataset, &trainer.recipe).min(state.len());
     *trainer.engine.state_mut() = state;
     let tensors = |prefix| TensorSource::new(&file, prefix);
     if tensors(FIELD).whole("whole").is_some() {

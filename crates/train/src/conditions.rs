@@ -18,6 +18,7 @@ use crate::first_splats::has_points;
 use crate::normal_maps::NormalMaps;
 use crate::recipe::{Param, Params};
 use crate::robust::median;
+use crate::schedule::Clock;
 use crate::trainer::{TrainError, Trainer};
 use glam::Vec3;
 use irradia_scene::{Photo, View};
@@ -199,6 +200,8 @@ impl Trainer {
         self.tell_shutters();
         self.settle_spacing();
         self.settle_maps();
+        // It carries the values of parameters from stage to stage.
+        self.clock = Clock::new(&self.recipe);
         Ok(())
     }
 
@@ -251,15 +254,22 @@ impl Trainer {
         train.any(|view| self.dataset.views[*view].camera.intrinsics.lens.is_wide())
     }
 
-    fn settle_spacing(&mut self) {
-        if self.recipe.sparse_visits == 0 {
-            return;
+    /// Steps for each training photograph that a run without a number of steps has at most, 0 for any: the recipe's `sparse_visits`, and more of closer photographs.
+    pub(crate) fn most_visits(&self) -> u64 {
+        let (visits, spacing) = (self.recipe.sparse_visits, self.spacing.to_degrees());
+        if visits == 0 || spacing >= SPARSE {
+            return visits;
         }
+        let own = self
+            .recipe
+            .total_steps()
+            .div_ceil(self.dataset.train.len().max(1) as u64);
+        own.max((visits as f64 * SPARSE / spacing.max(CLOSEST)) as u64)
+    }
+
+    fn settle_spacing(&mut self) {
         let spacing = self.spacing.to_degrees();
-        if spacing < SPARSE {
-            let visits = self.recipe.sparse_visits as f64 * SPARSE / spacing.max(CLOSEST);
-            let own = self.recipe.total_steps().div_ceil(self.dataset.train.len() as u64);
-            self.recipe.sparse_visits = own.max(visits as u64);
+        if self.recipe.sparse_visits == 0 || spacing < SPARSE {
             return;
         }
         let (total, least) = (self.total_steps(), self.least_pace());

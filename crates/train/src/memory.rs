@@ -234,15 +234,35 @@ pub fn free() -> Option<usize> {
         let line = text.lines().find_map(|line| line.strip_prefix("MemAvailable:"))?;
         Some(1024 * line.trim().strip_suffix("kB")?.trim().parse::<u64>().ok()?)
     })?;
+    // Files in the page cache count as used there, and give way.
+    let cached = || inactive_files(&read("/sys/fs/cgroup/memory.stat")?);
     let group = number("/sys/fs/cgroup/memory.max")
         .zip(number("/sys/fs/cgroup/memory.current"))
-        .map_or(u64::MAX, |(most, used)| most.saturating_sub(used));
+        .map_or(u64::MAX, |(most, used)| {
+            most.saturating_sub(used.saturating_sub(cached().unwrap_or(0)))
+        });
     usize::try_from(system.min(group)).ok()
+}
+
+/// Bytes of the file cache that a control group gives up first, by its `memory.stat`.
+fn inactive_files(stat: &str) -> Option<u64> {
+    stat.lines()
+        .find_map(|line| line.strip_prefix("inactive_file "))?
+        .trim()
+        .parse()
+        .ok()
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn the_file_cache_of_a_control_group_is_read() {
+        let stat = "anon 1000\nfile 9000\ninactive_file 4096\nactive_file 4904\n";
+        assert_eq!(inactive_files(stat), Some(4096));
+        assert_eq!(inactive_files("anon 1000\n"), None);
+    }
 
     const GIB: usize = 1 << 30;
 

@@ -241,19 +241,19 @@ impl Objective {
         }
     }
 
-    /// The mean of the result of [`Objective::error`].
-    pub fn mean_error(&self) -> f64 {
-        self.error.iter().map(|e| f64::from(*e)).sum::<f64>() / self.error.len().max(1) as f64
-    }
-
-    /// The mean of the result of [`Objective::error`] over the [`TRIMMED`] best pixels.
-    pub fn trimmed_error(&self) -> f64 {
-        let mut errors = self.error.clone();
-        let count = (errors.len() as f32 * TRIMMED) as usize;
-        if count < errors.len() {
-            errors.select_nth_unstable_by(count, f32::total_cmp);
+    /// The mean of the result of [`Objective::error`] over the pixels of `photo` that are neither masked nor transparent, and over the [`TRIMMED`] best of
+    /// them; 0 without any.
+    pub fn mean_errors(&self, photo: &Prepared) -> [f64; 2] {
+        let shown = |plane: &Option<Vec<u8>>, at: usize| plane.as_ref().is_none_or(|values| values[at] != 0);
+        let counts = |at: &usize| shown(&photo.mask, *at) && shown(&photo.alpha, *at);
+        let mut errors: Vec<f32> = (0..self.error.len()).filter(counts).map(|at| self.error[at]).collect();
+        let mean = |errors: &[f32]| errors.iter().map(|e| f64::from(*e)).sum::<f64>() / errors.len().max(1) as f64;
+        let all = mean(&errors);
+        let best = (errors.len() as f32 * TRIMMED) as usize;
+        if best < errors.len() {
+            errors.select_nth_unstable_by(best, f32::total_cmp);
         }
-        errors[..count].iter().map(|e| f64::from(*e)).sum::<f64>() / count.max(1) as f64
+        [all, mean(&errors[..best])]
     }
 
     /// The gradient of the colour last evaluated, `[3, H, W]`, for components between it and the scene's colour.
@@ -392,6 +392,32 @@ mod tests {
             None,
             "alpha shows what is empty"
         );
+    }
+
+    #[test]
+    fn errors_are_those_of_what_a_photograph_shows() {
+        let photo = Prepared {
+            width: 4,
+            height: 2,
+            rgb: vec![0; 24],
+            alpha: Some(vec![255, 255, 255, 255, 255, 255, 255, 0]),
+            mask: Some(vec![255, 255, 255, 255, 0, 0, 0, 255]),
+            background: [0.0; 3],
+        };
+        let mut objective = Objective::new(None);
+        let errors = [0.1, 0.1, 0.1, 0.9, 0.7, 0.7, 0.7, 0.7];
+        objective.error(&[errors; 3].concat(), &photo, false);
+        let near = |got: [f64; 2], wanted: [f64; 2]| got.iter().zip(wanted).all(|(a, b)| (a - b).abs() < 1e-6);
+        assert!(
+            near(objective.mean_errors(&photo), [0.3, 0.1]),
+            "{:?}",
+            objective.mean_errors(&photo)
+        );
+        let hidden = Prepared {
+            mask: Some(vec![0; 8]),
+            ..photo
+        };
+        assert_eq!(objective.mean_errors(&hidden), [0.0; 2]);
     }
 
     #[test]

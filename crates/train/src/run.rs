@@ -2,7 +2,6 @@
 
 use crate::eval::{EvalOptions, Metrics, evaluate_views, mean};
 use crate::event::{Event, Observer, Signal, StepReport};
-use crate::first_splats::first_count;
 use crate::forecast::{self, Forecast};
 use crate::half_fit::HalfFit;
 use crate::paces::Paces;
@@ -169,7 +168,7 @@ pub fn run(
 
 /// What became of the first splats, where a run ends with fewer: a warning where hardly any are left.
 fn fewer_than_at_first(trainer: &Trainer) -> Option<Event> {
-    let (first, last) = (first_count(&trainer.dataset, &trainer.recipe), trainer.engine.len());
+    let (first, last) = (trainer.splats_at_first, trainer.engine.len());
     if trainer.field.is_some() || !trainer.finished() || last >= first {
         return None;
     }

@@ -195,7 +195,7 @@ impl Trainer {
         let (mut sum, mut count) = (0.0, 0);
         self.show_training_views(MEASURED_VIEWS, plan, false, |trainer, view, photo| {
             let shown = trainer.hidden.apply(view, &trainer.dataset.views[view].camera, photo);
-            sum += trainer.error_of_frame(shown.as_ref().unwrap_or(photo));
+            sum += trainer.errors_of_frame(shown.as_ref().unwrap_or(photo))[0];
             count += 1;
         })?;
         Ok(sum / f64::from(count.max(1)))
@@ -209,7 +209,7 @@ impl Trainer {
         if let Some(ceiling) = plan.reset_opacity {
             self.engine.edit_density(|state| classic::reset_opacity(state, ceiling));
         }
-        if change.is_some() && self.recipe.render.smoothing_filter {
+        if (change.is_some() || merged.is_some()) && self.recipe.render.smoothing_filter {
             self.update_filter();
         }
         match (change, merged) {

@@ -167,6 +167,8 @@ pub struct Trainer {
     /// Steps of this process whose frames were read back from a GPU for their losses.
     pub(crate) read_for_losses: u64,
     pub(crate) free_space: FreeSpace,
+    /// Splats before the first step, or, if fewer, before the first since the run was resumed: edits may have removed some.
+    pub(crate) splats_at_first: usize,
     /// Angle between adjacent training photographs, radians.
     pub(crate) spacing: f64,
     /// What sparse photographs show; absent if the recipe has no free space.
@@ -270,6 +272,7 @@ impl Trainer {
             device_loss: DeviceLoss::new(&options.device)?,
             read_for_losses: 0,
             free_space: FreeSpace::new(&dataset, recipe.free_space),
+            splats_at_first: first_splats,
             spacing,
             surroundings: (recipe.free_space > 0.0)
                 .then(|| Surroundings::new(&dataset, spacing))
@@ -329,7 +332,7 @@ impl Trainer {
 
     /// The least pace of a run without a given number of steps: the recipe's limit on visits.
     pub(crate) fn least_pace(&self) -> f64 {
-        match self.recipe.sparse_visits {
+        match self.most_visits() {
             0 => 0.0,
             visits => {
                 let total = self.recipe.total_steps();
@@ -435,16 +438,11 @@ impl Trainer {
         }
     }
 
-    /// Mean L1 error of the last frame against its photograph.
-    pub(crate) fn error_of_frame(&mut self, photo: &Prepared) -> f64 {
+    /// The mean L1 error of the last frame against its photograph, where this shows something, and that of the pixels that fit best.
+    pub(crate) fn errors_of_frame(&mut self, photo: &Prepared) -> [f64; 2] {
         let color = self.sockets.frame_color(&self.engine);
         self.objective.error(color, photo, false);
-        self.objective.mean_error()
-    }
-
-    /// As [`Self::error_of_frame`] was last called, of the pixels that fit best.
-    pub(crate) fn trimmed_error(&self) -> f64 {
-        self.objective.trimmed_error()
+        self.objective.mean_errors(photo)
     }
 
     /// Renders at most `most` training views, evenly spaced, as the plan does, with `depth` if asked for, and passes each with its

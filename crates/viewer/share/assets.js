@@ -19,9 +19,20 @@ export const openMask = async () => null;
 
 /** The scene in compact form. @param {AbortSignal} signal */
 export async function openSplats(signal) {
-  const packed = view.file ? (await fetch(view.file, { signal })).body : inside("splats");
-  if (!packed) throw new Error("the scene is not beside the page");
-  return unzipped(packed);
+  return view.file ? fetched(view.file, signal) : unzipped(inside("splats"));
+}
+
+/** The unpacked file beside the page. @param {string} file @param {AbortSignal} signal */
+async function fetched(file, signal) {
+  const response = await fetch(file, { signal }).catch((error) => {
+    if (error.name === "AbortError") throw error;
+    return null;
+  });
+  if (!response?.ok) throw new Error(`${file} cannot be loaded: serve this folder, with all its files, by a web server, or share the scene as one page`);
+  const bytes = await response.blob();
+  const start = new Uint8Array(await bytes.slice(0, 2).arrayBuffer());
+  // Some servers say how it is packed, and the browser has unpacked it.
+  return start[0] === 0x1f && start[1] === 0x8b ? unzipped(bytes.stream()) : new Response(bytes.stream());
 }
 
 /** What the page holds in base64. @param {string} id */

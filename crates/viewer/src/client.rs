@@ -1,5 +1,6 @@
 //! The socket of one page: its requests to the desk, pictures and news to the page.
 
+use crate::Subject;
 use crate::desk::{Out, SEATS, Task};
 use crate::live::Known;
 use crate::message::Request;
@@ -237,7 +238,8 @@ fn handle(shared: &Shared, seat: u64, message: Message, allowance: &mut Allowanc
             }
         }
         Request::Unit { metres } => {
-            let kept = subject.folder.as_ref().map(|folder| folder.set_metres_per_unit(metres));
+            let folder = subject.folder.as_ref();
+            let kept = folder.map(|folder| folder.set_metres_per_unit(metres * scale_of(subject)));
             let told = match kept {
                 Some(Ok(())) => json!({ "tell": "unit", "metres": metres }),
                 Some(Err(error)) => json!({ "tell": "problem", "text": error.to_string() }),
@@ -247,6 +249,11 @@ fn handle(shared: &Shared, seat: u64, message: Message, allowance: &mut Allowanc
         }
     }
     Handled::Fine
+}
+
+/// By how much edits have scaled the whole scene: the unit of its run is that before.
+fn scale_of(subject: &Subject) -> f64 {
+    subject.edition().map_or(1.0, |edition| edition.placement.scale)
 }
 
 /// What a page is told first.
@@ -261,7 +268,8 @@ fn hello(shared: &Shared) -> Value {
         "live": subject.live.is_some(),
         "plan": subject.live.as_ref().map(|live| live.plan()),
         "recipe": subject.recipe,
-        "metres": subject.folder.as_ref().and_then(|folder| folder.metres_per_unit()),
+        "id": shared.id,
+        "metres": subject.folder.as_ref().and_then(|folder| folder.metres_per_unit()).map(|metres| metres / scale_of(subject)),
         "keeps_unit": subject.folder.is_some(),
         "warnings": subject.warnings,
         "editing": { "works": subject.editing.is_ok(), "why": subject.editing.as_ref().err() },

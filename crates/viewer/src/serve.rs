@@ -26,7 +26,7 @@ use irradia_scene::Photo;
 use serde_json::json;
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, PoisonError};
-use std::time::Duration;
+use std::time::{Duration, SystemTime};
 use tokio::sync::Semaphore;
 use tokio::time::timeout;
 
@@ -48,6 +48,8 @@ const POLICY: &str = "default-src 'self'; img-src 'self' blob: data:; style-src 
 
 /// What all requests share.
 pub(crate) struct Shared {
+    /// Of this server: what a browser keeps of another one at the same address is of another scene.
+    pub id: String,
     pub subject: Subject,
     pub desk: Desk,
     pub guard: Guard,
@@ -65,9 +67,16 @@ pub(crate) struct Shared {
     uploading: Semaphore,
 }
 
+/// When the server began, nanoseconds.
+fn started() -> String {
+    let since = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH);
+    since.map_or(0, |since| since.as_nanos()).to_string()
+}
+
 impl Shared {
     pub fn new(subject: Subject, guard: Guard, notices: Arc<Notices>) -> Self {
         Self {
+            id: started(),
             subject,
             desk: Desk::default(),
             guard,

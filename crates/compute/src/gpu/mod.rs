@@ -189,7 +189,10 @@ impl Gpu {
             Wanted::Any => info.is_usable,
             Wanted::Named(name) => info.name.to_lowercase().contains(&name.to_lowercase()),
         };
-        let Some((adapter, info)) = list().into_iter().find(|(_, info)| is_wanted(info)) else {
+        let mut found: Vec<_> = list().into_iter().filter(|(_, info)| is_wanted(info)).collect();
+        // Of several of one name one that can be used.
+        found.sort_by_key(|(_, info)| !info.is_usable);
+        let Some((adapter, info)) = found.into_iter().next() else {
             return Err(DeviceError::None(match wanted {
                 Wanted::Real => "was found".to_owned(),
                 Wanted::Any => "was found; Mesa's software Vulkan would do (mesa-vulkan-drivers)".to_owned(),

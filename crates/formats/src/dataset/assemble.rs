@@ -45,7 +45,7 @@ impl Skipped {
 
     fn because(self) -> &'static str {
         match self {
-            Self::MissingImage => "have no image file",
+            Self::MissingImage => "have no image file (--images names the folder of the photographs)",
             Self::UnreadableImage => "have an image file that cannot be read",
             Self::NoPose => "have a pose that is not finite or not a rotation",
             Self::NoCamera => "have intrinsics that are not finite, not positive or leave no image after undistortion",

@@ -72,12 +72,25 @@ impl Beside {
     }
 }
 
+/// Gives views without masks those that lie in `masks` below the dataset's folder.
+pub(super) fn find_masks(declared: &mut Declared) {
+    let Some(masks) = Beside::masks(&declared.root, "images") else {
+        return;
+    };
+    for view in declared.views.iter_mut().filter(|view| view.mask.is_none()) {
+        view.mask = masks.of(&view.name).or_else(|| masks.of(view.name_below()));
+    }
+    let masked = declared.views.iter().filter(|view| view.mask.is_some()).count();
+    let warning = masks.mask_warning(declared.views.len(), masked);
+    declared.warnings.extend(warning);
+}
+
 /// Gives views the maps of depth and of normals that lie below the dataset's folder, if its files declare none.
 pub(super) fn find_maps(declared: &mut Declared) {
     let depths = Beside::depths(&declared.root).filter(|_| declared.views.iter().all(|view| view.depth.is_none()));
     let normals = Beside::normals(&declared.root).filter(|_| declared.views.iter().all(|view| view.normals.is_none()));
     for view in &mut declared.views {
-        let find = |maps: &Beside| maps.of(view.name_below()).or_else(|| maps.of(&view.name));
+        let find = |maps: &Beside| maps.of(&view.name).or_else(|| maps.of(view.name_below()));
         let [depth, normals] = [&depths, &normals].map(|maps| maps.as_ref().and_then(find));
         view.depth = view.depth.take().or(depth);
         view.normals = view.normals.take().or(normals);

@@ -47,6 +47,17 @@ fn begins_as_a_bundle(file: &Path) -> bool {
     super::files::begins_with(file, |start| start.starts_with(b"# Bundle file"))
 }
 
+/// The name in a line of a list, which may have a focal length and other numbers behind it.
+fn name_in(line: &str) -> &str {
+    let mut name = line.trim();
+    while let Some((before, last)) = name.rsplit_once(char::is_whitespace)
+        && last.parse::<f64>().is_ok()
+    {
+        name = before.trim_end();
+    }
+    name
+}
+
 pub(super) fn read(path: &Path, downscale: f32) -> Result<Declared, FormatError> {
     let file = find(path).ok_or_else(|| FormatError::malformed(path, "contains no bundle.out"))?;
     let bundle = read_and_parse(&file, parse_bundle)?;
@@ -65,9 +76,8 @@ pub(super) fn read(path: &Path, downscale: f32) -> Result<Declared, FormatError>
         return Err(FormatError::malformed(&file, message));
     };
     let names = read_and_parse(&list, |bytes| {
-        // A line may have a focal length behind the name.
-        let first = |line: &str| line.split_whitespace().next().map(str::to_owned);
-        Ok(text(bytes)?.lines().filter_map(first).collect::<Vec<String>>())
+        let names = text(bytes)?.lines().map(name_in).filter(|name| !name.is_empty());
+        Ok(names.map(str::to_owned).collect::<Vec<String>>())
     })?;
     if names.len() != bundle.cameras.len() {
         let (cameras, names) = (bundle.cameras.len(), names.len());

@@ -320,6 +320,13 @@ pub fn read_dataset(path: &Path, options: &DatasetOptions) -> Result<Dataset, Fo
     if let Some(folder) = &options.images {
         images::relocate(&mut declared, folder, options.downscale)?;
     }
+    // The other readers know in which folder theirs lie.
+    if !matches!(
+        format,
+        DatasetFormat::Colmap | DatasetFormat::Nerfstudio | DatasetFormat::Llff | DatasetFormat::Blender
+    ) {
+        beside::find_masks(&mut declared);
+    }
     // Those of rendered scenes are the truth to compare with.
     match format {
         DatasetFormat::Blender => {

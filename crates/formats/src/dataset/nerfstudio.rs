@@ -10,8 +10,17 @@ use crate::points_ply::read_declared_points;
 use std::collections::HashSet;
 use std::path::{Path, PathBuf};
 
+/// Files of other programs, which may be named themselves.
+const OF_OTHERS: [&str; 3] = ["reconstruction.json", "metadata.json", "dataset.json"];
+
 /// The JSON file: `path` itself, or `transforms.json` in it.
 pub(super) fn find(path: &Path) -> Option<PathBuf> {
+    if path
+        .file_name()
+        .is_some_and(|name| OF_OTHERS.iter().any(|other| name == *other))
+    {
+        return None;
+    }
     let is_json = path
         .extension()
         .is_some_and(|extension| extension.eq_ignore_ascii_case("json"));
@@ -38,13 +47,13 @@ pub(super) fn read(path: &Path, downscale: f32) -> Result<Declared, FormatError>
     let masks = Beside::masks(&root, "images");
     if let Some(masks) = &masks {
         for view in views.iter_mut().filter(|view| view.mask.is_none()) {
-            view.mask = masks.of(view.name_below());
+            view.mask = masks.of(&view.name).or_else(|| masks.of(view.name_below()));
         }
         let masked = views.iter().filter(|view| view.mask.is_some()).count();
         warnings.extend(masks.mask_warning(views.len(), masked));
     }
     let points = transforms.ply_file_path.as_ref().and_then(|ply| {
-        let read = read_declared_points(&root.join(ply));
+        let read = read_declared_points(&root.join(ply.replace('\\', "/")));
         read.map_err(|error| warnings.push(format!("the initial points are ignored: {error}")))
             .ok()
     });
@@ -65,8 +74,8 @@ fn missing_files(frames: &[Frame], views: &[DeclaredView]) -> Vec<String> {
     type Found = fn(&DeclaredView) -> &Option<PathBuf>;
     let kinds: [(&str, Named, Found); 3] = [
         ("masks", |frame| &frame.mask_path, |view| &view.mask),
-        ("maps of depth", |frame| &frame.depth_file_path, |view| &view.depth),
-        ("maps of normals", |frame| &frame.normal_file_path, |view| &view.normals),
+        ("maps of depth", Frame::depth, |view| &view.depth),
+        ("maps of normals", Frame::normals, |view| &view.normals),
     ];
     let line = |(what, named, found): (&str, Named, Found)| {
         let lacks = |(frame, view)| named(frame).as_ref().filter(|_| found(view).is_none());
@@ -132,8 +141,8 @@ pub(super) fn declared_views(
                 name: relative_name(root, image.as_deref().unwrap_or(&path)),
                 image,
                 mask: beside(&frame.mask_path),
-                depth: beside(&frame.depth_file_path),
-                normals: beside(&frame.normal_file_path),
+                depth: beside(frame.depth()),
+                normals: beside(frame.normals()),
                 pose: frame.pose(),
                 camera,
                 depth_bounds: None,

@@ -2,7 +2,8 @@
 //!
 //! Focal lengths are those of a film 36 mm wide, which is the longer side of the image. Angles of the CSV, in degrees, turn a camera
 //! that looks along -Z with Y up: roll about Y, pitch about X, then the negative heading about Z (nerfstudio's
-//! `realitycapture_utils.py`). An XMP has camera-from-world with OpenCV axes.
+//! `realitycapture_utils.py`). An XMP has camera-from-world with OpenCV axes. The tangential coefficients t1 and t2 are OpenCV's p2 and
+//! p1, as in the program's own template of an export for OpenCV, and in AliceVision's import.
 
 use super::declared::{Declared, DeclaredCamera, DeclaredPose, DeclaredView, Focal, lens_or_pinhole, pose_from_axes};
 use super::files::{begins_with, first_file, is_image_name, list_files, locate_image, relative_name};
@@ -20,6 +21,8 @@ use std::path::{Path, PathBuf};
 const FILM: f64 = 36.0;
 /// Where the photographs are, relative to the file.
 const FOLDERS: [&str; 3] = ["images", "", "../images"];
+/// What an XMP with a pose holds.
+const POSE: &[u8] = b"xcr:Rotation";
 /// How the CSV begins.
 const FIRST_COLUMNS: &[u8] = b"#name,x,y,alt,heading,pitch,roll";
 
@@ -59,7 +62,8 @@ pub(super) fn find(path: &Path) -> Option<Source> {
     if let Some(file) = first_file(path, is_table) {
         return Some(Source::Csv(file));
     }
-    let has_camera = |start: &[u8]| start.windows(5).any(|word| word == b"xcr:R" || word == b"xcr:V");
+    // Others have a calibration alone.
+    let has_camera = |start: &[u8]| start.windows(POSE.len()).any(|word| word == POSE);
     [path.to_owned(), path.join("images")].into_iter().find_map(|folder| {
         let images = list_files(&folder, is_image_name).ok()?;
         let posed: Vec<PathBuf> = images
@@ -174,7 +178,7 @@ pub fn parse_realitycapture_csv(bytes: &[u8]) -> Result<Vec<RealityCaptureView>,
             focal: number("f")? / FILM,
             offset: [optional("px")? / FILM, optional("py")? / FILM],
             k: [optional("k1")?, optional("k2")?, optional("k3")?],
-            p: [optional("t1")?, optional("t2")?],
+            p: [optional("t2")?, optional("t1")?],
         });
     }
     Ok(rows)
@@ -215,6 +219,6 @@ pub fn parse_realitycapture_xmp(bytes: &[u8]) -> Result<RealityCaptureView, Malf
             one("xcr:PrincipalPointV").unwrap_or(0.0),
         ],
         k: [k(0), k(1), k(2)],
-        p: [k(4), k(5)],
+        p: [k(5), k(4)],
     })
 }

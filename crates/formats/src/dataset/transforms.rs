@@ -36,12 +36,14 @@ pub struct Frame {
     pub transform_matrix: Vec<Vec<Option<f64>>>,
     /// The mask, relative to the file; white is kept.
     pub mask_path: Option<String>,
-    /// A map of depths, relative to the file; `depth_path` in files for instant-ngp.
-    #[serde(alias = "depth_path")]
+    /// A map of depths, relative to the file.
     pub depth_file_path: Option<String>,
+    /// The same in files for instant-ngp.
+    pub depth_path: Option<String>,
     /// A map of normals, relative to the file.
-    #[serde(alias = "normal_path")]
     pub normal_file_path: Option<String>,
+    /// The same under another name.
+    pub normal_path: Option<String>,
     /// Time of capture (D-NeRF: 0 to 1 over the capture).
     pub time: Option<f64>,
     /// Velocity of the camera along its own OpenGL axes, per second (this key and the next: "Gaussian Splatting on the Move").
@@ -51,6 +53,22 @@ pub struct Frame {
     /// Intrinsics of this frame only.
     #[serde(flatten)]
     pub camera: CameraKeys,
+}
+
+impl Frame {
+    /// The map of depths, under either name.
+    pub fn depth(&self) -> &Option<String> {
+        either(&self.depth_file_path, &self.depth_path)
+    }
+
+    /// The map of normals, under either name.
+    pub fn normals(&self) -> &Option<String> {
+        either(&self.normal_file_path, &self.normal_path)
+    }
+}
+
+fn either<'a>(first: &'a Option<String>, second: &'a Option<String>) -> &'a Option<String> {
+    if first.is_some() { first } else { second }
 }
 
 /// The keys of a camera's intrinsics; global or in a frame.
@@ -321,7 +339,9 @@ mod tests {
             transform_matrix: rows.map(|row| row.map(Some).to_vec()).to_vec(),
             mask_path: None,
             depth_file_path: None,
+            depth_path: None,
             normal_file_path: None,
+            normal_path: None,
             time: None,
             camera_linear_velocity: None,
             camera_angular_velocity: None,

@@ -99,6 +99,10 @@ fn gps(exif: &Exif) -> Option<[f64; 3]> {
     };
     let latitude = angle(Tag::GPSLatitude, Tag::GPSLatitudeRef, "S").filter(|v| v.abs() <= 90.0)?;
     let longitude = angle(Tag::GPSLongitude, Tag::GPSLongitudeRef, "W").filter(|v| v.abs() <= 180.0)?;
+    if latitude == 0.0 && longitude == 0.0 {
+        // In the sea: some cameras write it before they know their place.
+        return None;
+    }
     let below = number(exif, Tag::GPSAltitudeRef) == Some(1.0);
     let altitude = number(exif, Tag::GPSAltitude).unwrap_or(0.0);
     Some([latitude, longitude, if below { -altitude } else { altitude }])

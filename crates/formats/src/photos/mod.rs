@@ -6,7 +6,7 @@ mod panorama;
 
 use crate::dataset::{Beside, is_image_name, list_files, oriented_size, turned_as_stored};
 use crate::error::read_file;
-use crate::image_file::{Colour, decode, decode_jpeg_at, read_header, read_metadata};
+use crate::image_file::{Colour, decode, decode_jpeg_at, decode_mask, read_header, read_metadata};
 use crate::{FormatError, Pixels};
 pub use exif::{CameraTags, parse_camera_tags};
 pub use gimbal::parse_gimbal;
@@ -85,6 +85,21 @@ impl PhotoEntry {
         })
     }
 
+    /// The same photograph without its mask.
+    ///
+    /// # Errors
+    /// When the file of the mask cannot be read.
+    pub fn without_mask(&self) -> Result<Self, FormatError> {
+        let Some(mask) = &self.mask else {
+            return Ok(self.clone());
+        };
+        Ok(Self {
+            hash: self.hash ^ mask_hash(mask)?,
+            mask: None,
+            ..self.clone()
+        })
+    }
+
     /// The mask at `width` x `height`, 0 where the photograph does not count; `None` if it has none.
     ///
     /// # Errors
@@ -92,7 +107,7 @@ impl PhotoEntry {
     pub fn read_mask(&self, width: u32, height: u32) -> Result<Option<Vec<u8>>, FormatError> {
         let Some(path) = &self.mask else { return Ok(None) };
         let orientation = read_header(path)?.turned_with(self.orientation, (self.width, self.height));
-        let mask = decode(path, orientation, Colour::Grey)?;
+        let mask = decode_mask(path, orientation)?;
         Ok(Some(resize_area(
             &mask.data,
             1,

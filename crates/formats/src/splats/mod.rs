@@ -546,6 +546,10 @@ fn write_folder(meta: &Path, cloud: &GaussianCloud, options: &WriteOptions) -> R
     if let Some(folder) = meta.parent().filter(|folder| !folder.as_os_str().is_empty()) {
         fs::create_dir_all(folder).map_err(failed)?;
     }
+    // Without it the folder is no scene, rather than one whose images are of two.
+    if meta.exists() {
+        fs::remove_file(meta).map_err(failed)?;
+    }
     for (name, content) in files {
         write_atomic(&meta.with_file_name(name), |out| out.write_all(&content))?;
     }

@@ -14,7 +14,7 @@ use irradia_runs::{
     write_image,
 };
 use serde_json::json;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 #[derive(clap::Args)]
 pub struct Args {
@@ -96,7 +96,7 @@ pub fn run(args: &Args) -> Result<()> {
     }
     let dataset = scene.place(reading.read(&args.data)?);
     let background = match (args.background, &run) {
-        (None, None) => Background::usual(&dataset, false)?,
+        (None, None) if !has_background(&args.scene) => Background::usual(&dataset, false)?,
         (given, _) => given,
     };
     if let Some(background) = background {
@@ -158,7 +158,7 @@ pub fn run(args: &Args) -> Result<()> {
     say(figures(&format!("mean of {}", rows.len()), &mean, nets))?;
     if let Some(path) = &args.json {
         let figures = json!({
-            "scene": scene_of(&args.scene), "data": args.data,
+            "scene": scene_of(&args.scene).to_string_lossy(), "data": args.data.to_string_lossy(),
             "splats": scene.model.splats().map(|splats| splats.len()),
             "parameters": scene.model.field().map(|field| field.len()),
             "psnr": mean.psnr, "psnr_corrected": mean.psnr_corrected, "ssim": mean.ssim, "lpips": mean.lpips, "lpips_net": nets[0].map(LpipsNet::name),
@@ -169,6 +169,11 @@ pub fn run(args: &Args) -> Result<()> {
         write_atomic(path, |out| out.write_all(&bytes))?;
     }
     Ok(())
+}
+
+/// Whether a recipe beside `scene`, as of an edited run, says what is behind it.
+fn has_background(scene: &Path) -> bool {
+    scene_of(scene).with_file_name("recipe.toml").is_file()
 }
 
 /// One line of figures.

@@ -48,15 +48,17 @@ const GIF_SPEED: i32 = 10;
 pub struct FilmWriter {
     path: PathBuf,
     unfinished: PathBuf,
-    encoder: Encoder,
+    /// `None` once it has ended.
+    encoder: Option<Encoder>,
 }
 
 enum Encoder {
     Ffmpeg(Child),
     Gif {
         encoder: Box<gif::Encoder<BufWriter<File>>>,
-        /// Hundredths of a second.
-        delay: u16,
+        fps: f32,
+        /// Written so far.
+        frames: u32,
     },
 }
 
@@ -79,21 +81,27 @@ impl FilmWriter {
         Ok(Self {
             path: path.to_owned(),
             unfinished,
-            encoder,
+            encoder: Some(encoder),
         })
     }
 
     /// Adds a frame.
     pub fn add(&mut self, image: &Image) -> Result<()> {
         let rgb = image.to_u8();
-        match &mut self.encoder {
+        match self.encoder.as_mut().context("the film has ended")? {
             Encoder::Ffmpeg(child) => {
                 let input = child.stdin.as_mut().context("ffmpeg takes no frames")?;
-                input.write_all(&rgb).context("ffmpeg has ended before the film")
+                // If it has ended before the film, it says why.
+                input
+                    .write_all(&rgb)
+                    .or_else(|error| self.end().and(Err(error).context("ffmpeg takes no more frames")))
             }
-            Encoder::Gif { encoder, delay } => {
+            Encoder::Gif { encoder, fps, frames } => {
                 let mut frame = gif::Frame::from_rgb_speed(image.width as u16, image.height as u16, &rgb, GIF_SPEED);
-                frame.delay = *delay;
+                // In whole hundredths of a second, which add up to the film's length; browsers slow down frames of less than two.
+                let ends = |frames: u32| (100.0 * frames as f32 / *fps).round() as u32;
+                frame.delay = (ends(*frames + 1) - ends(*frames)).clamp(2, u16::MAX.into()) as u16;
+                *frames += 1;
                 encoder
                     .write_frame(&frame)
                     .with_context(|| format!("cannot write {}", self.path.display()))
@@ -102,26 +110,39 @@ impl FilmWriter {
     }
 
     /// Completes the film.
-    pub fn finish(self) -> Result<()> {
-        match self.encoder {
-            Encoder::Ffmpeg(mut child) => {
+    pub fn finish(mut self) -> Result<()> {
+        self.end()?;
+        fs::rename(&self.unfinished, &self.path).with_context(|| format!("cannot write {}", self.path.display()))
+    }
+
+    /// Ends the encoder, which writes what is left.
+    fn end(&mut self) -> Result<()> {
+        let unwritten = || format!("cannot write {}", self.path.display());
+        match self.encoder.take() {
+            Some(Encoder::Ffmpeg(mut child)) => {
                 drop(child.stdin.take());
                 let output = child.wait_with_output().context("ffmpeg")?;
                 if !output.status.success() {
                     let said = String::from_utf8_lossy(&output.stderr);
-                    let last = said.lines().last().unwrap_or("no reason given").to_owned();
-                    // Best effort: the error is the one to report.
-                    let _ = fs::remove_file(&self.unfinished);
+                    let last = said.lines().last().unwrap_or("no reason given");
                     return Err(anyhow!("ffmpeg could not write {}: {last}", self.path.display()));
                 }
             }
-            Encoder::Gif { encoder, .. } => {
-                let mut file = encoder.into_inner().context("the GIF cannot be completed")?;
-                file.flush()
-                    .with_context(|| format!("cannot write {}", self.path.display()))?;
+            Some(Encoder::Gif { encoder, .. }) => {
+                let mut file = encoder.into_inner().with_context(unwritten)?;
+                file.flush().with_context(unwritten)?;
             }
+            None => {}
         }
-        fs::rename(&self.unfinished, &self.path).with_context(|| format!("cannot write {}", self.path.display()))
+        Ok(())
+    }
+}
+
+impl Drop for FilmWriter {
+    /// Removes what was not finished.
+    fn drop(&mut self) {
+        // Best effort: a finished film has another name by now.
+        let _ = fs::remove_file(&self.unfinished);
     }
 }
 
@@ -132,7 +153,8 @@ fn gif_encoder(path: &Path, width: u32, height: u32, fps: f32) -> Result<Encoder
     encoder.set_repeat(gif::Repeat::Infinite)?;
     Ok(Encoder::Gif {
         encoder: Box::new(encoder),
-        delay: (100.0 / fps).round().max(2.0) as u16,
+        fps,
+        frames: 0,
     })
 }
 

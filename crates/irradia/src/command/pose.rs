@@ -141,7 +141,14 @@ pub fn pose_again(input: &mut TrainInput, dataset: &Dataset, poses: Poses, anywa
     }
     input.reading.format = None;
     let file_name = |name: &str| name.rsplit('/').next().unwrap_or(name).to_owned();
-    let listed = dataset.views.iter().map(|view| file_name(&view.name)).collect();
+    let mut listed = HashSet::new();
+    if let Some(view) = dataset.views.iter().find(|view| !listed.insert(file_name(&view.name))) {
+        return Err(Usage(format!(
+            "several photographs are called {}, which tells held-out ones from others: train with --poses given, or rename them",
+            file_name(&view.name)
+        ))
+        .into());
+    }
     let report = pose_into_run(input, poses, Some(listed))?;
     let left_out: HashSet<&str> = report.left_out.iter().map(|left| left.name.as_str()).collect();
     let lost = |views: &[usize]| {

@@ -13,8 +13,8 @@ use clap::builder::RangedU64ValueParser;
 use irradia_compute::DeviceChoice;
 use irradia_runs::scene::Dataset;
 use irradia_runs::{
-    Background, DEFAULT_RECIPE, Finished, PoseCheck, Reading, Run, RunError, RunFolder, TrainInput, TrainRequest,
-    check_poses, is_posed_here,
+    Background, DEFAULT_RECIPE, Finished, PoseCheck, PosesBy, Reading, Run, RunError, RunFolder, TrainInput,
+    TrainRequest, check_poses, poses_by,
 };
 use irradia_train::event::Observer;
 use std::path::{Path, PathBuf};
@@ -199,7 +199,6 @@ pub fn run(args: &Args) -> Result<()> {
 fn replay(run: &Path, args: &Args) -> Result<TrainInput> {
     let out = args.out.clone().expect("required by clap");
     let mut input = placed_by(args, TrainInput::replay_of(run, out)?)?;
-    input.unseen_lpips = input.unseen_lpips.filter(|path| path.exists());
     input.overwrite = args.overwrite;
     Ok(input)
 }
@@ -213,6 +212,7 @@ fn placed_by(args: &Args, mut input: TrainInput) -> Result<TrainInput> {
     input.memory = args.memory.or(input.memory);
     input.device = args.device.clone().unwrap_or(input.device);
     input.lpips = lpips_for(input.lpips, args)?;
+    input.unseen_lpips = input.unseen_lpips.filter(|path| path.exists());
     Ok(input)
 }
 
@@ -260,7 +260,7 @@ fn with_poses(input: TrainInput, poses: Option<PosesOf>, anyway: bool) -> Result
         return read(again);
     }
     // Rendered scenes are exact, our own poses have been examined, and the splats of --from lie in the world of those given.
-    let is_sure = given.1.kind == "Blender" || is_posed_here(&input.data) || input.from.is_some();
+    let is_sure = given.1.kind == "Blender" || poses_by(&input.data) == Some(PosesBy::Irradia) || input.from.is_some();
     if poses.is_some() || is_sure {
         return Ok(given);
     }

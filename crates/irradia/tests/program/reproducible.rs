@@ -167,7 +167,12 @@ fn a_run_does_not_resume_on_other_data() {
 #[test]
 fn a_run_with_a_budget_is_repeated_bit_for_bit() {
     let folder = with_data();
-    irradia_with(folder.path(), "train data --out run --budget 2s --seed 5", &LIVELY).success();
+    irradia_with(
+        folder.path(),
+        "train data --out run --budget 2s --seed 5 --set render.background=[0.1,0.0,0.0]",
+        &LIVELY,
+    )
+    .success();
     irradia(folder.path(), "train --replay run --out again").success();
     let [run, again] = ["run", "again"].map(|name| folder.path().join(name));
     assert!(scene(&run) == scene(&again));
@@ -176,6 +181,8 @@ fn a_run_with_a_budget_is_repeated_bit_for_bit() {
     let paces = |run: &Path| std::fs::read_to_string(run.join("pace.txt")).expect("paces");
     assert_eq!(paces(&run), paces(&again), "a repeated run can be repeated");
     assert!(paces(&run).lines().count() > 10);
+    let recipe = |run: &Path| std::fs::read_to_string(run.join("recipe.toml")).expect("a recipe");
+    assert_eq!(recipe(&run), recipe(&again), "with the background that was set");
     // An interrupted repetition resumes as one.
     unfinish(&again, "scene.ply");
     irradia(folder.path(), "train --resume again").success();

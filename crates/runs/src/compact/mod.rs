@@ -165,6 +165,7 @@ pub fn compact(input: &CompactInput, see: &mut dyn FnMut(CompactEvent)) -> Resul
                         "the target would lose {:.2} dB on the training views: more splats are kept",
                         before - found.psnr
                     ));
+                    tries.begin_again(&scene);
                     tries.smallest(found.splats.len(), least, see)?
                 }
                 _ => found,

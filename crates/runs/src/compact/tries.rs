@@ -185,6 +185,14 @@ impl<'a> Tries<'a> {
         })
     }
 
+    /// The next try begins with all splats of `scene`, as the first did.
+    pub fn begin_again(&mut self, scene: &Scene) {
+        if let Some(splats) = scene.model.splats() {
+            self.begin = splats.clone();
+        }
+        self.grain = COARSE;
+    }
+
     /// `splats` to be rendered.
     pub fn model<'s>(&self, splats: &'s Splats) -> Model<'s> {
         Model::of_splats(splats)

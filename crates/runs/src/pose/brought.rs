@@ -61,15 +61,16 @@ impl Belonging<'_> {
     }
 
     /// Brings it into `folder`, which is created: as a hard link where the file system allows it, else, and masks, which users edit in a dataset, as a copy.
-    fn bring(&self, folder: &Path) -> Result<(), RunError> {
-        fs::create_dir_all(folder).map_err(RunError::io("create", folder))?;
-        let to = &folder.join(&self.name);
-        if self.is(to) {
+    /// Another file of that name is put away: it may be the only one.
+    fn bring(&self, out: &Path, folder: &str) -> Result<(), RunError> {
+        let name = format!("{folder}/{}", self.name);
+        let to = &out.join(&name);
+        if self.is(to) || (to.exists() && has_bytes_of(to, self.from)?) {
             return Ok(());
         }
-        if to.exists() {
-            fs::remove_file(to).map_err(RunError::io("replace", to))?;
-        }
+        put_away(out, std::iter::once(name))?;
+        let around = to.parent().unwrap_or(out);
+        fs::create_dir_all(around).map_err(RunError::io("create", around))?;
         if self.folder == MASKS || fs::hard_link(self.from, to).is_err() {
             fs::copy(self.from, to).map_err(RunError::io("write", to))?;
         }
@@ -77,16 +78,26 @@ impl Belonging<'_> {
     }
 }
 
+/// Whether two files hold the same.
+fn has_bytes_of(one: &Path, other: &Path) -> Result<bool, RunError> {
+    let length = |path: &Path| {
+        let metadata = fs::metadata(path).map_err(RunError::io("read", path));
+        metadata.map(|metadata| metadata.len())
+    };
+    let bytes = |path: &Path| fs::read(path).map_err(RunError::io("read", path));
+    Ok(length(one)? == length(other)? && bytes(one)? == bytes(other)?)
+}
+
 /// Brings a photograph, its mask and its maps of depth and normals into the folders `images`, `masks`, `depths` and `normals` of the dataset.
 pub(super) fn bring_photo(out: &Path, photo: &PhotoEntry) -> Result<(), RunError> {
-    belongings(photo).try_for_each(|file| file.bring(&out.join(file.folder)))
+    belongings(photo).try_for_each(|file| file.bring(out, file.folder))
 }
 
 /// Brings a panorama and its mask into the dataset, where training finds them beside their faces.
 pub(super) fn bring_panorama(out: &Path, panorama: &PhotoEntry) -> Result<(), RunError> {
     belongings(panorama).try_for_each(|file| match file.folder {
-        IMAGES => file.bring(&out.join(PANORAMAS)),
-        MASKS => file.bring(&out.join(PANORAMA_MASKS)),
+        IMAGES => file.bring(out, PANORAMAS),
+        MASKS => file.bring(out, PANORAMA_MASKS),
         _ => Ok(()),
     })
 }

@@ -246,7 +246,7 @@ fn plan(model: &Model, infos: &[PhotoInfo]) -> Plan {
 /// Writes the report, its page and its pictures.
 pub(super) fn write(out: &Path, folder: &PhotoFolder, work: &Work, report: &DoctorReport) -> Result<(), RunError> {
     let pictures = out.join(PICTURES);
-    if pictures.exists() {
+    if pictures.exists() && out.join("doctor.json").exists() {
         // Those of an earlier call.
         fs::remove_dir_all(&pictures).map_err(RunError::io("clear", &pictures))?;
     }

@@ -45,13 +45,30 @@ pub(super) fn is_film(path: &Path) -> bool {
 
 /// Whether ffmpeg is installed.
 pub(super) fn can_be_read() -> bool {
-    let mut ffmpeg = Command::new("ffmpeg");
-    let silent = ffmpeg
+    ffmpeg_version().is_some()
+}
+
+/// What ffmpeg says of its version, if it is installed.
+fn ffmpeg_version() -> Option<String> {
+    let output = Command::new("ffmpeg")
         .arg("-version")
         .stdin(Stdio::null())
-        .stdout(Stdio::null())
-        .stderr(Stdio::null());
-    silent.status().is_ok_and(|status| status.success())
+        .output()
+        .ok()?;
+    let said = String::from_utf8_lossy(&output.stdout).into_owned();
+    output.status.success().then_some(said)
+}
+
+/// The option by which ffmpeg of this `version` passes every frame once: `-fps_mode` is new in 5.1, and `-vsync` is gone in later ones.
+fn frame_option(version: &str) -> &'static str {
+    let number = version.strip_prefix("ffmpeg version ").unwrap_or_default();
+    let mut parts = number.trim_start_matches('n').split(['.', '-', ' ']);
+    let mut part = || parts.next()?.parse::<u32>().ok();
+    match part() {
+        // Of a build between versions nothing is known.
+        Some(major) if (major, part().unwrap_or(0)) < (5, 1) => "-vsync",
+        _ => "-fps_mode",
+    }
 }
 
 /// The record of what was chosen, beside the frames; it begins empty.
@@ -119,7 +136,8 @@ pub(super) fn frames(
     for (i, film) in films.iter().enumerate() {
         let frames = match measure(film, before, progress) {
             Ok(frames) => frames,
-            Err(error) if i < named => return Err(error),
+            // Once ffmpeg is installed they can be read.
+            Err(error) if i < named || !can_be_read() => return Err(error),
             Err(error) => {
                 let said = error.to_string();
                 let path = format!("{}: ", film.display());
@@ -183,7 +201,8 @@ fn measure(film: &Path, before: usize, progress: &(dyn Fn(PoseProgress) + Sync))
     let mut child = Command::new("ffmpeg")
         .args(["-loglevel", "error", "-i"])
         .arg(file_url(film))
-        .args(["-vf", &format!("scale={WIDTH}:-2"), "-fps_mode", "passthrough"])
+        .args(["-vf", &format!("scale={WIDTH}:-2")])
+        .args([frame_option(&ffmpeg_version().unwrap_or_default()), "passthrough"])
         .args(["-f", "image2pipe", "-c:v", "pgm", "-pix_fmt", "gray", "-"])
         .stdin(Stdio::null())
         .stdout(Stdio::piped())
@@ -381,9 +400,8 @@ fn extract(chosen: &Chosen, folder: &Path) -> Result<(), RunError> {
             "-vf",
             // Pixels that are not square (DV, anamorphic) become so: the cameras have one focal length.
             &format!("select='{}',scale=iw*sar:ih", is_one_of(&chosen.frames)),
-            "-fps_mode",
-            "passthrough",
         ])
+        .args([frame_option(&ffmpeg_version().unwrap_or_default()), "passthrough"])
         // A pattern: the folder's own name may hold a `%`.
         .args(["-q:v", "2", "-start_number", "0", "chosen_%06d.jpg"])
         .current_dir(folder)
@@ -406,6 +424,21 @@ fn extract(chosen: &Chosen, folder: &Path) -> Result<(), RunError> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn every_ffmpeg_gets_an_option_that_it_knows() {
+        for (version, option) in [
+            ("ffmpeg version 4.4.2-0ubuntu0.22.04.1 Copyright", "-vsync"),
+            ("ffmpeg version 5.0 Copyright", "-vsync"),
+            ("ffmpeg version 5.1.6-0+deb12u1 Copyright", "-fps_mode"),
+            ("ffmpeg version 7.0.2-static https", "-fps_mode"),
+            ("ffmpeg version n4.3.1 Copyright", "-vsync"),
+            ("ffmpeg version N-109516-g8e2a2e1 Copyright", "-fps_mode"),
+            ("", "-fps_mode"),
+        ] {
+            assert_eq!(frame_option(version), option, "{version}");
+        }
+    }
 
     #[test]
     fn windows_are_equal_in_motion_and_give_their_sharpest_frame() {

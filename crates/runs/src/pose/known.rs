@@ -39,9 +39,16 @@ impl KnownPoses {
         let folders: Vec<PathBuf> = folders.into_iter().filter(|folder| folder.is_dir()).collect();
         let mut found = read_photo_folders(&folders)?;
         for photo in &mut found.photos {
-            let inside = photo.path.strip_prefix(&images).unwrap_or(&photo.path);
+            let inside = photo.path.strip_prefix(&images).unwrap_or(&photo.path).to_owned();
             let parts = inside.iter().map(OsStr::to_string_lossy);
             photo.name = parts.collect::<Vec<_>>().join("/");
+            let masks = [format!("{}.png", photo.name).into(), inside.with_extension("png")];
+            let mut masks = masks
+                .map(|name: PathBuf| self.data.join("masks").join(name))
+                .into_iter();
+            if let (None, Some(mask)) = (&photo.mask, masks.find(|mask| mask.is_file())) {
+                *photo = photo.with_mask(mask)?;
+            }
         }
         Ok(found)
     }
@@ -51,10 +58,13 @@ impl KnownPoses {
         let mut folder = self.photographs()?;
         let present = |name: &&String| folder.photos.iter().any(|photo| photo.name == **name);
         if let Some(name) = self.images.keys().filter(|name| !present(name)).min() {
-            return Err(RunError::Refused(format!(
-                "{} has a pose for {name}, which is not in its folder images: add the photograph there, at the size of its camera",
-                self.data.display()
-            )));
+            let unused = folder.unused().find(|(unused, _)| unused == name);
+            let why = match unused {
+                Some((_, reason)) => format!("which is left out of its folder images ({reason})"),
+                None => "which is not in its folder images: add the photograph there".to_owned(),
+            };
+            let message = format!("{} has a pose for {name}, {why}", self.data.display());
+            return Err(RunError::Refused(message));
         }
         let before = folder.photos.len();
         folder.left_out.extend(more.left_out);
@@ -90,6 +100,26 @@ impl KnownPoses {
     /// the same metadata.
     pub fn of(&self, photos: &mut [PhotoInfo]) -> Result<Known, RunError> {
         let of_photo: Vec<Option<&ColmapImage>> = photos.iter().map(|photo| self.images.get(&photo.name)).collect();
+        for (photo, image) in photos.iter().zip(&of_photo) {
+            let Some(camera) = image.and_then(|image| self.cameras.get(&image.camera_id)) else {
+                continue;
+            };
+            let [size, of_camera] = [
+                [photo.width, photo.height].map(u64::from),
+                [camera.width, camera.height],
+            ];
+            if size != of_camera {
+                return Err(RunError::Refused(format!(
+                    "{} of {} is {}x{}, its camera {}x{}: photographs are added to those at the size of their cameras, turned as these are",
+                    photo.name,
+                    self.data.display(),
+                    size[0],
+                    size[1],
+                    of_camera[0],
+                    of_camera[1]
+                )));
+            }
+        }
         let mut camera_of_group: HashMap<usize, u32> = HashMap::new();
         for (photo, image) in photos.iter().zip(&of_photo) {
             if let Some(image) = image {

@@ -27,11 +27,15 @@ impl Look {
             max_features,
             ..Sift::default()
         };
+        let mask = match (photo.alpha(), photo.mask.clone()) {
+            (Some(alpha), Some(mask)) => Some(alpha.into_iter().zip(mask).map(|(a, b)| a.min(b)).collect()),
+            (alpha, mask) => alpha.or(mask),
+        };
         let features = sift.extract(&GreyPhoto {
             width: photo.width,
             height: photo.height,
             data: &in_grey(&photo.data, photo.channels),
-            mask: photo.alpha().as_deref().or(photo.mask.as_deref()),
+            mask: mask.as_deref(),
         });
         let info = PhotoInfo {
             name: view.name.clone(),

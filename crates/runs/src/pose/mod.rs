@@ -34,7 +34,7 @@ use capture::Capture;
 use irradia_formats::{PhotoEntry, PhotoFolder, write_atomic};
 use irradia_sfm::doctor::Kind;
 use irradia_sfm::map::{MapOptions, PhotoInfo, Reconstruction};
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 use stages::Work;
 use std::collections::HashSet;
 use std::fs;
@@ -164,6 +164,21 @@ pub struct PoseReport {
     pub warnings: Vec<String>,
     /// What is wrong with the capture, the gravest first.
     pub findings: Vec<Finding>,
+    /// Who found the poses.
+    pub poses_by: PosesBy,
+}
+
+/// Who found the poses of a dataset.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum PosesBy {
+    /// This program, which has examined them.
+    #[default]
+    Irradia,
+    /// COLMAP, which this program ran.
+    Colmap,
+    /// Others, and this program those of photographs that were added.
+    Others,
 }
 
 /// One search for poses; [`PoseReport::attempts`].
@@ -280,6 +295,7 @@ pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Resu
     fs::create_dir_all(out).map_err(RunError::io("create", out))?;
     let mut clock = Clock::new();
     let mut capture = Capture::read(&input.photos, Some(out), progress)?;
+    still::ignore_own(&mut capture.folder.photos, out)?;
     if let Some(only) = &input.only {
         let is_one = |photo: &PhotoEntry| only.contains(&photo.name);
         if capture.folder.photos.iter().filter(|photo| is_one(photo)).count() == only.len() {
@@ -317,6 +333,7 @@ pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Resu
             ));
         }
         let mut report = colmap::run(input, &capture, progress)?;
+        report.poses_by = PosesBy::Colmap;
         clock.end("colmap");
         report.stages = clock.stages;
         report.seconds = started.elapsed().as_secs_f64();
@@ -326,6 +343,10 @@ pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Resu
 
     let is_new = known.is_none();
     let into = known.as_ref().map(|known| known.model.clone());
+    let by = match into {
+        Some(_) => poses_by(out).unwrap_or(PosesBy::Others),
+        None => PosesBy::Irradia,
+    };
     let work = Work::new(input.max_features, Some(out), folder, progress);
     let mut matched = Matched::find(work, &capture, false, &mut clock)?;
     let masked = match is_new && !capture.has_panoramas() {
@@ -403,6 +424,7 @@ pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Resu
 
     let mut report = output::report(folder, &work, &infos, &reconstruction);
     report.findings = examined.findings;
+    report.poses_by = by;
     report.scale = scale;
     report.attempts = attempts;
     report.pairs = pairs.len();
@@ -414,16 +436,23 @@ pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Resu
     Ok(report)
 }
 
-/// Whether [`pose`] wrote the dataset in `data`.
-pub fn is_posed_here(data: &Path) -> bool {
-    data.join(REPORT).exists()
+/// Who found the poses in `data`, if [`pose`] wrote the model there, or added to it.
+pub fn poses_by(data: &Path) -> Option<PosesBy> {
+    #[derive(Deserialize)]
+    struct Known {
+        // Earlier versions did not say.
+        #[serde(default)]
+        poses_by: PosesBy,
+    }
+    let report = fs::read(data.join(REPORT)).ok()?;
+    Some(serde_json::from_slice::<Known>(&report).map_or(PosesBy::Irradia, |known| known.poses_by))
 }
 
 /// Refuses to replace a model that [`pose`] did not write.
 fn check_free(out: &Path) -> Result<(), RunError> {
     let foreign = ["sparse", "transforms.json", "transforms_train.json", "poses_bounds.npy"]
         .into_iter()
-        .find(|name| out.join(name).exists() && !is_posed_here(out));
+        .find(|name| out.join(name).exists() && matches!(poses_by(out), None | Some(PosesBy::Others)));
     match foreign {
         Some(name) => Err(RunError::Refused(format!(
             "{} already holds {name} of another origin: choose another --out",

@@ -2,7 +2,7 @@
 
 use super::brought;
 use super::stages::Work;
-use super::{CameraReport, LeftOutPhoto, PoseReport, is_posed_here};
+use super::{CameraReport, LeftOutPhoto, PoseReport, PosesBy, poses_by};
 use crate::RunError;
 use irradia_formats::{
     ColmapCamera, ColmapImage, ColmapModel, ColmapPoint, PhotoEntry, PhotoFolder, PosedImage, TrackedPoint,
@@ -71,7 +71,7 @@ fn replace_model(out: &Path, model: &Path, written: &Path) -> Result<(), RunErro
         .into_iter()
         .flat_map(|table| ["bin", "txt"].map(|extension| format!("{table}.{extension}")));
     let names: Vec<String> = names.collect();
-    if !is_posed_here(out) {
+    if poses_by(out).is_none() {
         let place = model.strip_prefix(out).unwrap_or(model);
         let files = names.iter().map(|name| place.join(name).to_string_lossy().into_owned());
         brought::put_away(out, files)?;
@@ -242,5 +242,6 @@ pub(super) fn report(folder: &PhotoFolder, work: &Work, infos: &[PhotoInfo], fou
         seconds: 0.0,
         warnings: Vec::new(),
         findings: Vec::new(),
+        poses_by: PosesBy::Irradia,
     }
 }

@@ -132,15 +132,15 @@ fn contradicting(distances: &[KnownDistance], ratios: &[f64]) -> Option<String> 
     })
 }
 
-/// East, north and up, m, of latitudes, longitudes and altitudes, about their mean: on the plane that touches the earth there.
+/// East, north and up, m, of latitudes, longitudes and altitudes, about their median: on the plane that touches the earth there. A place far away, as some
+/// cameras write before they know theirs, must not move it: away from the photographs' latitude, metres along the parallel have another length.
 fn local(gps: &[Option<[f64; 3]>]) -> Vec<Option<DVec3>> {
     let known: Vec<&[f64; 3]> = gps.iter().flatten().collect();
-    let mean = |k: usize| known.iter().map(|place| place[k]).sum::<f64>() / known.len().max(1) as f64;
-    let [latitude, altitude] = [0, 2].map(mean);
+    let [latitude, altitude] = [0, 2].map(|k| middle(known.iter().map(|place| place[k])));
     // From the first place, across the date line as well.
     let first = known.first().map_or(0.0, |place| place[1]);
     let around = |from: f64, longitude: f64| (longitude - from + 540.0).rem_euclid(360.0) - 180.0;
-    let longitude = first + known.iter().map(|place| around(first, place[1])).sum::<f64>() / known.len().max(1) as f64;
+    let longitude = first + middle(known.iter().map(|place| around(first, place[1])));
     let (sin, cos) = latitude.to_radians().sin_cos();
     // Radii of curvature along the parallel and along the meridian.
     let flattened = 1.0 - ECCENTRICITY_SQUARED * sin * sin;
@@ -154,6 +154,16 @@ fn local(gps: &[Option<[f64; 3]>]) -> Vec<Option<DVec3>> {
         )
     };
     gps.iter().map(|known| known.map(place)).collect()
+}
+
+/// The median of `values`; 0 of none.
+fn middle(values: impl Iterator<Item = f64>) -> f64 {
+    let mut values: Vec<f64> = values.collect();
+    values.sort_unstable_by(f64::total_cmp);
+    match values.len() {
+        0 => 0.0,
+        n => 0.5 * (values[(n - 1) / 2] + values[n / 2]),
+    }
 }
 
 #[cfg(test)]
@@ -172,6 +182,13 @@ mod tests {
             (d.x - 78_847.0).abs() < 10.0 && (d.y - 111_132.0).abs() < 10.0 && d.z == 200.0,
             "{d}"
         );
+        // One at the equator, as before the camera knows its place, changes nothing.
+        let place = |east: f64| Some([45.0, 7.0 + east, 100.0]);
+        let places = local(&[place(0.0), Some([0.0, 1.0, 0.0]), place(0.5), place(1.0), place(0.5)]);
+        let [Some(a), _, _, Some(b), _] = places[..] else {
+            panic!("{places:?}");
+        };
+        assert!((b.x - a.x - 78_847.0).abs() < 10.0, "{a} {b}");
         let across = local(&[Some([0.0, 179.999, 0.0]), Some([0.0, -179.999, 0.0])]);
         let [Some(west), Some(east)] = across[..] else {
             panic!("{across:?}");

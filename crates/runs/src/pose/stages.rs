@@ -13,6 +13,12 @@ use rayon::prelude::*;
 use std::collections::HashSet;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicUsize, Ordering};
+use std::time::{Duration, Instant};
+
+/// Pairs that are matched between two looks at the clock.
+const BATCH: usize = 1000;
+/// How often matches are saved while pairs are matched.
+const SAVED_EVERY: Duration = Duration::from_secs(60);
 
 /// The file of features and matches, of those of a second attempt, and of those of what does not stand still.
 const STORE: &str = "features.bin";
@@ -255,17 +261,25 @@ impl<'a> Work<'a> {
             of: new.len(),
         });
         let done = AtomicUsize::new(0);
-        let found = match_pairs(&self.features, &new, &matching, || {
-            let now = done.fetch_add(1, Ordering::Relaxed) + 1;
-            (self.progress)(PoseProgress::Done(now));
-        });
-        let is_new = !found.is_empty();
-        let found: Vec<_> = found
-            .into_iter()
-            .map(|pair| (hash(&pair.photos), pair.matches))
-            .collect();
-        self.known.matches.extend(found);
-        if is_new {
+        let mut saved = Instant::now();
+        for some in new.chunks(BATCH) {
+            let found = match_pairs(&self.features, some, &matching, || {
+                let now = done.fetch_add(1, Ordering::Relaxed) + 1;
+                (self.progress)(PoseProgress::Done(now));
+            });
+            let hash = |pair: &[u32; 2]| pair.map(|i| self.hashes[i as usize]);
+            let found: Vec<_> = found
+                .into_iter()
+                .map(|pair| (hash(&pair.photos), pair.matches))
+                .collect();
+            self.known.matches.extend(found);
+            // Of a long stage little is lost if it is interrupted.
+            if saved.elapsed() > SAVED_EVERY {
+                self.save()?;
+                saved = Instant::now();
+            }
+        }
+        if !new.is_empty() {
             self.save()?;
         }
         let matches = |photos: [u32; 2]| PairMatches {

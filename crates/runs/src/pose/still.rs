@@ -3,9 +3,10 @@
 
 use super::PoseProgress;
 use super::attempt::{Attempt, Matched};
-use super::brought::MASKS;
+use super::brought::{MASKS, put_away};
 use super::stages::in_rgb;
 use crate::RunError;
+use crate::scene_file::same_file;
 use irradia_formats::{PhotoEntry, PhotoFolder, write_png};
 use irradia_sfm::map::{StandsStill, stands_still, turntable};
 use irradia_sfm::{Backdrop, Overlay, StillScene, bars};
@@ -207,11 +208,33 @@ fn writing_over(size: [u32; 2], pictures: &Pictures) -> Option<Vec<bool>> {
     (share(&lies) as f64 <= LIES_OVER * lies.len() as f64).then_some(lies)
 }
 
-/// Whether there are no masks, once those of an earlier call are removed.
+/// Takes masks that an earlier call wrote into `out` from `photos`, which lie there themselves: they are not the user's.
+pub(super) fn ignore_own(photos: &mut [PhotoEntry], out: &Path) -> Result<(), RunError> {
+    let written = out.join(MASKS);
+    if !written.join(RECORD).exists() {
+        return Ok(());
+    }
+    for photo in photos {
+        let folder = photo.mask.as_deref().and_then(Path::parent);
+        if folder.is_some_and(|folder| same_file(folder, &written)) {
+            *photo = photo.without_mask()?;
+        }
+    }
+    Ok(())
+}
+
+/// Whether there are no masks, once those of an earlier call are put away: somebody may have edited them.
 fn is_free_once_cleared(folder: &PhotoFolder, out: &Path) -> Result<bool, RunError> {
     let written = out.join(MASKS);
-    if written.join(RECORD).exists() {
-        fs::remove_dir_all(&written).map_err(RunError::io("clear", &written))?;
+    let record = written.join(RECORD);
+    if record.exists() {
+        let entries = fs::read_dir(&written).map_err(RunError::io("read", &written))?;
+        let names: Vec<String> = (entries.flatten())
+            .map(|entry| entry.file_name().to_string_lossy().into_owned())
+            .filter(|name| name != RECORD)
+            .collect();
+        fs::remove_file(&record).map_err(RunError::io("remove", &record))?;
+        put_away(out, names.into_iter().map(|name| format!("{MASKS}/{name}")))?;
     }
     // Somebody's, for the poses or for the training alone.
     Ok(!written.exists() && folder.photos.iter().all(|photo| photo.mask.is_none()))

@@ -75,6 +75,12 @@ fn a_folder_gets_the_scene_its_moved_cameras_and_the_edits() {
     }
     let error = editing.write_in_place().expect_err("moved").to_string();
     assert!(error.contains("photographs"), "{error}");
+
+    // Another scene in the same folder gets nothing of this one.
+    edited(&again, &["opacity factor=0.9 all"])
+        .write(&out, &WriteOptions::default())
+        .expect("writes");
+    assert!(out.join("scene.ply").exists() && !out.join("cameras.json").exists() && !out.join("recipe.toml").exists());
 }
 
 #[test]
@@ -175,6 +181,11 @@ fn a_run_edited_in_place_resumes_with_the_edited_splats() {
     assert_eq!((run.trainer().clock.step, state.len()), (6, left));
     run.train(&mut []).expect("trains");
     assert!(run.finish().expect("finishes").complete);
+    // A finished run needs no checkpoints.
+    fs::remove_dir_all(path.join("checkpoints")).unwrap();
+    edited(&path, &["opacity factor=0.9 all"])
+        .write_in_place()
+        .expect("writes");
 }
 
 #[test]
@@ -194,6 +205,16 @@ fn a_training_begins_with_the_splats_of_a_scene() {
     let second = run.finish().expect("finishes").report;
     assert!(second.psnr > first.psnr - 1.0, "{} after {}", second.psnr, first.psnr);
 
+    let fewer = TrainInput {
+        out: folder.path().join("fewer"),
+        max_splats: Some(1000),
+        ..from.clone()
+    };
+    let error = Run::begin_on(fewer.check().unwrap(), dataset())
+        .err()
+        .expect("too many")
+        .to_string();
+    assert!(error.contains("reduce count=1000"), "{error}");
     let field = TrainInput {
         recipe: "hashgrid".into(),
         ..from.clone()

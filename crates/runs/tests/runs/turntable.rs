@@ -132,6 +132,17 @@ fn what_turns_is_posed_and_what_stands_still_behind_it_is_masked() {
     let again = posed(&photos, &out);
     assert_eq!(again.warnings, report.warnings);
     assert_eq!(fs::read(out.join("sparse/0/images.bin")).unwrap(), model);
+    // In place, its own masks are not taken for the user's; those that somebody edited are put away.
+    let edited = masks.join("00.png.png");
+    fs::write(&edited, fs::read(masks.join("01.png.png")).unwrap()).unwrap();
+    let kept = fs::read(&edited).unwrap();
+    let in_place = posed(&out, &out);
+    assert_eq!(
+        (in_place.registered, in_place.warnings.len()),
+        (RING, report.warnings.len())
+    );
+    assert_eq!(fs::read_dir(&masks).unwrap().count(), RING + 1);
+    assert_eq!(fs::read(out.join("unused/masks/00.png.png")).unwrap(), kept);
     // Photographs with masks of their own keep these.
     let own = folder.path().join("own");
     fs::create_dir(&own).unwrap();

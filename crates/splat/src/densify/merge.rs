@@ -57,7 +57,8 @@ fn pairs(state: &SplatState, options: &MergeOptions) -> Vec<(u32, u32)> {
         .into_par_iter()
         .filter(|i| {
             let other = nearest[*i as usize];
-            *i < other && nearest[other as usize] == *i
+            // None is nearest where distances overflow.
+            *i < other && nearest.get(other as usize) == Some(i)
         })
         .map(|i| (whole[i as usize], whole[nearest[i as usize] as usize]))
         .filter(|(a, b)| similar(state, *a as usize, *b as usize, options))

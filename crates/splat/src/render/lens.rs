@@ -90,10 +90,14 @@ impl LensParams {
                 p: unroll!(i in 2 => simd.splat(p[i])),
                 s: unroll!(i in 2 => simd.splat(s[i])),
             },
-            Lens::Fov { omega } => Bend::Fov {
-                scale: simd.splat(2.0 * (0.5 * omega).tan()),
-                omega: simd.splat(omega),
-            },
+            Lens::Fov { omega } => {
+                // A pinhole has none: the ratio of both is 1 then.
+                let omega = omega.max(1e-6);
+                Bend::Fov {
+                    scale: simd.splat(2.0 * (0.5 * omega).tan()),
+                    omega: simd.splat(omega),
+                }
+            }
         };
         let shutter = self.shutter.as_ref().map(|shutter| {
             let axis = shutter.first.axis();

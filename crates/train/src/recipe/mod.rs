@@ -153,7 +153,7 @@ documented! {
         /// Parameters over the whole run; a stage may override them.
         pub params: Params,
         /// Parameters in place of those of `params` if the data show where space is empty: the dataset has points, or the photographs
-        /// have alpha. `--set` of the same parameter in `params` prevails.
+        /// have alpha, or masks that leave out all but an object. `--set` of the same parameter in `params` prevails.
         #[serde(default, skip_serializing_if = "Params::is_empty")]
         pub known_space: Params,
         /// The same, if masks leave out all but an object.
@@ -162,7 +162,7 @@ documented! {
         /// The same, if the sky differs from photograph to photograph; `known_space` prevails.
         #[serde(default, skip_serializing_if = "Params::is_empty")]
         pub skies: Params,
-        /// The same, if at least 50 training photographs have more than 0.8 million pixels, in the mean.
+        /// The same, if at least 50 training photographs have more than 0.8 million pixels, in the mean; not of wide lenses.
         #[serde(default, skip_serializing_if = "Params::is_empty")]
         pub large: Params,
         /// The stages, in order.

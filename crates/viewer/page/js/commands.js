@@ -2,6 +2,7 @@
 
 import { connection } from "./connection.js";
 import { session } from "./edit/session.js";
+import { MOVES } from "./navigation.js";
 import { path } from "./path.js";
 import { shareAddress } from "./share.js";
 import { state } from "./state.js";
@@ -24,7 +25,7 @@ const navigation = () => stage().navigation;
 function step(by) {
   const count = state.get("views").length;
   if (!count) return;
-  const at = state.get("view");
+  const at = navigation()?.flight?.view ?? state.get("view");
   navigation()?.enter(at === null ? (by > 0 ? 0 : count - 1) : (at + by + count) % count);
 }
 
@@ -121,7 +122,9 @@ export const COMMANDS = {
 addEventListener("keydown", (event) => {
   const target = /** @type {HTMLElement} */ (event.target);
   if (event.altKey || target.matches("input:not([type=range]):not([type=checkbox]), select, dialog *")) return;
-  if (event.key === " " && target.matches("button, [role=button]")) return;
+  if (event.key === " " && target.matches("button, [role=button], input")) return;
+  // By their place on the keyboard, whatever its letters.
+  if (event.code in MOVES && !event.ctrlKey && !event.metaKey) return;
   const held = event.ctrlKey || event.metaKey ? (event.shiftKey ? "Ctrl+Shift+" : "Ctrl+") : "";
   const key = held ? held + event.key.toLowerCase() : event.key;
   const command = Object.values(COMMANDS).flat().find(({ keys }) => keys === key);

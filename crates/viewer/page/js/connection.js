@@ -65,6 +65,8 @@ class Connection extends EventTarget {
     const told = JSON.parse(data);
     switch (told.tell) {
       case "hello":
+        // Another server at the same address has another scene.
+        if ((state.get("hello")?.id ?? told.id) !== told.id) return location.reload();
         state.set({ hello: told, views: told.views, metres: told.metres, ...(told.scene && { scene: told.scene }) });
         break;
       case "scene":
@@ -100,3 +102,7 @@ function merged(old, fresh) {
 }
 
 export const connection = new Connection();
+
+/** The address of a picture of a view, which the browser may keep as long as this server runs.
+ * @param {number} index @param {"photo" | "thumbnail"} kind */
+export const pictureOf = (index, kind) => `view/${index}/${kind}${location.search ? `${location.search}&` : "?"}server=${state.get("hello")?.id ?? ""}`;

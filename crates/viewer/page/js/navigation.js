@@ -16,7 +16,7 @@ const STEEPEST = 1.54;
 /** Seconds of a flight from one camera to another. */
 const FLIGHT = 0.45;
 /** Keys that move, with the camera axes they move along. @type {Record<string, Vec3>} */
-const MOVES = {
+export const MOVES = {
   KeyW: [0, 0, 1], KeyS: [0, 0, -1], KeyA: [-1, 0, 0], KeyD: [1, 0, 0], KeyQ: [0, 1, 0], KeyE: [0, -1, 0],
   ArrowUp: [0, 0, 1], ArrowDown: [0, 0, -1], ArrowLeft: [-1, 0, 0], ArrowRight: [1, 0, 0],
 };
@@ -28,6 +28,8 @@ export class Navigation {
   pointers = new Map();
   /** @type {Set<string>} */
   keys = new Set();
+  /** Whether Shift is held. */
+  fast = false;
   /** @type {{ from: Camera, to: Camera, view: number | null, pivot: Vec3 | null, at: number } | null} */
   flight = null;
   last = 0;
@@ -159,6 +161,7 @@ export class Navigation {
   key(event, pressed) {
     const within = /** @type {HTMLElement} */ (event.target);
     const writes = within.matches?.("input, select, textarea, dialog *, .tabs *");
+    this.fast = event.shiftKey;
     if (!pressed) this.keys.delete(event.code);
     else if (!writes && !event.ctrlKey && !event.metaKey && !event.altKey && event.code in MOVES) {
       this.keys.add(event.code);
@@ -191,7 +194,7 @@ export class Navigation {
       const up = state.get("up");
       step = subtract(step, scale(up, dot(step, up)));
     }
-    const by = scale(step, this.pace * seconds * (this.keys.has("ShiftLeft") ? 4 : 1));
+    const by = scale(step, this.pace * seconds * (this.fast ? 4 : 1));
     this.place({ position: add(camera.position, by) });
     state.set({ pivot: add(state.get("pivot"), by) });
   }

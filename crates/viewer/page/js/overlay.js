@@ -2,6 +2,7 @@
 
 import { project, toCamera } from "./camera.js";
 import { add, axes, cross, length, scale, subtract } from "./math.js";
+import { pictureOf } from "./connection.js";
 import { path } from "./path.js";
 import { state } from "./state.js";
 
@@ -85,7 +86,7 @@ class Thumbnails extends EventTarget {
     if (!image) {
       image = new Image();
       image.onload = () => this.dispatchEvent(new Event("load"));
-      image.src = `view/${index}/thumbnail${location.search}`;
+      image.src = pictureOf(index, "thumbnail");
       this.images.set(index, image);
     }
     return image.complete && image.naturalWidth ? image : null;

@@ -1,7 +1,7 @@
 // The picture, the overlay and the comparison with photographs: <irr-stage>.
 
 import { frameOn, intrinsics } from "./camera.js";
-import { connection } from "./connection.js";
+import { connection, pictureOf } from "./connection.js";
 import { el } from "./dom.js";
 import { LocalRenderer } from "./local/renderer.js";
 import { Navigation } from "./navigation.js";
@@ -22,6 +22,8 @@ export const LOCAL_MODES = ["color", "ellipses", "rings", "points"];
 const MANY = 3e6;
 /** Largest number of device pixels per CSS pixel. */
 const DENSITY = 2;
+/** Pixels of the longer side of a picture, as the server draws at most. */
+const MOST_SIDE = 4096;
 /** Milliseconds between the two pictures of a blink. */
 const BLINK = 700;
 
@@ -143,7 +145,8 @@ export class Stage extends HTMLElement {
   shot() {
     const camera = state.get("camera");
     const rect = this.frameRect;
-    const density = this.density ?? 1;
+    // A larger stage gets a smaller picture, scaled.
+    const density = Math.min(this.density ?? 1, MOST_SIDE / Math.max(rect.width, rect.height, 1));
     const [width, height] = [Math.max(1, Math.round(rect.width * density)), Math.max(1, Math.round(rect.height * density))];
     const k = intrinsics(width, height, camera.fov, state.insideView);
     const error = state.get("compare") === "error" && state.get("view") !== null;
@@ -319,7 +322,7 @@ export class Stage extends HTMLElement {
     this.handle.hidden = !shows || compare !== "slider";
     clearInterval(this.blinking);
     if (!shows) return;
-    const address = `view/${index}/photo${location.search}`;
+    const address = pictureOf(index, "photo");
     if (this.photo.getAttribute("src") !== address) this.photo.src = address;
     this.clipPhoto();
     this.photo.style.visibility = "visible";

@@ -35,6 +35,9 @@ class Timeline extends HTMLElement {
       mark.addEventListener("pointerdown", (event) => event.stopPropagation());
       mark.addEventListener("keydown", (event) => {
         if (event.key !== "Delete" && event.key !== "Backspace") return;
+        // The selection stays.
+        event.stopPropagation();
+        event.preventDefault();
         path.keys.splice(index, 1);
         const first = path.keys[0]?.time ?? 0;
         for (const key of path.keys) key.time -= first;

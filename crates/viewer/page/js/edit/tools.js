@@ -35,6 +35,8 @@ const TWO = ["rectangle", "cut"];
 const STEP = 2;
 /** Distance at which the first corner of a polygon is met again, CSS pixels. */
 const CLOSE = 9;
+/** Milliseconds between the presses of a double click. */
+const TWICE = 400;
 
 /** How a shape changes the selection, with the keys of image editors. @param {{ shiftKey: boolean, altKey: boolean }} event @returns {Mode} */
 export function modeOf({ shiftKey, altKey }) {
@@ -45,6 +47,8 @@ export function modeOf({ shiftKey, altKey }) {
 export class Tools extends EventTarget {
   /** What is being drawn, pixels of the picture. @type {{ tool: Tool, points: Point[], camera: Camera, k: Intrinsics, mode: Mode } | null} */
   drawn = null;
+  /** When the last corner was set. */
+  pressed = 0;
   /** The pointer, pixels of the picture. @type {Point | null} */
   at = null;
 
@@ -90,7 +94,10 @@ export class Tools extends EventTarget {
     if (tool === "polygon") {
       const [first] = this.drawn?.points ?? [];
       const close = first && Math.hypot(first[0] - at[0], first[1] - at[1]) < CLOSE * this.stage.pixel;
-      if (this.drawn && this.drawn.points.length > 2 && (close || event.detail > 1)) return this.finish();
+      const last = this.drawn?.points.at(-1);
+      const again = last && event.timeStamp - this.pressed < TWICE && Math.hypot(last[0] - at[0], last[1] - at[1]) < CLOSE * this.stage.pixel;
+      this.pressed = event.timeStamp;
+      if (this.drawn && this.drawn.points.length > 2 && (close || again)) return this.finish();
       if (this.drawn) this.drawn.points.push(at);
       else this.drawn = { tool, points: [at], camera, k, mode };
     } else if (LINES.includes(tool)) {

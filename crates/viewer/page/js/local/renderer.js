@@ -241,6 +241,8 @@ export class LocalRenderer {
   async fetchMask() {
     const painter = this.painter;
     if (!painter || !this.begun || this.masked === this.mask || this.fetching || this.loaded < this.total) return;
+    // Another version comes once it is wanted.
+    if (this.version !== this.scene?.version) return;
     this.fetching = true;
     const { mask, abort } = this;
     try {

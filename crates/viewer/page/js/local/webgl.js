@@ -90,6 +90,7 @@ export class WebGl {
     this.place = texture(gl, ROW, rows);
     this.look = texture(gl, ROW, rows);
     this.order = texture(gl, ROW, rows, gl.R32UI);
+    if (this.target) gl.deleteFramebuffer(this.target);
     this.target = gl.createFramebuffer();
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.target);
     gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, this.place, 0);

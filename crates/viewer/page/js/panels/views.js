@@ -1,7 +1,7 @@
 // The panel of the views: thumbnails, PSNR, a jump into each.
 
 import { choose, el, section, segments } from "../dom.js";
-import { connection } from "../connection.js";
+import { connection, pictureOf } from "../connection.js";
 import { stage } from "../commands.js";
 import { state } from "../state.js";
 
@@ -45,7 +45,7 @@ class ViewsPanel extends HTMLElement {
     const view = state.get("views")[index];
     const psnr = state.get("scores").get(index);
     const picture = view.photo
-      ? el("img", { src: `view/${index}/thumbnail${location.search}`, loading: "lazy", alt: "", width: 56, height: 38 })
+      ? el("img", { src: pictureOf(index, "thumbnail"), loading: "lazy", alt: "", width: 56, height: 38 })
       : el("span", { className: "blank" });
     const button = el("button", { type: "button", title: view.name, onclick: () => stage().navigation?.enter(index) }, picture,
       el("span", { className: "name" }, view.name.split("/").pop() ?? "", el("span", { className: "kind", textContent: view.trained ? "trained" : "held out" })),

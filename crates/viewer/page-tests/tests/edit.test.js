@@ -98,6 +98,31 @@ factor = 2
   await server.stop();
 });
 
+test("a double click closes a polygon, Space switches a check box, and a double step enters the view after the next", async () => {
+  const server = await serve("view", copy("polygon"), "--port", "0");
+  const { page, problems } = await open(browser, server.address);
+  await set(page, { drawing: "served", axes: false });
+  await page.getByRole("tab", { name: "Edit" }).click();
+  await sharp(page);
+  await page.getByRole("button", { name: "Polygon" }).click();
+  const { x: left, y: top, width, height } = await page.locator("irr-stage .overlay").boundingBox();
+  const at = (x, y) => [left + x * width, top + y * height];
+  for (const corner of [at(0.3, 0.3), at(0.7, 0.3)]) await page.mouse.click(...corner);
+  await page.mouse.dblclick(...at(0.5, 0.8));
+  await edited(page, ({ selected }) => selected > 0);
+  await page.keyboard.press("Escape");
+  const box = page.getByLabel("Highlight");
+  const before = await box.isChecked();
+  await box.focus();
+  await page.keyboard.press(" ");
+  assert.equal(await box.isChecked(), !before);
+  await page.keyboard.press("]");
+  await page.keyboard.press("]");
+  await until(page, async () => (await import("/page/js/state.js")).state.get("view") === 1);
+  assert.deepEqual(problems, []);
+  await server.stop();
+});
+
 test("a lasso, a brush and a deletion; undo, save and download agree with the program", async () => {
   const scene = copy("edited");
   const server = await serve("view", scene, "--port", "0");

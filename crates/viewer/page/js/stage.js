@@ -322,7 +322,7 @@ export class Stage extends HTMLElement {
     this.handle.hidden = !shows || compare !== "slider";
     clearInterval(this.blinking);
     if (!shows) return;
-    const address = pictureOf(index, "photo");
+    const address = pictureOf(/** @type {number} */ (index), "photo");
     if (this.photo.getAttribute("src") !== address) this.photo.src = address;
     this.clipPhoto();
     this.photo.style.visibility = "visible";

@@ -25,8 +25,9 @@ use irradia_runs::formats::{SplatFormat, encode_splats};
 use irradia_scene::Photo;
 use serde_json::json;
 use std::collections::HashMap;
+use std::hash::{DefaultHasher, Hash, Hasher};
 use std::sync::{Arc, Mutex, PoisonError};
-use std::time::{Duration, SystemTime};
+use std::time::Duration;
 use tokio::sync::Semaphore;
 use tokio::time::timeout;
 
@@ -48,7 +49,7 @@ const POLICY: &str = "default-src 'self'; img-src 'self' blob: data:; style-src 
 
 /// What all requests share.
 pub(crate) struct Shared {
-    /// Of this server: what a browser keeps of another one at the same address is of another scene.
+    /// Of the scene and its photographs: what a browser keeps from the same address may be of others.
     pub id: String,
     pub subject: Subject,
     pub desk: Desk,
@@ -67,16 +68,24 @@ pub(crate) struct Shared {
     uploading: Semaphore,
 }
 
-/// When the server began, nanoseconds.
-fn started() -> String {
-    let since = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH);
-    since.map_or(0, |since| since.as_nanos()).to_string()
+/// The same for the same scene and photographs after a restart, and another for others.
+fn identity(subject: &Subject) -> String {
+    let mut hasher = DefaultHasher::new();
+    subject.title.hash(&mut hasher);
+    subject.views.0.iter().for_each(|view| view.name.hash(&mut hasher));
+    if let Some(edition) = subject.edition()
+        && let Some(splats) = edition.scene().model.splats()
+    {
+        let values = (0..3).flat_map(|c| (0..splats.len()).map(move |i| splats.means.get(c, i)));
+        values.for_each(|value| value.to_bits().hash(&mut hasher));
+    }
+    hasher.finish().to_string()
 }
 
 impl Shared {
     pub fn new(subject: Subject, guard: Guard, notices: Arc<Notices>) -> Self {
         Self {
-            id: started(),
+            id: identity(&subject),
             subject,
             desk: Desk::default(),
             guard,

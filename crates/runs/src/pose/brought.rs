@@ -78,14 +78,13 @@ impl Belonging<'_> {
     }
 }
 
-/// Whether two files hold the same.
+/// Whether two files hold the same: links of one file were written at the same time, and copies are compared.
 fn has_bytes_of(one: &Path, other: &Path) -> Result<bool, RunError> {
-    let length = |path: &Path| {
-        let metadata = fs::metadata(path).map_err(RunError::io("read", path));
-        metadata.map(|metadata| metadata.len())
-    };
+    let metadata = |path: &Path| fs::metadata(path).map_err(RunError::io("read", path));
     let bytes = |path: &Path| fs::read(path).map_err(RunError::io("read", path));
-    Ok(length(one)? == length(other)? && bytes(one)? == bytes(other)?)
+    let [a, b] = [metadata(one)?, metadata(other)?];
+    let is_link = a.modified().ok().zip(b.modified().ok()).is_some_and(|(a, b)| a == b);
+    Ok(a.len() == b.len() && (is_link || bytes(one)? == bytes(other)?))
 }
 
 /// Brings a photograph, its mask and its maps of depth and normals into the folders `images`, `masks`, `depths` and `normals` of the dataset.

@@ -65,7 +65,7 @@ class Connection extends EventTarget {
     const told = JSON.parse(data);
     switch (told.tell) {
       case "hello":
-        // Another server at the same address has another scene.
+        // Another server at the same address may have another scene.
         if ((state.get("hello")?.id ?? told.id) !== told.id) return location.reload();
         state.set({ hello: told, views: told.views, metres: told.metres, ...(told.scene && { scene: told.scene }) });
         break;
@@ -103,6 +103,6 @@ function merged(old, fresh) {
 
 export const connection = new Connection();
 
-/** The address of a picture of a view, which the browser may keep as long as this server runs.
+/** The address of a picture of a view, which the browser may keep: it names the scene.
  * @param {number} index @param {"photo" | "thumbnail"} kind */
-export const pictureOf = (index, kind) => `view/${index}/${kind}${location.search ? `${location.search}&` : "?"}server=${state.get("hello")?.id ?? ""}`;
+export const pictureOf = (index, kind) => `view/${index}/${kind}${location.search ? `${location.search}&` : "?"}scene=${state.get("hello")?.id ?? ""}`;

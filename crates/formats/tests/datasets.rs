@@ -431,7 +431,7 @@ fn unusable_views_are_skipped_with_one_line_per_reason() {
     let warnings = dataset.warnings.join("\n");
     assert_eq!(dataset.warnings.len(), 3, "{warnings}");
     assert!(
-        warnings.contains("1 of 8 views have no image file and are skipped: images/07.png"),
+        warnings.contains("1 of 8 views have no image file (--images names the folder of the photographs) and are skipped: images/07.png"),
         "{warnings}"
     );
     assert!(

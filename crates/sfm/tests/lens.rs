@@ -80,7 +80,7 @@ fn a_fisheye_is_told_from_a_wide_perspective_lens() {
         let camera = model.cameras[0].expect("registered");
         assert_eq!((model.registered(), camera.fisheye), (24, fisheye), "{camera:?}");
         assert!((camera.focal() / 300.0 - 1.0).abs() < 0.005, "{camera:?}");
-        // 95.0 to 95.1 by the rounding of the processor.
+        // 94.9995 on one processor and above 95 on others, whose rounding differs.
         assert!(world.auc(model, 1.0) > 94.5, "{fisheye}: {}", world.auc(model, 1.0));
     }
 }

@@ -35,7 +35,8 @@ pub use dataset::colmap::{
     ColmapCamera, ColmapImage, ColmapModel, ColmapPoint, PosedImage, TrackedPoint, read_colmap_poses, write_colmap,
 };
 pub use dataset::{
-    DEFAULT_MAX_SIDE, DatasetFormat, DatasetOptions, Holdout, Lenses, PANORAMA_MASKS, PANORAMAS, Readout, read_dataset,
+    Beside, DEFAULT_MAX_SIDE, DatasetFormat, DatasetOptions, Holdout, Lenses, PANORAMA_MASKS, PANORAMAS, Readout,
+    read_dataset,
 };
 pub use describe::{Description, Kind, describe, detect};
 pub use error::{FormatError, Malformed};

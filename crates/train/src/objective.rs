@@ -340,16 +340,21 @@ mod tests {
     use crate::Recipe;
     use crate::schedule::{Clock, plan};
 
-    #[test]
-    fn surfaces_are_wanted_where_photographs_show_something_and_none_where_masks_leave_out() {
-        let photo = Prepared {
+    /// A photograph of 4 x 2 pixels of one grey.
+    fn masked(grey: u8, mask: [u8; 8]) -> Prepared {
+        Prepared {
             width: 4,
             height: 2,
-            rgb: vec![128; 24],
+            rgb: vec![grey; 24],
             alpha: None,
-            mask: Some(vec![255, 255, 255, 255, 0, 0, 255, 255]),
+            mask: Some(mask.to_vec()),
             background: [0.0; 3],
-        };
+        }
+    }
+
+    #[test]
+    fn surfaces_are_wanted_where_photographs_show_something_and_none_where_masks_leave_out() {
+        let photo = masked(128, [255, 255, 255, 255, 0, 0, 255, 255]);
         let (color, alpha) = ([0.5; 24], [0.9, 0.2, 1.0, 0.0, 0.9, 0.0, 0.5, 0.5]);
         let v_alpha = |set: &str, photo: &Prepared| {
             let set = ["params.cover_weight=0", set].map(str::to_owned);
@@ -397,12 +402,8 @@ mod tests {
     #[test]
     fn errors_are_those_of_what_a_photograph_shows() {
         let photo = Prepared {
-            width: 4,
-            height: 2,
-            rgb: vec![0; 24],
             alpha: Some(vec![255, 255, 255, 255, 255, 255, 255, 0]),
-            mask: Some(vec![255, 255, 255, 255, 0, 0, 0, 255]),
-            background: [0.0; 3],
+            ..masked(0, [255, 255, 255, 255, 0, 0, 0, 255])
         };
         let mut objective = Objective::new(None);
         let errors = [0.1, 0.1, 0.1, 0.9, 0.7, 0.7, 0.7, 0.7];

@@ -1,6 +1,6 @@
 //! Files that belong to images, one each, in a folder beside theirs: masks, and maps of depth and of normals.
 
-use super::declared::Declared;
+use super::declared::{Declared, DeclaredView};
 use super::files::{is_image_name, relative_name};
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 const MAX_DEPTH: u32 = 6;
 
 /// The files in a separate folder, by the image to which they belong.
-pub(crate) struct Beside {
+pub struct Beside {
     folder: String,
     /// By path below the folder, lower case, without extension.
     by_stem: HashMap<String, PathBuf>,
@@ -60,6 +60,11 @@ impl Beside {
         keys.into_iter().find_map(|key| self.by_stem.get(key)).cloned()
     }
 
+    /// The file of `view`, whose name may begin with the folder of the photographs.
+    fn of_view(&self, view: &DeclaredView) -> Option<PathBuf> {
+        self.of(&view.name).or_else(|| self.of(view.name_below()))
+    }
+
     /// The warning if some images have no mask.
     pub fn mask_warning(&self, images: usize, masked: usize) -> Option<String> {
         (masked < images).then(|| {
@@ -78,7 +83,7 @@ pub(super) fn find_masks(declared: &mut Declared) {
         return;
     };
     for view in declared.views.iter_mut().filter(|view| view.mask.is_none()) {
-        view.mask = masks.of(&view.name).or_else(|| masks.of(view.name_below()));
+        view.mask = masks.of_view(view);
     }
     let masked = declared.views.iter().filter(|view| view.mask.is_some()).count();
     let warning = masks.mask_warning(declared.views.len(), masked);
@@ -90,8 +95,7 @@ pub(super) fn find_maps(declared: &mut Declared) {
     let depths = Beside::depths(&declared.root).filter(|_| declared.views.iter().all(|view| view.depth.is_none()));
     let normals = Beside::normals(&declared.root).filter(|_| declared.views.iter().all(|view| view.normals.is_none()));
     for view in &mut declared.views {
-        let find = |maps: &Beside| maps.of(&view.name).or_else(|| maps.of(view.name_below()));
-        let [depth, normals] = [&depths, &normals].map(|maps| maps.as_ref().and_then(find));
+        let [depth, normals] = [&depths, &normals].map(|maps| maps.as_ref()?.of_view(view));
         view.depth = view.depth.take().or(depth);
         view.normals = view.normals.take().or(normals);
     }

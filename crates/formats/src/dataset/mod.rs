@@ -31,7 +31,7 @@ mod world;
 
 use crate::FormatError;
 pub(crate) use assemble::{oriented_size, turned_as_stored};
-pub(crate) use beside::Beside;
+pub use beside::Beside;
 use declared::Declared;
 pub(crate) use declared::DeclaredPoints;
 pub(crate) use files::{is_image_name, list_files};
@@ -320,10 +320,10 @@ pub fn read_dataset(path: &Path, options: &DatasetOptions) -> Result<Dataset, Fo
     if let Some(folder) = &options.images {
         images::relocate(&mut declared, folder, options.downscale)?;
     }
-    // The other readers know in which folder theirs lie.
+    // The others' lie beside one of several folders of photographs, or are none.
     if !matches!(
         format,
-        DatasetFormat::Colmap | DatasetFormat::Nerfstudio | DatasetFormat::Llff | DatasetFormat::Blender
+        DatasetFormat::Colmap | DatasetFormat::Llff | DatasetFormat::Blender
     ) {
         beside::find_masks(&mut declared);
     }

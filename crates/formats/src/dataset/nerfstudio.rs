@@ -1,6 +1,5 @@
 //! A folder with one `transforms.json`, as written by nerfstudio and instant-ngp.
 
-use super::beside::Beside;
 use super::declared::{Declared, DeclaredView, Split};
 use super::files::{find_image, relative_name};
 use super::transforms::{Frame, Transforms, parse_transforms};
@@ -41,17 +40,9 @@ pub(super) fn read(path: &Path, downscale: f32) -> Result<Declared, FormatError>
         Some(parent) if parent != Path::new("") => parent.to_owned(),
         _ => PathBuf::from("."),
     };
-    let mut views = declared_views(&file, &root, &transforms)?;
+    let views = declared_views(&file, &root, &transforms)?;
     let mut warnings = missing_files(&transforms.frames, &views);
 
-    let masks = Beside::masks(&root, "images");
-    if let Some(masks) = &masks {
-        for view in views.iter_mut().filter(|view| view.mask.is_none()) {
-            view.mask = masks.of(&view.name).or_else(|| masks.of(view.name_below()));
-        }
-        let masked = views.iter().filter(|view| view.mask.is_some()).count();
-        warnings.extend(masks.mask_warning(views.len(), masked));
-    }
     let points = transforms.ply_file_path.as_ref().and_then(|ply| {
         let read = read_declared_points(&root.join(ply.replace('\\', "/")));
         read.map_err(|error| warnings.push(format!("the initial points are ignored: {error}")))

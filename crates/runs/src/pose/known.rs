@@ -2,7 +2,7 @@
 
 use crate::RunError;
 use glam::{DQuat, DVec3};
-use irradia_formats::{ColmapCamera, ColmapImage, PhotoFolder, read_colmap_poses, read_photo_folders};
+use irradia_formats::{Beside, ColmapCamera, ColmapImage, PhotoFolder, read_colmap_poses, read_photo_folders};
 use irradia_sfm::geometry::camera::DCamera;
 use irradia_sfm::geometry::pose::DPose;
 use irradia_sfm::map::{Known, PhotoInfo};
@@ -37,16 +37,14 @@ impl KnownPoses {
         let folders = self.images.keys().map(|name| images.join(name));
         let folders: BTreeSet<PathBuf> = folders.filter_map(|photo| Some(photo.parent()?.to_owned())).collect();
         let folders: Vec<PathBuf> = folders.into_iter().filter(|folder| folder.is_dir()).collect();
+        let masks = Beside::masks(&self.data, "images");
         let mut found = read_photo_folders(&folders)?;
         for photo in &mut found.photos {
-            let inside = photo.path.strip_prefix(&images).unwrap_or(&photo.path).to_owned();
+            let inside = photo.path.strip_prefix(&images).unwrap_or(&photo.path);
             let parts = inside.iter().map(OsStr::to_string_lossy);
             photo.name = parts.collect::<Vec<_>>().join("/");
-            let masks = [format!("{}.png", photo.name).into(), inside.with_extension("png")];
-            let mut masks = masks
-                .map(|name: PathBuf| self.data.join("masks").join(name))
-                .into_iter();
-            if let (None, Some(mask)) = (&photo.mask, masks.find(|mask| mask.is_file())) {
+            let mask = masks.as_ref().and_then(|masks| masks.of(&photo.name));
+            if let (None, Some(mask)) = (&photo.mask, mask) {
                 *photo = photo.with_mask(mask)?;
             }
         }

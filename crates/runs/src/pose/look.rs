@@ -1,6 +1,6 @@
 //! Views of a dataset as the mapper takes them: with their features, cameras and poses.
 
-use super::stages::{color_at, in_grey};
+use super::stages::{both, color_at, in_grey};
 use irradia_scene::{Camera, View};
 use irradia_sfm::Features;
 use irradia_sfm::features::{Extractor, GreyPhoto, Sift};
@@ -27,10 +27,7 @@ impl Look {
             max_features,
             ..Sift::default()
         };
-        let mask = match (photo.alpha(), photo.mask.clone()) {
-            (Some(alpha), Some(mask)) => Some(alpha.into_iter().zip(mask).map(|(a, b)| a.min(b)).collect()),
-            (alpha, mask) => alpha.or(mask),
-        };
+        let mask = both(photo.mask.clone(), photo.alpha());
         let features = sift.extract(&GreyPhoto {
             width: photo.width,
             height: photo.height,

@@ -321,12 +321,16 @@ fn mask_of(photo: &PhotoEntry, pixels: &Pixels) -> Result<Option<Vec<u8>>, Strin
     let given = photo
         .read_mask(pixels.width, pixels.height)
         .map_err(|error| error.to_string())?;
-    let alpha = (pixels.channels == 4).then(|| pixels.data.chunks_exact(4).map(|pixel| pixel[3]));
-    Ok(match (given, alpha) {
-        (Some(given), Some(alpha)) => Some(given.into_iter().zip(alpha).map(|(a, b)| a.min(b)).collect()),
-        (Some(given), None) => Some(given),
-        (None, alpha) => alpha.map(Iterator::collect),
-    })
+    let alpha = (pixels.channels == 4).then(|| pixels.data.chunks_exact(4).map(|pixel| pixel[3]).collect());
+    Ok(both(given, alpha))
+}
+
+/// The mask of what neither a mask nor alpha hides.
+pub(super) fn both(mask: Option<Vec<u8>>, alpha: Option<Vec<u8>>) -> Option<Vec<u8>> {
+    match (mask, alpha) {
+        (Some(mask), Some(alpha)) => Some(mask.into_iter().zip(alpha).map(|(a, b)| a.min(b)).collect()),
+        (mask, alpha) => mask.or(alpha),
+    }
 }
 
 /// `[to[1], to[0], 3]` the pixels reduced to that size.
